@@ -1,0 +1,1 @@
+"""Callbacks for any Stable-Baselines3 algorithm: one idea per file."""

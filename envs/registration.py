@@ -1,0 +1,20 @@
+"""Registers the environments with Gymnasium, by module paths, so that nothing heavy is imported before it is used."""
+
+from __future__ import annotations
+
+import gymnasium
+
+MAX_EPISODE_STEPS = 1500  # 15 s of control steps of 0.01 s (4.2.3)
+ENVIRONMENTS = {"QuadTargetTracking-v0": "target_tracking", "QuadStateRecovery-v0": "state_recovery"}
+
+
+def register_environments() -> None:
+    """Register ``QuadTargetTracking-v0`` and ``QuadStateRecovery-v0``; called when ``sb3_quad`` is imported."""
+    for env_id, task in ENVIRONMENTS.items():
+        if env_id not in gymnasium.registry:
+            gymnasium.register(
+                id=env_id,
+                entry_point="sb3_quad.envs.quadcopter_env:QuadcopterEnv",
+                max_episode_steps=MAX_EPISODE_STEPS,
+                kwargs={"task": task},
+            )

@@ -1,0 +1,39 @@
+"""Quadcopter environments, experts, DAgger and PPO with behavioural cloning for Stable-Baselines3."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie beside this folder rather than inside it; an installed
+# package holds them inside, and then this does nothing.
+_checkout = Path(__file__).resolve().parent.parent
+if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
+    __path__.append(str(_checkout))
+
+from sb3_quad.envs.registration import register_environments  # noqa: E402
+
+if TYPE_CHECKING:
+    from sb3_quad.dagger.dagger import DAgger
+    from sb3_quad.experts.pid import PIDExpert
+
+__version__ = "0.1.0"
+__all__ = ["DAgger", "PIDExpert", "__version__"]
+
+_LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
+    "DAgger": "sb3_quad.dagger.dagger",
+    "PIDExpert": "sb3_quad.experts.pid",
+}
+
+register_environments()
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

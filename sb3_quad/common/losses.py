@@ -1,0 +1,75 @@
+"""The terms of Eqs. 4.3 and 4.4 that DAgger and PPO with behavioural cloning share.
+
+Every function takes and gives tensors; ``b`` is the mini-batch, ``a`` the action dimension.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch as th
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from torch.nn import functional as F
+
+CloningLoss = Literal["mse", "nll"]
+CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll")
+
+
+def actor_mean(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
+    """Mean of the policy's Gaussian, (b, a), by the actor alone; ``evaluate_actions`` would run the critic too."""
+    features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
+    mean: th.Tensor = policy.action_net(policy.mlp_extractor.forward_actor(features))
+    return mean
+
+
+def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """-log π(a|s) of a diagonal Gaussian, (b,), summed over the action's dimensions."""
+    scaled = (actions - mean) * th.exp(-log_std)
+    return (0.5 * scaled.square() + log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=1)
+
+
+def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
+    """H of a diagonal Gaussian, a scalar: the same in every state, because the standard deviation is (Eq. 4.2)."""
+    return (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+
+
+def cloning_loss(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """L_BC: how far the policy is from the expert's ``actions`` (b, a), a scalar.
+
+    ``"nll"`` is Eq. 3.12, the negative log-likelihood, which also shrinks the standard deviation towards the error that
+    is left. ``"mse"`` is the mean squared error of the mean over rows and dimensions, and leaves it alone.
+    """
+    return gaussian_nll(mean, log_std, actions).mean() if kind == "nll" else F.mse_loss(mean, actions)
+
+
+def value_loss(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range: float | None) -> th.Tensor:
+    """The critic's loss, a scalar: Eq. 3.8 averaged over the rows, or plain mean squared error without ``clip_range``.
+
+    Eq. 3.8 takes the larger of the two errors, so leaving the clip range is never rewarded; SB3's own clipping takes
+    the clipped one alone.
+
+    :param values: v(s) now, (b,)
+    :param old_values: v(s) when the rollout was flown, (b,)
+    :param returns: Ĝ of Eq. 3.11, (b,)
+    """
+    error = (values - returns).square()
+    if clip_range is not None:
+        clipped = old_values + (values - old_values).clamp(-clip_range, clip_range)
+        error = th.max(error, (clipped - returns).square())
+    return error.mean()
+
+
+def l2_loss(policy: ActorCriticPolicy) -> th.Tensor:
+    """½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar; biases and log_std are left out."""
+    return 0.5 * th.stack([weights.square().sum() for weights in policy.parameters() if weights.ndim > 1]).sum()
+
+
+def split_parameters(policy: ActorCriticPolicy) -> tuple[list[th.nn.Parameter], list[th.nn.Parameter]]:
+    """The parameters of the actor (with whatever both share) and those of the critic alone."""
+    modules = [policy.mlp_extractor.value_net, policy.value_net]
+    if not policy.share_features_extractor:
+        modules.append(policy.vf_features_extractor)
+    critic = [parameter for module in modules for parameter in module.parameters()]
+    own = {id(parameter) for parameter in critic}
+    return [parameter for parameter in policy.parameters() if id(parameter) not in own], critic

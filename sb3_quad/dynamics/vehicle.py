@@ -1,0 +1,193 @@
+"""Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files that hold them."""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sb3_quad.errors import ConfigError, unknown
+
+FloatArray = npt.NDArray[np.float64]
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+Finite = Annotated[float, AfterValidator(_finite)]
+Positive = Annotated[Finite, Field(gt=0)]
+PerRotor = tuple[tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite]]
+
+# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); one row of an array (n_parameters, n) each.
+PARAMETER_NAMES = (
+    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain", "gravity"),
+    *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
+    *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
+)
+
+
+class Vehicle(BaseModel):
+    """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
+
+    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another. Raises :class:`ConfigError` through
+    :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(min_length=1, description="what the vehicle is called")
+    mass: Positive = Field(description="m, kg")
+    inertia: tuple[Positive, Positive, Positive] = Field(description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2")
+    rotor_positions: PerRotor = Field(description="x, y of each rotor in the body frame (x forward, y left), m")
+    rotor_directions: tuple[int, int, int, int] = Field(
+        description="sign of the yaw moment of each rotor: two of 1, two of -1"
+    )
+    moment_thrust_ratio: Positive = Field(description="kM / kF, m")
+    thrust_coefficient: Positive = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
+    motor_gain: Positive = Field(description="k_m, 1/s (Eq. 4.1)")
+    gravity: Positive = Field(default=9.81, description="g, m/s^2")
+    thrust_limits: tuple[Annotated[Finite, Field(ge=0)], Positive] = Field(
+        description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
+    )
+    physics_step: Positive = Field(default=0.0025, description="s")
+    control_step: Positive = Field(default=0.01, description="s; a whole number of physics steps")
+    delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
+    collision_radius: Positive = Field(description="radius of the collision sphere at the centre of mass, m")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Vehicle:
+        low, high = self.thrust_limits
+        if not low < 1.0 < high:
+            raise ValueError(f"thrust_limits {list(self.thrust_limits)}: hover (1.0) must lie between them")
+        if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
+            raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
+        ixx, iyy, izz = self.inertia
+        if max(ixx, iyy, izz) > (ixx + iyy + izz) / 2 * (1 + 1e-9):
+            raise ValueError(f"inertia {list(self.inertia)}: no rigid body has one moment larger than the other two together")
+        substeps = self.control_step / self.physics_step
+        if abs(substeps - round(substeps)) > 1e-9 or round(substeps) < 1:
+            raise ValueError(f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step}")
+        if self.motor_gain * self.physics_step > 1.0:
+            raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
+        if abs(np.linalg.det(self.mixer)) < 1e-12:
+            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently")
+        if not np.allclose(self.mixer[1:].sum(axis=1), 0.0, atol=1e-9):
+            raise ValueError("rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)")
+        return self
+
+    @cached_property
+    def mixer(self) -> FloatArray:
+        """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N.
+
+        Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and pitch.
+        """
+        positions = np.asarray(self.rotor_positions, dtype=np.float64)
+        yaw = self.moment_thrust_ratio * np.asarray(self.rotor_directions, dtype=np.float64)
+        return np.stack([np.ones(4), positions[:, 1], -positions[:, 0], yaw])
+
+    @cached_property
+    def mixer_inverse(self) -> FloatArray:
+        """Rotor thrusts from [ΣF; Mx; My; Mz], shape (4, 4)."""
+        return np.asarray(np.linalg.inv(self.mixer))
+
+    @property
+    def hover_thrust(self) -> float:
+        """Thrust of one rotor in hover, m g / 4, N."""
+        return self.mass * self.gravity / 4.0
+
+    @property
+    def thrust_range(self) -> tuple[float, float]:
+        """Least and greatest thrust of one rotor, N."""
+        return self.thrust_limits[0] * self.hover_thrust, self.thrust_limits[1] * self.hover_thrust
+
+    @property
+    def rotor_speed_range(self) -> tuple[float, float]:
+        """Least and greatest speed of one rotor, rad/s (Eq. 2.4 at the thrust limits)."""
+        low, high = self.thrust_range
+        return math.sqrt(low / self.thrust_coefficient), math.sqrt(high / self.thrust_coefficient)
+
+    @property
+    def hover_rotor_speed(self) -> float:
+        """Speed of one rotor in hover, rad/s."""
+        return math.sqrt(self.hover_thrust / self.thrust_coefficient)
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps in one control step."""
+        return round(self.control_step / self.physics_step)
+
+    def thrust_to_action(self, thrust: FloatArray) -> FloatArray:
+        """Actions in [-1, 1] from rotor thrusts in N, any shape; the inverse of Eq. 3.18 (not clipped)."""
+        low, high = self.thrust_range
+        return (thrust - (high + low) / 2) / ((high - low) / 2)
+
+    def action_to_thrust(self, action: FloatArray) -> FloatArray:
+        """Rotor thrusts in N from actions, any shape; Eq. 3.18, actions outside [-1, 1] clipped."""
+        low, high = self.thrust_range
+        return (high + low) / 2 + (high - low) / 2 * np.clip(action, -1.0, 1.0)
+
+    def parameters(self) -> FloatArray:
+        """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of ``PARAMETER_NAMES``."""
+        low, high = self.thrust_range
+        head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
+        tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius)
+        return np.array([*head, *self.mixer[1:].ravel(), *tail], dtype=np.float64)
+
+
+def vehicle_names() -> list[str]:
+    """The vehicles that come with the package."""
+    folder = resources.files("sb3_quad.vehicles")
+    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
+    """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
+
+    :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
+    """
+    if isinstance(source, Vehicle):
+        return source
+    text = str(source)
+    if isinstance(source, Path) or text.endswith((".yaml", ".yml")) or "/" in text:
+        try:
+            content = Path(text).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"vehicle file {text}: cannot be read ({error})") from None
+        return _parse_vehicle(content, text)
+    if text not in vehicle_names():
+        raise ConfigError(unknown("vehicle", text, vehicle_names()) + ", or the path of a .yaml file")
+    content = resources.files("sb3_quad.vehicles").joinpath(f"{text}.yaml").read_text(encoding="utf-8")
+    return _parse_vehicle(content, f"{text}.yaml")
+
+
+def _parse_vehicle(content: str, where: str) -> Vehicle:
+    try:
+        data = yaml.safe_load(content)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"vehicle file {where}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"vehicle file {where}: must hold keys and values, such as 'mass: 1.727'")
+    try:
+        return Vehicle.model_validate(data)
+    except ValidationError as error:
+        raise ConfigError(f"vehicle file {where}: {'; '.join(_explain(item) for item in error.errors())}") from None
+
+
+def _explain(item: Any) -> str:
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return unknown("key", key, Vehicle.model_fields)
+    message = item["msg"].removeprefix("Value error, ")
+    field = Vehicle.model_fields.get(key.split(".")[0])
+    meaning = f" ({field.description})" if field and field.description else ""
+    return f"{key}: {message}{meaning}" if key else message

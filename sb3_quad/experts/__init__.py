@@ -1,0 +1,1 @@
+"""Controllers that know the model: the teachers of DAgger and of PPO with behavioural cloning."""

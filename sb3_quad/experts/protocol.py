@@ -1,0 +1,80 @@
+"""What an expert is, and how it answers both with the true state and behind SB3's ``predict``."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_quad.dynamics.rotation import nearest_rotation, quaternion_from_rotation
+from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.errors import ExpertError
+from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD
+
+Actions = npt.NDArray[np.float32]
+
+
+class Expert(ABC):
+    """A controller of a known vehicle: :meth:`actions` from the true state is all that a subclass has to write.
+
+    >>> class Hover(Expert):
+    ...     def actions(self, state):
+    ...         return np.zeros((state.n, 4), dtype=np.float32)
+
+    Anything with such an ``actions(state)`` method can teach; this class adds ``predict``, so that
+    ``evaluate_policy(PIDExpert(), env)`` works as for an SB3 model.
+
+    :param vehicle: name, YAML path or :class:`~sb3_quad.dynamics.vehicle.Vehicle` that the expert is designed for.
+    :param observation_mean: μ of Eq. 3.16, shape (18,), that :meth:`predict` undoes; None for the environment's default.
+    :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
+    """
+
+    def __init__(
+        self,
+        vehicle: str | Vehicle = "itm",
+        observation_mean: npt.ArrayLike | None = None,
+        observation_std: npt.ArrayLike | None = None,
+    ) -> None:
+        self.vehicle = load_vehicle(vehicle)
+        self.observation_mean = np.array(DEFAULT_MEAN if observation_mean is None else observation_mean, dtype=np.float64)
+        self.observation_std = np.array(DEFAULT_STD if observation_std is None else observation_std, dtype=np.float64)
+
+    @abstractmethod
+    def actions(self, state: QuadcopterState) -> Actions:
+        """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
+
+    def predict(
+        self,
+        observation: npt.NDArray[np.floating] | dict[str, npt.NDArray[np.floating]],
+        state: tuple[npt.NDArray[np.floating], ...] | None = None,
+        episode_start: npt.NDArray[np.bool_] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Actions, tuple[npt.NDArray[np.floating], ...] | None]:
+        """SB3's ``predict``: the actions for observations of shape (18,) or (n, 18), noise and all.
+
+        :raises ExpertError: observations of another shape.
+        """
+        array = np.asarray(observation, dtype=np.float64)
+        if array.ndim not in (1, 2) or array.shape[-1] != DEFAULT_MEAN.size:
+            raise ExpertError(f"{type(self).__name__}: observation of shape {array.shape}, expected (18,) or (n, 18)")
+        actions = self.actions(observed_state(np.atleast_2d(array), self.observation_mean, self.observation_std))
+        return (actions[0] if array.ndim == 1 else actions), state
+
+
+def observed_state(
+    observation: npt.NDArray[np.float64], mean: npt.NDArray[np.float64], std: npt.NDArray[np.float64]
+) -> QuadcopterState:
+    """The state that observations of shape (n, 18) tell of, with the target as origin (Eq. 3.16 undone).
+
+    Noise leaves ᴮRᴵ no rotation; the nearest one is taken. Rotor speeds cannot be observed and are zero.
+    """
+    features = observation * std + mean
+    rotation = nearest_rotation(features[:, 3:12].reshape(-1, 3, 3).transpose(0, 2, 1))
+    array = np.zeros((STATE_SIZE, len(features)))
+    array[POSITION] = features[:, 0:3].T
+    array[QUATERNION] = quaternion_from_rotation(rotation).T
+    array[VELOCITY] = np.einsum("nij,nj->in", rotation, features[:, 12:15])
+    array[BODY_RATES] = features[:, 15:18].T
+    return QuadcopterState(array)

@@ -1,0 +1,54 @@
+"""Experts by name, as YAML and the command line give them."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.errors import ConfigError, ExpertError, SB3QuadError, unknown
+from sb3_quad.experts.models import load_model
+
+EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert"}
+
+
+def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm") -> Any:
+    """The expert that ``spec`` names.
+
+    :param spec: ``"pid"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where ``factory(vehicle)``
+        returns an expert; or an expert itself, returned as it is.
+    :param vehicle: what a named expert is designed for.
+    :raises ConfigError: an unknown name, a missing or unreadable file.
+    :raises ExpertError: a factory that fails.
+    """
+    if not isinstance(spec, (str, Path)):
+        return spec
+    text = str(spec)
+    if text in EXPERTS:
+        return _factory(EXPERTS[text])(load_vehicle(vehicle))
+    if text.endswith(".zip"):
+        return load_model(text)
+    if ":" in text:
+        factory = _factory(text)
+        try:
+            return factory(load_vehicle(vehicle))
+        except SB3QuadError:
+            raise
+        except Exception as error:
+            raise ExpertError(f"expert {text}: the factory failed with {type(error).__name__}: {error}") from error
+    raise ConfigError(unknown("expert", text, EXPERTS) + ", or path/to/model.zip, or package.module:factory")
+
+
+def _factory(path: str) -> Callable[[Vehicle], Any]:
+    module_name, _, attribute = path.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module_name), attribute)
+    except ImportError as error:
+        raise ConfigError(f"expert {path}: module {module_name} cannot be imported ({error})") from None
+    except AttributeError:
+        raise ConfigError(f"expert {path}: module {module_name} has no {attribute!r}") from None
+    if not callable(factory):
+        raise ConfigError(f"expert {path}: {attribute} is not callable")
+    return factory  # type: ignore[no-any-return]

@@ -1,0 +1,51 @@
+"""A rollout buffer that also keeps the expert's action for every visited state."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.vec_env import VecNormalize
+
+
+class ExpertRolloutBufferSamples(NamedTuple):
+    """SB3's ``RolloutBufferSamples`` and ``expert_actions`` of shape (batch_size, action_dim)."""
+
+    observations: th.Tensor
+    actions: th.Tensor
+    old_values: th.Tensor
+    old_log_prob: th.Tensor
+    advantages: th.Tensor
+    returns: th.Tensor
+    expert_actions: th.Tensor
+
+
+class ExpertRolloutBuffer(RolloutBuffer):
+    """SB3's rollout buffer with a row of expert actions beside each row of actions.
+
+    ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills; the algorithm writes row
+    ``pos`` before it calls :meth:`add` for the same step.
+    """
+
+    expert_actions: npt.NDArray[np.float32]
+
+    def reset(self) -> None:
+        self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32)
+        super().reset()
+
+    def get(  # type: ignore[override]
+        self, batch_size: int | None = None
+    ) -> Generator[ExpertRolloutBufferSamples, None, None]:
+        if not self.generator_ready:
+            self.expert_actions = self.swap_and_flatten(self.expert_actions)
+        yield from super().get(batch_size)  # type: ignore[misc]
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None
+    ) -> ExpertRolloutBufferSamples:
+        samples = super()._get_samples(batch_inds, env)
+        return ExpertRolloutBufferSamples(*samples, expert_actions=self.to_torch(self.expert_actions[batch_inds]))

@@ -1,0 +1,353 @@
+"""PPO with a weighted behavioural-cloning loss towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
+
+from __future__ import annotations
+
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import Distribution
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
+
+from sb3_quad.common.labels import ExpertLabeller
+from sb3_quad.common.losses import cloning_loss, evaluate, l2_loss, max_clipped_value_loss
+from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
+from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
+from sb3_quad.ppo_bc.gradients import gradient_norms
+
+SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
+BC_LOSSES = ("nll", "mse")
+BC_FILTERS = ("none", "negative_advantage")
+
+
+class PPOBC(PPO):
+    """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
+
+    The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H · entropy + c_BC · L_BC.
+    Errata of the thesis, followed in their meant sense: Eq. 3.5 prints the probability ratio as a difference of logs (the
+    ratio is its exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
+
+    All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. With ``bc_coef=0``, ``l2_coef=0`` and
+    ``critic_warmup=0`` (and either no ``clip_range_vf`` or ``max_clipped_value=False``) training is PPO's, bit for bit. A
+    saved model loads with ``PPO.load``, also where this package is not installed.
+
+    :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
+        an SB3 model, or a callable from observations to actions. Needed when learning starts with a cloning weight.
+    :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining progress (SB3's
+        ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
+    :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a mean over the action's
+        dimensions; or ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone.
+    :param bc_filter: ``"negative_advantage"`` clones only where the flown action did worse than the critic expected;
+        ``"none"`` clones everywhere.
+    :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std`` are left out.
+    :param max_clipped_value: the value loss of Eq. 3.8, the larger of the clipped and the unclipped error, where
+        ``clip_range_vf`` is given; False for stock PPO's clipped error.
+    :param critic_warmup: for this many rollouts only the critic learns: a critic that comes from another task, or from
+        another policy, would else spoil the actor with its first advantages.
+    :raises ConfigError: a value out of range or a name that is not known, when built.
+    :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
+    :raises TrainingError: a loss that is not finite; the parameters are those of the step before.
+    """
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        n_steps: int = 2048,
+        batch_size: int = 64,
+        n_epochs: int = 10,
+        gamma: float = 0.99,
+        gae_lambda: float = 0.95,
+        clip_range: float | Schedule = 0.2,
+        clip_range_vf: float | Schedule | None = None,
+        normalize_advantage: bool = True,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float = 0.5,
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        rollout_buffer_class: type[RolloutBuffer] | None = None,
+        rollout_buffer_kwargs: dict[str, Any] | None = None,
+        target_kl: float | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        expert: Any = None,
+        bc_coef: float | Schedule = 0.005,
+        bc_loss: str = "nll",
+        bc_filter: str = "none",
+        l2_coef: float = 0.0,
+        max_clipped_value: bool = True,
+        critic_warmup: int = 0,
+        _init_setup_model: bool = True,
+    ):
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            batch_size=batch_size,
+            n_epochs=n_epochs,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            clip_range=clip_range,
+            clip_range_vf=clip_range_vf,
+            normalize_advantage=normalize_advantage,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            rollout_buffer_class=rollout_buffer_class or ExpertRolloutBuffer,
+            rollout_buffer_kwargs=rollout_buffer_kwargs,
+            target_kl=target_kl,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        if bc_loss not in BC_LOSSES:
+            raise ConfigError(unknown("bc_loss", bc_loss, BC_LOSSES))
+        if bc_filter not in BC_FILTERS:
+            raise ConfigError(unknown("bc_filter", bc_filter, BC_FILTERS))
+        if not l2_coef >= 0:
+            raise ConfigError(f"l2_coef is {l2_coef}, must be at least 0")
+        if critic_warmup < 0:
+            raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
+        self.expert = expert
+        self.bc_coef = bc_coef
+        self.bc_loss = bc_loss
+        self.bc_filter = bc_filter
+        self.l2_coef = l2_coef
+        self.max_clipped_value = max_clipped_value
+        self.critic_warmup = critic_warmup
+        self._n_rollouts_trained = 0
+        self._labeller: ExpertLabeller | None = None
+        self._labels: Any = None
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
+            raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
+        self.bc_coef = FloatSchedule(self.bc_coef)
+
+    def _excluded_save_params(self) -> list[str]:
+        own = ["expert", "_labeller", "_labels", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        return [*super()._excluded_save_params(), *own]
+
+    def set_expert(self, expert: Any) -> None:
+        """Give the expert to a model that was loaded without one."""
+        self.expert = expert
+        self._labeller = None
+
+    def _current_bc_coef(self) -> float:
+        return float(self.bc_coef(self._current_progress_remaining))  # type: ignore[operator]
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self.expert is None and any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0)):  # type: ignore[arg-type]
+            raise ExpertError("PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0")
+        result = super()._setup_learn(*args, **kwargs)
+        if self.expert is not None:
+            assert self.env is not None
+            self._labeller = ExpertLabeller(self.expert, self.env)
+        return result
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        if self._labelling and self._labeller is not None and self._labeller.needs_state:
+            self._labels = self._labeller.labels(self._last_obs)  # the first step's state, before it
+        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+
+    @property
+    def _labelling(self) -> bool:
+        return self._labeller is not None and self._current_bc_coef() != 0.0
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        """Called by ``collect_rollouts`` after ``env.step`` and before ``rollout_buffer.add``: writes the step's labels.
+
+        They belong to the state before the step: an expert on observations is asked now, since ``_last_obs`` is still that
+        observation; an expert on the true state was asked before the step, and now for the step to come.
+        """
+        super()._update_info_buffer(infos, dones)
+        if not self._labelling:
+            return
+        assert self._labeller is not None and isinstance(self.rollout_buffer, ExpertRolloutBuffer)
+        if self._labeller.needs_state:
+            self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labels
+            self._labels = self._labeller.labels(self._last_obs)
+        else:
+            self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labeller.labels(self._last_obs)
+
+    def train(self) -> None:
+        """One update on the current rollout: ``PPO.train`` with the added terms (each marked "PPO+BC")."""
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
+        if self.clip_range_vf is not None:
+            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
+        # PPO+BC
+        bc_coef = self._current_bc_coef() if self._labeller is not None else 0.0
+        warming_up = self._n_rollouts_trained < self.critic_warmup
+        grad_norms: dict[str, float] = {}
+        bc_losses, l2_losses = [], []
+
+        entropy_losses = []
+        pg_losses, value_losses = [], []
+        clip_fractions = []
+
+        continue_training = True
+        for epoch in range(self.n_epochs):
+            approx_kl_divs = []
+            for rollout_data in self.rollout_buffer.get(self.batch_size):
+                actions = rollout_data.actions
+                if isinstance(self.action_space, spaces.Discrete):
+                    actions = rollout_data.actions.long().flatten()
+
+                values, log_prob, entropy, distribution = evaluate(self.policy, rollout_data.observations, actions)
+                values = values.flatten()
+                advantages = rollout_data.advantages
+                raw_advantages = advantages  # PPO+BC: the filter looks at their sign before normalisation
+                if self.normalize_advantage and len(advantages) > 1:
+                    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+                ratio = th.exp(log_prob - rollout_data.old_log_prob)
+
+                policy_loss_1 = advantages * ratio
+                policy_loss_2 = advantages * th.clamp(ratio, 1 - clip_range, 1 + clip_range)
+                policy_loss = -th.min(policy_loss_1, policy_loss_2).mean()
+
+                pg_losses.append(policy_loss.item())
+                clip_fraction = th.mean((th.abs(ratio - 1) > clip_range).float()).item()
+                clip_fractions.append(clip_fraction)
+
+                if self.clip_range_vf is None:
+                    value_loss = F.mse_loss(rollout_data.returns, values)
+                elif self.max_clipped_value:  # PPO+BC: Eq. 3.8
+                    value_loss = max_clipped_value_loss(values, rollout_data.old_values, rollout_data.returns, clip_range_vf)
+                else:
+                    values_pred = rollout_data.old_values + th.clamp(
+                        values - rollout_data.old_values, -clip_range_vf, clip_range_vf
+                    )
+                    value_loss = F.mse_loss(rollout_data.returns, values_pred)
+                value_losses.append(value_loss.item())
+
+                if entropy is None:
+                    entropy_loss = -th.mean(-log_prob)
+                else:
+                    entropy_loss = -th.mean(entropy)
+
+                entropy_losses.append(entropy_loss.item())
+
+                loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
+                # PPO+BC: the terms that Eq. 4.4 adds
+                terms = {"policy": policy_loss, "value": self.vf_coef * value_loss}
+                if bc_coef != 0.0:
+                    bc_loss = self._bc_loss(distribution, rollout_data.expert_actions, raw_advantages)
+                    bc_losses.append(bc_loss.item())
+                    terms["bc"] = bc_coef * bc_loss
+                    loss = loss + terms["bc"]
+                if self.l2_coef > 0.0:
+                    l2 = l2_loss(self.policy)
+                    l2_losses.append(l2.item())
+                    loss = loss + self.l2_coef * l2
+                if warming_up:
+                    loss = self.vf_coef * value_loss
+                if not th.isfinite(loss):
+                    raise TrainingError(
+                        f"the loss is {loss.item()} after {self.num_timesteps} steps (policy {policy_loss.item():.3g}, value "
+                        f"{value_loss.item():.3g}): try a smaller learning_rate or bc_coef, and check the expert's actions"
+                    )
+                if not grad_norms:
+                    grad_norms = gradient_norms(terms, self.policy.parameters())
+
+                with th.no_grad():
+                    log_ratio = log_prob - rollout_data.old_log_prob
+                    approx_kl_div = th.mean((th.exp(log_ratio) - 1) - log_ratio).cpu().numpy()
+                    approx_kl_divs.append(approx_kl_div)
+
+                if self.target_kl is not None and approx_kl_div > 1.5 * self.target_kl:
+                    continue_training = False
+                    if self.verbose >= 1:
+                        print(f"Early stopping at step {epoch} due to reaching max kl: {approx_kl_div:.2f}")
+                    break
+
+                self.policy.optimizer.zero_grad()
+                loss.backward()
+                th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+                self.policy.optimizer.step()
+
+            self._n_updates += 1
+            if not continue_training:
+                break
+        self._n_rollouts_trained += 1  # PPO+BC
+
+        explained_var = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
+
+        self.logger.record("train/entropy_loss", np.mean(entropy_losses))
+        self.logger.record("train/policy_gradient_loss", np.mean(pg_losses))
+        self.logger.record("train/value_loss", np.mean(value_losses))
+        self.logger.record("train/approx_kl", np.mean(approx_kl_divs))
+        self.logger.record("train/clip_fraction", np.mean(clip_fractions))
+        self.logger.record("train/loss", loss.item())
+        self.logger.record("train/explained_variance", explained_var)
+        if hasattr(self.policy, "log_std"):
+            self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        self.logger.record("train/clip_range", clip_range)
+        if self.clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+        # PPO+BC
+        self.logger.record("train/bc_coef", bc_coef)
+        if bc_losses:
+            self.logger.record("train/bc_loss", np.mean(bc_losses))
+        if l2_losses:
+            self.logger.record("train/l2_loss", np.mean(l2_losses))
+        for name, norm in grad_norms.items():
+            self.logger.record(f"train/grad_norm_{name}", norm)
+
+    def _bc_loss(self, distribution: Distribution, expert_actions: th.Tensor, advantages: th.Tensor) -> th.Tensor:
+        """L_BC of Eq. 3.12 over the mini-batch, or over its filtered part."""
+        per_sample = cloning_loss(distribution, expert_actions, self.bc_loss)
+        if self.bc_filter == "none":
+            return per_sample.mean()
+        mask = (advantages < 0).float()
+        return (per_sample * mask).sum() / mask.sum().clamp(min=1.0)
+
+    def learn(
+        self: SelfPPOBC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "PPOBC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfPPOBC:
+        """As ``PPO.learn``; see the class for what it raises."""
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )

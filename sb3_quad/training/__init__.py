@@ -1,0 +1,1 @@
+"""Training jobs: their YAML settings, run folders, environments, interruption and resumption."""

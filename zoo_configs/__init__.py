@@ -1,0 +1,1 @@
+"""Training settings, one YAML per algorithm, in the format of rl-zoo."""
