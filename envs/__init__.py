@@ -1,1 +1,32 @@
 """Gymnasium and Stable-Baselines3 environments of the quadcopter."""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+    from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+    from sb3_quad.envs.tasks import TASKS, Task
+    from sb3_quad.envs.vec_env import QuadcopterVecEnv
+
+__all__ = ["TASKS", "QuadcopterEnv", "QuadcopterVecEnv", "QuadcopterVectorEnv", "Task"]
+
+_LAZY = {  # imported on first use: `import sb3_quad` waits neither for pybullet nor for numba nor for torch
+    "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
+    "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
+    "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
+    "TASKS": "sb3_quad.envs.tasks",
+    "Task": "sb3_quad.envs.tasks",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LAZY:
+        return getattr(importlib.import_module(_LAZY[name]), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_LAZY})

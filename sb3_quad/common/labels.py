@@ -42,7 +42,9 @@ class ExpertLabeller:
 
     def __init__(self, expert: Any, env: VecEnv) -> None:
         if expert is None:
-            raise ExpertError("no expert: give expert=... when building or loading the model, or call set_expert(expert)")
+            raise ExpertError(
+                "no expert: give expert=... when building or loading the model, or call set_expert(expert)"
+            )
         if isinstance(expert, type):
             raise ExpertError(f"expert {expert.__name__}: is a class; give an instance, such as {expert.__name__}()")
         if not isinstance(env.action_space, spaces.Box):

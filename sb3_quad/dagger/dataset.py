@@ -83,7 +83,10 @@ class AggregatedDataset:
         except (OSError, KeyError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ConfigError(f"dataset {path}: cannot be read ({reason}); it must come from save_dataset") from None
-        for name, rows, store in (("observations", observations, self._observations), ("actions", actions, self._actions)):
+        for name, rows, store in (
+            ("observations", observations, self._observations),
+            ("actions", actions, self._actions),
+        ):
             if rows.shape[1:] != tuple(store.shape[1:]) or len(rows) != len(actions):
                 expected = f"({len(actions)}, {', '.join(map(str, store.shape[1:]))})"
                 raise ConfigError(f"dataset {path}: {name} of shape {rows.shape}, this model needs {expected}")

@@ -11,13 +11,13 @@ from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
 from sb3_quad.errors import ConfigError, ExpertError, SB3QuadError, unknown
 from sb3_quad.experts.models import load_model
 
-EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert"}
+EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.experts.geometric:GeometricExpert"}
 
 
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm") -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: ``"pid"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where ``factory(vehicle)``
+    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where ``factory(vehicle)``
         returns an expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for.
     :raises ConfigError: an unknown name, a missing or unreadable file.

@@ -18,9 +18,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_quad.common.labels import ExpertLabeller
-from sb3_quad.common.losses import cloning_loss, evaluate, l2_loss, max_clipped_value_loss
+from sb3_quad.common.losses import gaussian_nll, l2_loss, value_loss as max_clipped_value_loss
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
+from sb3_quad.ppo_bc.forward import evaluate
 from sb3_quad.ppo_bc.gradients import gradient_norms
 
 SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
@@ -327,7 +328,11 @@ class PPOBC(PPO):
 
     def _bc_loss(self, distribution: Distribution, expert_actions: th.Tensor, advantages: th.Tensor) -> th.Tensor:
         """L_BC of Eq. 3.12 over the mini-batch, or over its filtered part."""
-        per_sample = cloning_loss(distribution, expert_actions, self.bc_loss)
+        mean = distribution.mode()
+        if self.bc_loss == "nll":
+            per_sample = gaussian_nll(mean, self.policy.log_std, expert_actions) / expert_actions.shape[1]
+        else:
+            per_sample = (mean - expert_actions).square().mean(dim=1)
         if self.bc_filter == "none":
             return per_sample.mean()
         mask = (advantages < 0).float()

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 ALGORITHMS = {
     "dagger": "sb3_quad.dagger.dagger:DAgger",
+    "ppo_bc": "sb3_quad.ppo_bc.ppo_bc:PPOBC",
     "ppo": "stable_baselines3.ppo.ppo:PPO",
 }
 # Set by a training job rather than by the settings of an algorithm.

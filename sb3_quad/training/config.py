@@ -19,6 +19,7 @@ anything else         a keyword of the algorithm's constructor; ``lin_1e-3`` fal
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
@@ -30,13 +31,17 @@ import yaml
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.errors import ConfigError, unknown
 from sb3_quad.training.algorithms import constructor_parameters, get_algorithm, takes_expert
-from sb3_quad.training.literals import parse_mapping, parse_number
+from sb3_quad.training.literals import parse_mapping
 from sb3_quad.training.values import convert, positive_whole, qualified_classes
 
 VEC_ENVS = ("batch", "dummy", "subproc")
 _JOB_KEYS = (
     *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "policy", "policy_kwargs", "expert"),
     *("callback", "env_wrapper", "vec_env_wrapper", "normalize"),
+)
+# What env_kwargs may give to a quadcopter environment, batched or not.
+QUADCOPTER_KEYWORDS = (
+    *("task", "task_kwargs", "vehicle", "noise", "observation_mean", "observation_std", "max_episode_steps"),
 )
 
 
@@ -68,7 +73,7 @@ class TrainingConfig:
 def load_config(
     algo: str, env_id: str, conf_file: str | Path | None = None, overrides: dict[str, Any] | None = None
 ) -> TrainingConfig:
-    """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them.
+    """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for ``env_kwargs``).
 
     :param conf_file: path of a file, or the name of one that comes with the package such as ``thesis/dagger.yml``;
         None for ``<algo>.yml`` of the package.
@@ -85,52 +90,54 @@ def load_config(
     settings = content[env_id]
     if not isinstance(settings, dict):
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")
-    return build_config(algo, env_id, {**settings, **(overrides or {})}, where)
+    changes = dict(overrides or {})
+    if "env_kwargs" in changes:
+        base = parse_mapping(settings.get("env_kwargs"), f"{where}: env_kwargs")
+        changes["env_kwargs"] = {**base, **parse_mapping(changes["env_kwargs"], "env_kwargs")}
+    return build_config(algo, env_id, {**settings, **changes}, where, changes)
 
 
-def build_config(algo: str, env_id: str, settings: dict[str, Any], where: str = "settings") -> TrainingConfig:
+def build_config(
+    algo: str, env_id: str, settings: dict[str, Any], where: str = "settings", changes: Collection[str] = ()
+) -> TrainingConfig:
     """The checked settings of one job, from a plain mapping.
 
     :param where: what the messages call the source of the settings.
+    :param changes: keys that come from the command line instead.
     :raises ConfigError: see :func:`load_config`.
     """
     algorithm = get_algorithm(algo)
     check_environment(env_id)
     parameters = constructor_parameters(algorithm)
+
+    def at(key: str) -> str:
+        return f"{'command line' if key in changes else where}: {key}"
+
     for key in settings:
         if key not in _JOB_KEYS and key not in parameters:
-            raise ConfigError(f"{where}: {unknown(f'key of {algo}', key, [*_JOB_KEYS, *parameters])}")
+            source = at(key).removesuffix(f": {key}")
+            raise ConfigError(f"{source}: {unknown(f'key of {algo}', key, [*_JOB_KEYS, *parameters])}")
     if settings.get("normalize"):
-        raise ConfigError(f"{where}: normalize is not supported, its statistics are not part of a model's zip; use false")
+        raise ConfigError(f"{at('normalize')} is not supported: its statistics are not part of a model's zip; use false")
     if "n_timesteps" not in settings:
         raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
-    policy = str(settings.get("policy", "MlpPolicy"))
-    if policy not in algorithm.policy_aliases:
-        raise ConfigError(f"{where}: {unknown('policy', policy, algorithm.policy_aliases)}")
-    expert = settings.get("expert")
-    if expert is not None and not takes_expert(algorithm):
-        raise ConfigError(f"{where}: {algo} learns from no expert; leave expert away")
-    vec_env = str(settings.get("vec_env", "batch" if env_id in ENVIRONMENTS else "dummy"))
-    if vec_env not in VEC_ENVS:
-        raise ConfigError(f"{where}: {unknown('vec_env', vec_env, VEC_ENVS)}")
-    if vec_env == "batch" and env_id not in ENVIRONMENTS:
-        raise ConfigError(f"{where}: {env_id} has no batched form; use vec_env dummy or subproc")
+    learns = takes_expert(algorithm)
+    if settings.get("expert") is not None and not learns:
+        raise ConfigError(f"{at('expert')}: {algo} learns from no expert; leave it away")
     return TrainingConfig(
         algo=algo,
         env_id=env_id,
-        n_timesteps=positive_whole(settings["n_timesteps"], f"{where}: n_timesteps"),
-        n_envs=positive_whole(settings.get("n_envs", 1), f"{where}: n_envs"),
-        vec_env=vec_env,
-        env_kwargs=_env_kwargs(settings.get("env_kwargs"), env_id, f"{where}: env_kwargs"),
-        policy=policy,
-        policy_kwargs=parse_mapping(settings.get("policy_kwargs"), f"{where}: policy_kwargs"),
-        expert="pid" if expert is None and takes_expert(algorithm) else expert,
-        callback=qualified_classes(settings.get("callback"), f"{where}: callback"),
-        env_wrapper=qualified_classes(settings.get("env_wrapper"), f"{where}: env_wrapper"),
-        vec_env_wrapper=qualified_classes(settings.get("vec_env_wrapper"), f"{where}: vec_env_wrapper"),
-        hyperparams={
-            key: convert(value, parameters[key], f"{where}: {key}") for key, value in settings.items() if key in parameters
-        },
+        n_timesteps=positive_whole(settings["n_timesteps"], at("n_timesteps")),
+        n_envs=positive_whole(settings.get("n_envs", 1), at("n_envs")),
+        vec_env=_vec_env(settings.get("vec_env"), env_id, at("vec_env")),
+        env_kwargs=_env_kwargs(settings.get("env_kwargs"), env_id, at("env_kwargs")),
+        policy=_known(settings.get("policy", "MlpPolicy"), algorithm.policy_aliases, at("policy")),
+        policy_kwargs=parse_mapping(settings.get("policy_kwargs"), at("policy_kwargs")),
+        expert=settings.get("expert") or ("pid" if learns else None),
+        callback=qualified_classes(settings.get("callback"), at("callback")),
+        env_wrapper=qualified_classes(settings.get("env_wrapper"), at("env_wrapper")),
+        vec_env_wrapper=qualified_classes(settings.get("vec_env_wrapper"), at("vec_env_wrapper")),
+        hyperparams={key: convert(value, parameters[key], at(key)) for key, value in settings.items() if key in parameters},
         settings=dict(settings),
     )
 
@@ -173,12 +180,23 @@ def _read(conf_file: str | Path) -> tuple[Any, str]:
     return read_yaml(resources.files("sb3_quad.zoo_configs").joinpath(name).read_text(encoding="utf-8"), name), name
 
 
-def _env_kwargs(value: Any, env_id: str, where: str) -> dict[str, Any]:
-    kwargs = {key: parse_number(entry) for key, entry in parse_mapping(value, where).items()}
-    if env_id in ENVIRONMENTS:
-        from sb3_quad.training.environments import quadcopter_keywords
+def _known(value: Any, valid: Collection[str], where: str) -> str:
+    if str(value) not in valid:
+        source, _, key = where.rpartition(": ")
+        raise ConfigError(f"{source}: {unknown(key, value, valid)}")
+    return str(value)
 
-        for key in kwargs:
-            if key not in quadcopter_keywords():
-                raise ConfigError(f"{where}: {unknown(f'keyword of {env_id}', key, quadcopter_keywords())}")
+
+def _vec_env(value: Any, env_id: str, where: str) -> str:
+    kind = _known(value or ("batch" if env_id in ENVIRONMENTS else "dummy"), VEC_ENVS, where)
+    if kind == "batch" and env_id not in ENVIRONMENTS:
+        raise ConfigError(f"{where} is batch, but {env_id} has no batched form; use dummy or subproc")
+    return kind
+
+
+def _env_kwargs(value: Any, env_id: str, where: str) -> dict[str, Any]:
+    kwargs = parse_mapping(value, where)
+    for key in kwargs:
+        if env_id in ENVIRONMENTS and key not in QUADCOPTER_KEYWORDS:
+            raise ConfigError(f"{where}: {unknown(f'keyword of {env_id}', key, QUADCOPTER_KEYWORDS)}")
     return kwargs

@@ -17,6 +17,7 @@ CLASSES = {
     **{f"optim.{name}": ("torch.optim", name) for name in _OPTIMIZERS},
 }
 _PREFIXES = ("torch.", "th.")
+_CLASS_NAME = re.compile(r"((torch|th)\.)?(nn|optim)\.")
 
 
 class _NotLiteral(ValueError):
@@ -36,7 +37,7 @@ def parse_number(value: Any) -> Any:
 
 
 def parse_value(text: str) -> Any:
-    """The value of ``v`` in ``--hyperparams k:v``: a literal, ``dict(…)`` or a known class; else the string itself.
+    """The value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the string itself.
 
     >>> parse_value("[64, 64]"), parse_value("dict(a=1)"), parse_value("mse"), parse_value("lin_1e-3")
     ([64, 64], {'a': 1}, 'mse', 'lin_1e-3')
@@ -84,16 +85,18 @@ def find_class(name: str) -> type | None:
 def _named(value: Any, key: str) -> Any:
     if isinstance(value, dict):
         return {name: _named(entry, f"{key}.{name}") for name, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_named(entry, key) for entry in value)
     if not isinstance(value, str):
         return value
     found = find_class(value)
-    if found is None and re.match(r"((torch|th)\.)?(nn|optim)\.", value):
+    if found is None and _CLASS_NAME.match(value):
         raise ConfigError(f"{key}: {unknown('class', value, CLASSES)}")
     return found if found is not None else parse_number(value)
 
 
 def _evaluate(node: ast.expr) -> Any:
-    """The value of a syntax tree of literals, containers, ``dict(…)`` calls and classes of ``CLASSES``."""
+    """The value of a syntax tree of literals, containers, ``dict(…)`` calls; names such as ``nn.Tanh`` as strings."""
     match node:
         case ast.Constant(value=value) if value is None or isinstance(value, (bool, int, float, str)):
             return value
@@ -107,9 +110,6 @@ def _evaluate(node: ast.expr) -> Any:
             return {_evaluate(key): _evaluate(value) for key, value in zip(keys, values, strict=True) if key is not None}
         case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(entry.arg for entry in keywords):
             return {str(entry.arg): _evaluate(entry.value) for entry in keywords}
-        case ast.Attribute():
-            found = find_class(ast.unparse(node))
-            if found is not None:
-                return found
-            raise _NotLiteral(unknown("class", ast.unparse(node), CLASSES))
+        case ast.Attribute() if _CLASS_NAME.match(ast.unparse(node)):
+            return ast.unparse(node)
     raise _NotLiteral(f"{ast.unparse(node)!r} is not a literal")

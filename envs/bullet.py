@@ -1,0 +1,119 @@
+"""One quadcopter's rigid body in a PyBullet simulation of its own."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import weakref
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pybullet as p
+
+from sb3_quad.dynamics.rotors import write_body
+from sb3_quad.dynamics.state import QuadcopterState
+from sb3_quad.dynamics.vehicle import Vehicle
+from sb3_quad.envs.urdf import vehicle_urdf
+from sb3_quad.errors import ConfigError
+
+FloatArray = npt.NDArray[np.float64]
+_ORIGIN = (0.0, 0.0, 0.0)
+
+
+class BulletBody:
+    """The rigid body of a vehicle in a PyBullet client of its own; several live side by side.
+
+    PyBullet integrates a floating multibody base, which is what specification section 1 describes: explicit velocities,
+    then the pose by the new velocities. The body is the only one in the simulation that can move or be touched; contact
+    with the ground is decided by the task from the position, not here.
+
+    :param vehicle: mass, inertia, gravity, collision radius and physics step.
+    :param window: width and height in pixels of PyBullet's window; needs a display, and PyBullet allows one per process.
+        None: no window.
+    :param visuals: load the body's looks, too; only needed for pictures.
+    :raises ConfigError: the window cannot be opened.
+    """
+
+    def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None, visuals: bool = False) -> None:
+        self.client = int(p.connect(p.DIRECT)) if window is None else _open_window(*window)
+        # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's clients are limited.
+        self._close = weakref.finalize(self, _disconnect, self.client)
+        p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
+        p.setPhysicsEngineParameter(fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client)
+        flags = p.URDF_USE_INERTIA_FROM_FILE | (0 if visuals else p.URDF_IGNORE_VISUAL_SHAPES)
+        self.body = load_urdf_text(vehicle_urdf(vehicle), self.client, flags=flags)
+        p.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=self.client)
+
+    @property
+    def connected(self) -> bool:
+        """Whether the simulation is still there: neither closed nor its window shut."""
+        return self._close.alive and bool(p.isConnected(self.client))
+
+    def place(self, state: FloatArray) -> None:
+        """Put the body where column 0 of ``state``, (STATE_SIZE, n), says."""
+        first = QuadcopterState(state[:, :1])
+        w, x, y, z = first.quaternion[0].tolist()
+        rates = first.rotation[0] @ first.body_rates[0]
+        p.resetBasePositionAndOrientation(self.body, first.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
+        p.resetBaseVelocity(self.body, first.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
+
+    def fly(self, wrenches: FloatArray) -> None:
+        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame."""
+        client, body, frame = self.client, self.body, p.LINK_FRAME
+        push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
+        for force, torque in wrenches.tolist():
+            push(body, -1, force, _ORIGIN, frame, physicsClientId=client)
+            twist(body, -1, torque, frame, physicsClientId=client)
+            step(physicsClientId=client)
+
+    def fly_pushed(self, wrenches: FloatArray, world_force: FloatArray, world_torque: FloatArray) -> None:
+        """As :meth:`fly`, with a force and a torque in the world frame, (3,) each, besides."""
+        client, body = self.client, self.body
+        outer_force, outer_torque = world_force.tolist(), world_torque.tolist()
+        for wrench in wrenches:
+            # A world-frame force acts at a point of the world: the centre of mass, where it is now.
+            position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
+            p.applyExternalForce(body, -1, outer_force, position, p.WORLD_FRAME, physicsClientId=client)
+            p.applyExternalTorque(body, -1, outer_torque, p.WORLD_FRAME, physicsClientId=client)
+            self.fly(wrench[None])
+
+    def read(self, state: FloatArray) -> None:
+        """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
+        position, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
+        velocity, angular_velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
+        write_body(state, position, quaternion, velocity, angular_velocity)
+
+    def close(self) -> None:
+        """Disconnect this client, and no other; calling it twice is fine."""
+        self._close()
+
+
+def load_urdf_text(urdf: str, client: int, **options: Any) -> int:
+    """Load a URDF given as text; the body's number. PyBullet reads files only, so one is written and removed."""
+    with tempfile.TemporaryDirectory(prefix="sb3_quad_") as folder:
+        path = Path(folder, "body.urdf")
+        path.write_text(urdf, encoding="utf-8")
+        return int(p.loadURDF(str(path), physicsClientId=client, **options))
+
+
+def _open_window(width: int, height: int) -> int:
+    # Without a display PyBullet ends the whole process instead of failing.
+    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
+        raise ConfigError("render_mode 'human' needs a display, and DISPLAY is not set; use render_mode='rgb_array'")
+    sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
+    try:
+        client = int(p.connect(p.GUI, options=f"--width={width} --height={height} {sky}"))
+    except p.error as error:
+        raise ConfigError(f"render_mode 'human': PyBullet opens one window per process ({error})") from None
+    if client < 0:
+        raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
+    return client
+
+
+def _disconnect(client: int) -> None:
+    if p.isConnected(client):
+        p.disconnect(physicsClientId=client)

@@ -1,0 +1,349 @@
+"""``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+from gymnasium import spaces
+
+from sb3_quad.dynamics.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
+from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.dynamics.streams import STEP, new_streams, stream_key
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.envs.batch import QuadcopterBatch
+from sb3_quad.envs.bullet import BulletBody
+from sb3_quad.envs.observation import OBSERVATION_SIZE
+from sb3_quad.envs.rendering import RENDER_MODES, Renderer, check_size
+from sb3_quad.envs.tasks import TaskSpec, score
+from sb3_quad.errors import ConfigError, unknown
+
+FloatArray = npt.NDArray[np.float64]
+Observation = npt.NDArray[np.float32]
+_START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
+
+
+class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+    """
+    ## Description
+
+    A quadcopter with slow motors and a delayed command flies to a target and stays there. Two tasks are registered:
+
+    | id | start | target |
+    |----|-------|--------|
+    | `QuadTargetTracking-v0` | hovering at (0, 0, 15) m | 10 m away in a uniformly random direction |
+    | `QuadStateRecovery-v0` | at (0, 0, 15) m, thrown: any attitude, velocity and body rates at random | (0, 0, 15) m |
+
+    The vehicle, the tasks and all numbers are those of the study thesis STUD-512; its equations are cited by number. The
+    body is flown by PyBullet; :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` flies many at once by compiled code, and
+    its row `i` agrees with this environment reset with `seed + i` to 1e-9.
+
+    The world frame has z up and the ground at z = 0. The body frame has x forward, y left, z up. Units are SI.
+
+    ## Action Space
+
+    `Box(-1, 1, (4,), float32)`: the commanded thrust of each rotor, as (0.5 a + 1) m g / 4 (Eq. 3.18; the limits are the
+    vehicle's), so that 0 is hover. Numbers outside [-1, 1] are clipped; ones that are not finite are refused.
+
+    | Num | Rotor (default vehicle) | Min | Max | Thrust (N) |
+    |-----|-------------------------|-----|-----|------------|
+    | 0 | front left | -1 | 1 | 2.12 to 6.35 |
+    | 1 | front right | -1 | 1 | 2.12 to 6.35 |
+    | 2 | rear right | -1 | 1 | 2.12 to 6.35 |
+    | 3 | rear left | -1 | 1 | 2.12 to 6.35 |
+
+    A command acts one control step (0.01 s) after it was given; then the rotor speed follows it by Eq. 4.1.
+
+    ## Observation Space
+
+    `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, drawn afresh every control step, then
+    `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2).
+
+    | Num | Feature | Frame | Unit | std |
+    |-----|---------|-------|------|-----|
+    | 0-2 | position relative to the target, r - r_T | world | m | 10/√3 |
+    | 3-11 | rotation matrix world to body, row by row | - | - | √3 |
+    | 12-14 | linear velocity | body | m/s | 5 |
+    | 15-17 | angular velocity | body | rad/s | 5 |
+
+    ## Rewards
+
+    Per control step, on the true state (Eqs. 4.5-4.9):
+    `-0.003 |r - r_T| - 0.002 arccos(R33) - 0.0005 |ω|`, and -15 on touching the ground, -15 on getting out of range.
+
+    ## Starting State
+
+    As the table above says. State recovery: attitude uniform on SO(3), velocity N(0, 2 m/s) and body rates N(0, 4 rad/s)
+    per axis. Rotors turn at hover speed, and hover is the command under way. `reset(options=...)` fixes a start:
+
+    | Key | Meaning |
+    |-----|---------|
+    | `target` | r_T, (3,), world frame, m |
+    | `state` | any of `position` (m), `quaternion` (w, x, y, z; body to world; normalised), `velocity` (world frame, m/s), `body_rates` (body frame, rad/s); what is left out is drawn as ever |
+
+    The same seed and the same actions give the same episode, bit for bit.
+
+    ## Episode End
+
+    - *Terminated*: the collision sphere (radius 0.135 m) touches the ground, or |r - r_T| > 30 m.
+    - *Truncated*: after 1500 control steps (15 s), by `max_episode_steps` of `gymnasium.make`.
+
+    ## Info
+
+    | Key | Meaning |
+    |-----|---------|
+    | `is_success` | not terminated so far; at the end of the episode, the thesis's success |
+    | `distance` | \\|r - r_T\\|, m |
+    | `collision` | the ground was touched |
+    | `out_of_range` | too far from the target |
+
+    ## Arguments
+
+    ```python
+    import gymnasium
+    import sb3_quad
+
+    env = gymnasium.make("QuadTargetTracking-v0", noise=0.0, task_kwargs={"target_distance": 15.0}, render_mode="rgb_array")
+    ```
+
+    | Argument | Default | Meaning |
+    |----------|---------|---------|
+    | `task` | by id | a name, a :class:`~sb3_quad.envs.tasks.Task`, or a mixture `{name: weight}` drawn from at each reset |
+    | `task_kwargs` | `None` | fields of the task to override |
+    | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.dynamics.vehicle.Vehicle` |
+    | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
+    | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
+    | `render_mode` | `None` | `"human"` (a window, in real time), `"rgb_array"` (pictures, without a display) |
+    | `render_width`, `render_height` | 640, 480 | size of pictures and window, pixels |
+
+    ## While Flying
+
+    On `env.unwrapped`; all hold until set anew, `set_target` until the next reset:
+    `set_target(position)`, `set_wrench(force, torque, force_frame, torque_frame)` (external, at the centre of mass),
+    `set_noise(level)`, `set_observation_scaling(mean, std)`, `set_task(task, task_kwargs)` (from the next reset);
+    `true_state()`, `target`, `noise`, `observation_mean`, `observation_std` and `vehicle` tell what holds.
+
+    ## Version History
+
+    - v0: first version.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # type: ignore[misc]
+
+    def __init__(
+        self,
+        task: TaskSpec = "target_tracking",
+        task_kwargs: Mapping[str, Any] | None = None,
+        vehicle: str | Path | Vehicle = "itm",
+        noise: float = 0.05,
+        observation_mean: npt.ArrayLike | None = None,
+        observation_std: npt.ArrayLike | None = None,
+        render_mode: str | None = None,
+        render_width: int = 640,
+        render_height: int = 480,
+    ) -> None:
+        if render_mode is not None and render_mode not in RENDER_MODES:
+            raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
+        self._vehicle = load_vehicle(vehicle)
+        self._batch = QuadcopterBatch(1, task, task_kwargs, self._vehicle, noise, observation_mean, observation_std)
+        self._wrenches = np.zeros((self._vehicle.substeps, 2, 3))
+        self._reward = np.zeros(1)
+        self._seeded = False
+        self._ready = False
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+        self.render_mode = render_mode
+        if render_mode is not None:
+            self.metadata = {**self.metadata, "render_fps": round(1.0 / self._vehicle.control_step)}
+        check_size(render_width, render_height)
+        human = render_mode == "human"
+        window = (render_width, render_height) if human else None
+        self._body = BulletBody(self._vehicle, window, visuals=render_mode == "rgb_array")
+        self._renderer = None
+        if render_mode is not None:
+            self._renderer = Renderer(self._vehicle, self._body, render_width, render_height, human)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """Begin an episode.
+
+        :param seed: begins a new stream of random numbers; None: the next episode of the present one.
+        :param options: a fixed ``target`` and parts of the ``state``, as the class says.
+        :raises ConfigError: an unknown option, or a value that is no start.
+        """
+        super().reset(seed=seed)
+        batch = self._batch
+        fixed = _check_options(options, self._vehicle)
+        if seed is not None or not self._seeded:
+            batch.streams[:] = new_streams(np.array([stream_key(self.np_random)], dtype=np.uint64))
+            self._seeded = True
+        batch.reset()
+        for rows, values in fixed:
+            batch.state[rows, 0] = values
+        self._body.place(batch.state)
+        self._ready = True
+        # The start itself is never scored; these are for the info only.
+        position, target = batch.state[POSITION, 0], batch.state[TARGET, 0]
+        batch.distance[0] = np.linalg.norm(position - target)
+        batch.collided[0] = batch.out_of_range[0] = False
+        if self._renderer is not None:
+            self._renderer.reset(batch.state)
+            if self.render_mode == "human":
+                self.render()
+        return batch.observe()[0], self._info()
+
+    def step(self, action: npt.NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """Fly one control step.
+
+        :param action: (4,), clipped to [-1, 1].
+        :raises ValueError: a wrong shape, or a number that is not finite.
+        """
+        batch, body, wrenches = self._batch, self._body, self._wrenches
+        array = np.asarray(action, dtype=np.float32)
+        if array.shape != (4,):
+            raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
+        if not self._ready:
+            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        state, wrench, vehicles = batch.state, batch.wrench, batch.vehicles
+        kind = rotor_wrenches(state, batch.queue, array, wrench, vehicles, self._vehicle.physics_step, wrenches)
+        if kind == NOT_FINITE:
+            raise ValueError(f"action {array.tolist()}: every number must be finite")
+        if kind == WORLD_FRAME_TOO:
+            body.fly_pushed(wrenches, wrench[0:3, 0], wrench[6:9, 0])
+        else:
+            body.fly(wrenches)
+        body.read(state)
+        batch.streams[STEP, 0] += 1
+        collided, out_of_range = batch.collided, batch.out_of_range
+        parameters = batch.tasks.parameters
+        score(state, vehicles, batch.task_index, parameters, self._reward, collided, out_of_range, batch.distance)
+        if self.render_mode == "human":
+            self.render()
+        info = self._info()
+        return batch.observe()[0], float(self._reward[0]), not info["is_success"], False, info
+
+    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
+        """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, which draws into its window."""
+        if self._renderer is None:
+            gymnasium.logger.warn("render() does nothing without a render_mode; pass render_mode='rgb_array' to make()")
+            return None
+        return self._renderer.render(self._batch.state, self._batch.wrench)
+
+    def close(self) -> None:
+        """End the simulation; calling it twice is fine."""
+        self._ready = False
+        self._body.close()
+
+    def true_state(self) -> QuadcopterState:
+        """The true state, a live view of one row."""
+        return self._batch.true_state()
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """The vehicle's parameters."""
+        return self._vehicle
+
+    @property
+    def target(self) -> FloatArray:
+        """r_T, (3,), world frame, m."""
+        return self._batch.state[TARGET, 0].copy()
+
+    @property
+    def noise(self) -> float:
+        """Relative standard deviation of the observation noise."""
+        return float(self._batch.noise_level[0])
+
+    @property
+    def observation_mean(self) -> FloatArray:
+        """μ of Eq. 3.16, (18,)."""
+        return self._batch.mean[:, 0].copy()
+
+    @property
+    def observation_std(self) -> FloatArray:
+        """σ of Eq. 3.16, (18,)."""
+        return self._batch.std[:, 0].copy()
+
+    def set_target(self, position: npt.ArrayLike) -> None:
+        """Move the target, (3,), world frame, m; until the next reset."""
+        self._batch.set_target(_vector("target", position, 3))
+
+    def set_wrench(
+        self,
+        force: npt.ArrayLike = (0.0, 0.0, 0.0),
+        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
+        force_frame: str = "world",
+        torque_frame: str = "body",
+    ) -> None:
+        """Apply an external force (N) and torque (N m), (3,) each, at the centre of mass until set anew.
+
+        :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of ``torque``.
+        """
+        self._batch.set_wrench(_vector("force", force, 3), _vector("torque", torque, 3), force_frame, torque_frame)
+
+    def set_noise(self, level: float) -> None:
+        """Set the relative standard deviation of the observation noise; 0: none."""
+        self._batch.set_noise(level)
+
+    def set_observation_scaling(self, mean: npt.ArrayLike | None = None, std: npt.ArrayLike | None = None) -> None:
+        """Set μ and σ of Eq. 3.16, (18,) each; None leaves one as it is."""
+        self._batch.set_observation_scaling(
+            None if mean is None else _vector("observation_mean", mean, OBSERVATION_SIZE),
+            None if std is None else _vector("observation_std", std, OBSERVATION_SIZE),
+        )
+
+    def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> None:
+        """Set the task of all episodes that begin from now on."""
+        self._batch.set_task(task, task_kwargs)
+
+    def _info(self) -> dict[str, Any]:
+        batch = self._batch
+        collision, out_of_range = bool(batch.collided[0]), bool(batch.out_of_range[0])
+        return {
+            "is_success": not (collision or out_of_range),
+            "distance": float(batch.distance[0]),
+            "collision": collision,
+            "out_of_range": out_of_range,
+        }
+
+
+def _check_options(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
+    """The rows of the state that ``options`` of reset fix, and their values."""
+    options = options or {}
+    for key in options:
+        if key not in ("target", "state"):
+            raise ConfigError(f"options: {unknown('key', key, ('target', 'state'))}")
+    start = options.get("state") or {}
+    if not isinstance(start, Mapping):
+        raise ConfigError(f"options: state must map names to values (valid names: {', '.join(_START)})")
+    fixed = [(TARGET, _vector("target", options["target"], 3))] if options.get("target") is not None else []
+    for key, value in start.items():
+        if key not in _START:
+            raise ConfigError(f"options: {unknown('state key', key, _START)}")
+        values = _vector(key, value, 4 if key == "quaternion" else 3)
+        if key == "quaternion":
+            norm = np.linalg.norm(values)
+            if norm < 1e-6:
+                raise ConfigError("quaternion: must not be zero")
+            values = values / norm
+        if key == "position" and values[2] <= vehicle.collision_radius:
+            raise ConfigError(f"position {values.tolist()}: touches the ground; z must exceed {vehicle.collision_radius} m")
+        fixed.append((_START[key], values))
+    return fixed
+
+
+def _vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
+    """``value`` as finite numbers of shape (size,)."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigError(f"{name} {value!r}: must be {size} numbers") from None
+    if array.shape != (size,):
+        raise ConfigError(f"{name} of shape {array.shape}: must be ({size},)")
+    if not np.isfinite(array).all():
+        raise ConfigError(f"{name} {array.tolist()}: every number must be finite")
+    return array

@@ -1,0 +1,47 @@
+"""Subcommands, errors and exit codes."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from sb3_quad.cli import benchmark, train
+from sb3_quad.cli.arguments import Parser
+from sb3_quad.errors import ConfigError, SB3QuadError, unknown
+
+EXIT_CODES = """exit codes:
+  0    done
+  2    bad input, or a training that cannot go on: one line on stderr says what
+  130  interrupted by Ctrl-C, after saving
+  143  interrupted by SIGTERM, after saving
+"""
+COMMANDS = {"train": train, "benchmark": benchmark}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EXIT_CODES)
+    subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=command.HELP, description=command.HELP, epilog=command.EXAMPLES)
+        command.add_arguments(subparser)
+    try:
+        if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+            raise ConfigError(unknown("command", arguments[0], COMMANDS))
+        options = parser.parse(arguments)
+        if options.command is None:
+            parser.print_help()
+            return 0
+        return COMMANDS[options.command].run(options)
+    except SB3QuadError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # as in `sb3-quad train --help | head`
+        sys.stderr.close()
+        return 0
+    except SystemExit as leaving:  # argparse, after --help
+        return int(leaving.code or 0)

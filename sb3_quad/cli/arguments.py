@@ -1,0 +1,63 @@
+"""Argument parsing with one-line errors, and the kinds of arguments rl-zoo has."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any, NoReturn
+
+from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.training.literals import parse_number, parse_value
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(
+            **{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs}  # type: ignore[arg-type]
+        )
+
+    def error(self, message: str) -> NoReturn:
+        """:raises ConfigError: always."""
+        raise ConfigError(message)
+
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """The options of a command line.
+
+        :raises ConfigError: an unknown option, a missing or bad value.
+        """
+        options, rest = self.parse_known_args(arguments)
+        if rest:
+            name = rest[0].split("=")[0]
+            raise ConfigError(unknown("option", name, self._options(options.command)).split(" (valid:")[0] + "; see --help")
+        return options
+
+    def _options(self, command: str | None) -> list[str]:
+        parsers: list[argparse.ArgumentParser] = [self]
+        for action in self._actions:
+            if isinstance(action, argparse._SubParsersAction) and command in action.choices:
+                parsers.append(action.choices[command])
+        return [option for parser in parsers for action in parser._actions for option in action.option_strings]
+
+
+def whole(text: str) -> int:
+    """A whole number, also as ``1e6``."""
+    number = parse_number(text)
+    if isinstance(number, str) or number != int(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number")
+    return int(number)
+
+
+def pairs(entries: Sequence[str] | None, option: str) -> dict[str, Any]:
+    """``k:v`` entries as a mapping.
+
+    :raises ConfigError: an entry without a colon.
+    """
+    found: dict[str, Any] = {}
+    for entry in entries or []:
+        key, colon, value = entry.partition(":")
+        if not colon or not key:
+            raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
+        found[key.strip()] = parse_value(value)
+    return found

@@ -1,0 +1,175 @@
+"""``train``: one training run, and its agent beside the expert at the end."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import random
+import sys
+import time
+from typing import TYPE_CHECKING, Any
+
+from sb3_quad.cli.arguments import pairs, whole
+from sb3_quad.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sb3_quad.training.job import TrainingJob
+    from sb3_quad.training.trainer import TrainingResult
+
+HELP = "Train an agent. Without arguments: stage one, DAgger from the PID expert on QuadTargetTracking-v0."
+EXAMPLES = """examples:
+  sb3-quad train                                          stage one, on the batched environment
+  sb3-quad train --vec-env subproc --n-envs 8             the same on PyBullet, one process each
+  sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
+  sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
+  sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
+  sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip
+  sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
+  sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
+"""
+FRESH_SEED = 2**19  # added to the seed: targets that neither training nor evaluations along the way have seen
+FRESH_EPISODES = 240
+DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of rl-zoo's ``train.py``, with their meanings."""
+    add = parser.add_argument
+    add("--algo", help=f"algorithm: dagger, ppo_bc or ppo ({DEFAULT_ALGO})")
+    add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
+    add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
+    add("-n", "--n-timesteps", type=whole, metavar="N", help="transitions to train on")
+    add("--n-envs", type=whole, metavar="N", help="environments side by side")
+    add("--vec-env", metavar="KIND", help="batch (compiled), dummy (PyBullet, one process) or subproc (one process each)")
+    add("--expert", metavar="SPEC", help="pid, path/to/model.zip or package.module:factory")
+    add("-params", "--hyperparams", nargs="+", metavar="K:V", help="settings to change, such as n_steps:500")
+    add("--env-kwargs", nargs="+", metavar="K:V", help="keywords of the environment, such as noise:0")
+    add("--eval-env-kwargs", nargs="+", metavar="K:V", help="the same, for the evaluation's environments only")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
+    add("-i", "--trained-agent", metavar="ZIP", help="agent to start from: policy and critic of an SB3 on-policy zip")
+    add("--resume", metavar="RUN_FOLDER", help="go on with an interrupted run; all its settings are kept")
+    add("-f", "--log-folder", metavar="DIR", help="where run folders go (logs)")
+    add("-uuid", "--uuid", action="store_true", help="add a UUID to the run folder's name")
+    add("--seed", type=int, help="seed (0); negative: a random one, noted in args.yml")
+    add("--eval-freq", type=whole, metavar="N", help="transitions between evaluations (250000); below 1: one at the end")
+    add("--eval-episodes", type=whole, metavar="N", help="episodes of an evaluation (48); 0: no evaluations")
+    add("--n-eval-envs", type=whole, metavar="N", help="environments to evaluate in (batch: one per episode; else 1)")
+    add("--save-freq", type=whole, metavar="N", help="transitions between checkpoints (none)")
+    add("--log-interval", type=whole, metavar="N", help="rollouts between two tables of --verbose 1 (1)")
+    add("-tb", "--tensorboard-log", metavar="DIR", help="folder for TensorBoard")
+    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
+    add("--device", help="cpu (default), cuda or auto")
+    add("--num-threads", type=whole, metavar="N", help="threads of PyTorch (its own choice)")
+    add("--verbose", type=int, choices=(0, 1, 2), help="1: SB3's tables, 2: debugging (0)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Train, compare, tell where everything is. Returns the exit code."""
+    for package in options.gym_packages:
+        try:
+            importlib.import_module(package)
+        except ImportError as error:
+            raise ConfigError(f"--gym-packages {package}: cannot be imported ({error})") from None
+    if options.num_threads is not None:
+        _set_threads(options.num_threads)
+    if options.resume is not None:
+        result = _resume(options)
+    else:
+        job = make_job(options)
+        from sb3_quad.training.job import describe
+        from sb3_quad.training.trainer import train
+
+        _say(describe(job))
+        result = train(job, _say)
+    if result.exit_code == 0:
+        _finish(result)
+    return result.exit_code
+
+
+def make_job(options: argparse.Namespace) -> TrainingJob:
+    """The job that a command line describes."""
+    from sb3_quad.training.config import load_config
+    from sb3_quad.training.job import TrainingJob
+
+    overrides = pairs(options.hyperparams, "--hyperparams")
+    for name in ("n_timesteps", "n_envs", "vec_env", "expert"):
+        if getattr(options, name) is not None:
+            overrides[name] = getattr(options, name)
+    if options.env_kwargs is not None:
+        overrides["env_kwargs"] = pairs(options.env_kwargs, "--env-kwargs")
+    config = load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, overrides)
+    seed = 0 if options.seed is None else options.seed if options.seed >= 0 else random.SystemRandom().randrange(2**31)
+    names = ("log_folder", "device", "trained_agent", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq")
+    given = {name: getattr(options, name) for name in (*names, "log_interval", "tensorboard_log", "verbose")}
+    given["eval_env_kwargs"] = pairs(options.eval_env_kwargs, "--eval-env-kwargs") or None
+    return TrainingJob(
+        config,
+        seed=seed,
+        unique=options.uuid,
+        progress=_progress(options),
+        **{name: value for name, value in given.items() if value is not None},
+    )
+
+
+def _resume(options: argparse.Namespace) -> TrainingResult:
+    from sb3_quad.training.trainer import resume
+
+    kept = ("algo", "env", "conf_file", "n_timesteps", "n_envs", "vec_env", "expert", "hyperparams", "env_kwargs")
+    for name in (*kept, "eval_env_kwargs", "trained_agent", "log_folder", "seed"):
+        if getattr(options, name) is not None:
+            raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
+    names = ("device", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "log_interval", "verbose")
+    changes: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return resume(options.resume, _say, progress=_progress(options), **changes)
+
+
+def _finish(result: TrainingResult) -> None:
+    from rich.console import Console
+
+    config = result.job.config
+    if config.task is not None:
+        start = time.perf_counter()
+        table = _compare(result)
+        Console().print(table)
+        _say(f"trained in {result.seconds:.1f} s, flown for this table in {time.perf_counter() - start:.1f} s")
+    else:
+        _say(f"trained in {result.seconds:.1f} s")
+    _say(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
+
+
+def _compare(result: TrainingResult) -> Any:
+    """The table of agent and expert over the same fresh episodes."""
+    from sb3_quad.evaluation.flights import fly
+    from sb3_quad.evaluation.summary import summarise
+    from sb3_quad.evaluation.tables import THESIS, comparison
+    from sb3_quad.experts.resolve import resolve_expert
+
+    config = result.job.config
+    keywords = {key: config.env_kwargs[key] for key in ("vehicle", "noise", "task_kwargs") if key in config.env_kwargs}
+    expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
+    columns = {
+        name: summarise(fly(pilot, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords))
+        for name, pilot in (("agent", result.model), ("expert", expert))
+    }
+    agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
+    figures = THESIS[str(config.task)]
+    thesis = {name: figures[name] for name in (agent, "expert") if name in figures}
+    title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
+    return comparison(title, columns, thesis)
+
+
+def _progress(options: argparse.Namespace) -> bool:
+    return sys.stderr.isatty() if options.progress is None else bool(options.progress)
+
+
+def _set_threads(number: int) -> None:
+    import torch
+
+    if number < 1:
+        raise ConfigError(f"--num-threads {number}: must be at least 1")
+    torch.set_num_threads(number)
+
+
+def _say(line: str) -> None:
+    print(line, flush=True)

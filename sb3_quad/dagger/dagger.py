@@ -1,0 +1,425 @@
+"""DAgger, data aggregation, as a Stable-Baselines3 algorithm (thesis 3.1.2, 4.2.1, Algorithm 3)."""
+
+from __future__ import annotations
+
+import secrets
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_quad.common.labels import ExpertLabeller
+from sb3_quad.common.losses import (
+    CloningLoss,
+    actor_mean,
+    cloning_loss,
+    gaussian_entropy,
+    l2_loss,
+    split_parameters,
+    value_loss,
+)
+from sb3_quad.dagger.checks import check_arguments, check_spaces
+from sb3_quad.dagger.dataset import AggregatedDataset, draw_rows
+from sb3_quad.errors import ConfigError, TrainingError
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+_VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
+
+
+class DAgger(OnPolicyAlgorithm):
+    """
+    Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
+
+    In every control step and every environment, independently, the expert's action flies with probability β, else the
+    agent's sampled action. Each visited observation joins a bounded dataset together with the expert's action for the
+    state *before* the step. The actor learns from mini-batches of the dataset, the critic from the GAE returns of the
+    rollout just flown. The loss is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss that
+    is minimised; entropy is to be encouraged)::
+
+        L_BC + l2_coef * 1/2 Σw² - ent_coef * H + vf_coef * value loss (Eq. 3.8)
+
+    with Σw² over the weight matrices of both networks, without biases and log_std.
+
+    For any environment with a Box action space and observations that are not a Dict. Papers:
+    https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
+
+    A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from generators that are
+    seeded by it and by the updates made so far, so a resumed run draws what the uninterrupted one would have drawn.
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds
+        ``log_std_init``, it begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3 model, or
+        a function from observations to actions; see :class:`~sb3_quad.common.labels.ExpertLabeller` for what each is
+        shown. Never saved: give it again to ``load``, or call :meth:`set_expert`, before learning goes on
+    :param learning_rate: The learning rate, it can be a function
+        of the current progress remaining (from 1 to 0)
+    :param n_steps: The number of steps to run for each environment per update
+    :param batch_size: Minibatch size, in pairs of the dataset
+    :param n_epochs: Passes of the critic over each rollout; and of the actor, over as many pairs as a rollout holds,
+        unless ``gradient_steps`` says otherwise
+    :param gamma: Discount factor
+    :param gae_lambda: Factor for trade-off of bias vs variance for Generalized Advantage Estimator
+    :param clip_range_vf: ε of the clipped value loss (Eq. 3.8), it can be a function of the current progress
+        remaining (from 1 to 0). None: plain mean squared error
+    :param ent_coef: Entropy coefficient c_H
+    :param vf_coef: Value function coefficient
+    :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a large
+        error of the critic does not hold up the actor. None: no clipping
+    :param gradient_steps: Optimiser steps after each rollout. Each takes ``batch_size`` pairs of the dataset and an equal
+        share of the critic's ``n_epochs`` passes. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO
+    :param beta: β of the first rollout, from 0 to 1
+    :param beta_decay: What β loses with every rollout
+    :param beta_final: Where β stops falling
+    :param bc_loss: ``"nll"``, Eq. 3.12, learns the standard deviation too; ``"mse"``, on the mean alone, leaves it to
+        ``log_std_init`` and ``ent_coef``
+    :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
+    :param l2_coef: c_L2
+    :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
+        the reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: the log location for tensorboard (if None, no logging)
+    :param policy_kwargs: additional arguments to be passed to the policy on creation
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
+    :raises ConfigError: an argument out of range, or a space that is not supported
+    :raises ExpertError: an expert that does not fit the environment
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": ActorCriticPolicy,
+        "CnnPolicy": ActorCriticCnnPolicy,
+    }
+
+    dataset: AggregatedDataset
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        expert: Any = None,
+        learning_rate: float | Schedule = 1e-3,
+        n_steps: int = 250,
+        batch_size: int = 8192,
+        n_epochs: int = 10,
+        gamma: float = 0.998,
+        gae_lambda: float = 0.95,
+        clip_range_vf: float | Schedule | None = None,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float | None = 0.5,
+        gradient_steps: int | None = None,
+        beta: float = 0.5,
+        beta_decay: float = 0.001,
+        beta_final: float = 0.3,
+        bc_loss: CloningLoss = "mse",
+        log_std_min: float = -3.0,
+        l2_coef: float = 0.0,
+        dataset_capacity: int = 1_500_000,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            check_spaces(env.observation_space, env.action_space)
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs={"log_std_init": -2.0, **(policy_kwargs or {})},
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.batch_size = batch_size
+        self.n_epochs = n_epochs
+        self.gradient_steps = gradient_steps
+        self.clip_range_vf = clip_range_vf
+        self.beta = beta
+        self.beta_decay = beta_decay
+        self.beta_final = beta_final
+        self.bc_loss: CloningLoss = bc_loss
+        self.log_std_min = log_std_min
+        self.l2_coef = l2_coef
+        self.dataset_capacity = dataset_capacity
+        self.expert: Any = None
+        self._labeller: ExpertLabeller | None = None
+        self._n_rollouts = 0
+        self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
+
+        if expert is not None:
+            self.set_expert(expert)
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        check_arguments(self)
+        super()._setup_model()
+        if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
+            raise ConfigError(
+                f"policy_kwargs {self.policy_kwargs}: DAgger needs a diagonal Gaussian policy (no use_sde)"
+            )
+        if self.clip_range_vf is not None:
+            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        dtype = self.observation_space.dtype
+        self.dataset = AggregatedDataset(
+            self.dataset_capacity or self.n_steps * self.n_envs,
+            self.rollout_buffer.obs_shape,
+            self.rollout_buffer.action_dim,
+            np.float32 if dtype is None or np.issubdtype(dtype, np.floating) else dtype,
+        )
+
+    def set_expert(self, expert: Any) -> None:
+        """Learn from ``expert`` from now on.
+
+        :raises ExpertError: an expert that does not fit the environment
+        """
+        if self.env is not None:
+            self._labeller = ExpertLabeller(expert, self.env)
+        self.expert = expert
+
+    @property
+    def current_beta(self) -> float:
+        """β of the present rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
+        return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
+
+    def _generator(self, purpose: int) -> np.random.Generator:
+        """Random numbers for this rollout (0) or update (1): no state to save, and the same again after a resume."""
+        return np.random.default_rng([self._entropy if self.seed is None else self.seed, purpose, self._n_updates])
+
+    def collect_rollouts(
+        self,
+        env: VecEnv,
+        callback: BaseCallback,
+        rollout_buffer: RolloutBuffer,
+        n_rollout_steps: int,
+    ) -> bool:
+        """Fly ``n_rollout_steps`` steps by the mixture of expert and agent, and add what was seen to the dataset.
+
+        Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The critic evaluates the
+        whole rollout at the end, since it does not change before.
+        """
+        assert self._labeller is not None and self._last_obs is not None
+        self.policy.set_training_mode(False)
+        rng = self._generator(0)
+        beta = self.current_beta
+        n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
+        low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
+        std = np.exp(self.policy.log_std.detach().cpu().numpy())
+        labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)
+        not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
+        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
+        timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, terminal observation
+        n_by_expert = n_steps = 0
+
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+
+        while n_steps < n_rollout_steps:
+            observations: Any = self._last_obs
+            labels[n_steps] = self._labeller.labels(observations)  # of the state before the step
+            with th.no_grad():
+                means = actor_mean(self.policy, self._tensor(observations)).cpu().numpy()
+            sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
+            by_expert = rng.random(n_envs) < beta
+            actions = np.where(by_expert[:, None], labels[n_steps], sampled)
+            clipped_actions = np.clip(actions, low, high).reshape(shape)
+
+            new_obs, rewards, dones, infos = env.step(clipped_actions)
+
+            self.num_timesteps += n_envs
+            n_by_expert += int(by_expert.sum())
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+
+            if dones.any():
+                ended = np.flatnonzero(dones)
+                self._update_info_buffer([infos[row] for row in ended], dones[ended])
+                for row in ended:
+                    if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
+                        timeouts.append((n_steps, int(row), infos[row]["terminal_observation"]))
+
+            rollout_buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)  # type: ignore[arg-type]
+            n_steps += 1
+            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_episode_starts = dones  # type: ignore[assignment]
+
+        flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
+        rollout_buffer.values = self._values(flown).reshape(n_rollout_steps, n_envs)
+        if timeouts:  # a time limit is no failure: what would have followed is worth V of the last observation
+            steps, rows, terminal = zip(*timeouts, strict=True)
+            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * self._values(np.stack(terminal))
+        rollout_buffer.compute_returns_and_advantage(last_values=th.from_numpy(self._values(new_obs)), dones=dones)
+
+        if self.dataset_capacity == 0:
+            self.dataset.clear()
+        self.dataset.add(flown, labels.reshape(-1, action_dim))
+        self._n_rollouts += 1
+
+        self.logger.record("dagger/beta", beta)
+        self.logger.record("dagger/dataset_size", len(self.dataset))
+        self.logger.record("rollout/expert_fraction", n_by_expert / (n_rollout_steps * n_envs))
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _tensor(self, observations: npt.NDArray[Any]) -> th.Tensor:
+        return th.as_tensor(observations, device=self.device)
+
+    def _values(self, observations: Any) -> npt.NDArray[np.float32]:
+        """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
+        with th.no_grad():
+            chunks = [
+                self.policy.predict_values(self._tensor(observations[i : i + _VALUE_CHUNK])).flatten()
+                for i in range(0, len(observations), _VALUE_CHUNK)
+            ]
+        return np.asarray(th.cat(chunks).cpu().numpy(), dtype=np.float32)
+
+    def train(self) -> None:
+        """Update the actor on the dataset and the critic on the rollout just flown.
+
+        :raises TrainingError: a loss or gradient that is not finite; the parameters stay as the last good step left them
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range_vf = self.clip_range_vf(self._current_progress_remaining) if callable(self.clip_range_vf) else None
+        actor_parameters, critic_parameters = split_parameters(self.policy)
+        rng = self._generator(1)
+        buffer = self.rollout_buffer
+        n_rows = buffer.buffer_size * buffer.n_envs
+        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
+        actor_batches = self.dataset.draw(self.batch_size, n_batches, rng)
+        critic_batches = np.array_split(draw_rows(n_rows, self.n_epochs * n_rows, rng), n_batches)
+        flown = th.from_numpy(buffer.observations.reshape(n_rows, *buffer.obs_shape))
+        old_values, returns = th.from_numpy(buffer.values.reshape(-1)), th.from_numpy(buffer.returns.reshape(-1))
+        terms = np.empty((n_batches, 5))  # loss, bc, value, entropy, l2
+
+        for i, rows in enumerate(critic_batches):
+            observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
+            mean, log_std = actor_mean(self.policy, observations), self.policy.log_std
+            bc = cloning_loss(self.bc_loss, mean, log_std, expert_actions)
+            entropy_loss = -gaussian_entropy(log_std)
+            l2 = l2_loss(self.policy)
+
+            index = th.from_numpy(rows)
+            values = self.policy.predict_values(flown[index].to(self.device)).flatten()
+            v_loss = value_loss(
+                values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf
+            )
+
+            loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
+            terms[i] = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()
+            self.policy.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+            norms = [th.nn.utils.clip_grad_norm_(group, limit) for group in (actor_parameters, critic_parameters)]
+            if not np.isfinite(terms[i]).all() or not all(th.isfinite(norm) for norm in norms):
+                self.policy.optimizer.zero_grad()
+                raise TrainingError(
+                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms[i, 1]:.3g}, value loss "
+                    f"{terms[i, 2]:.3g}): the model keeps its last good parameters; lower learning_rate, or look for "
+                    "rewards and observations that are not finite"
+                )
+            self.policy.optimizer.step()
+            with th.no_grad():
+                log_std.clamp_(min=self.log_std_min)
+            self._n_updates += 1
+
+        averages = terms.mean(axis=0)
+        self.logger.record("train/loss", float(averages[0]))
+        self.logger.record("train/bc_loss", float(averages[1]))
+        self.logger.record("train/value_loss", float(averages[2]))
+        self.logger.record("train/entropy_loss", float(averages[3]))
+        self.logger.record("train/l2_loss", float(averages[4]))
+        self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        self.logger.record(
+            "train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten())
+        )
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "DAgger",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """As in SB3. ``reset_num_timesteps=True`` also begins β anew; the dataset stays until :meth:`AggregatedDataset.clear`.
+
+        :raises ExpertError: no expert, or one that does not fit the environment
+        """
+        self.set_expert(self.expert)
+        if reset_num_timesteps:
+            self._n_rollouts = 0
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+    def save_dataset(self, path: str | Path) -> None:
+        """Save the dataset as an .npz file (``.npz`` is added to a name without a suffix).
+
+        :raises ConfigError: a place that cannot be written to
+        """
+        try:
+            self.dataset.save(_with_suffix(path))
+        except OSError as error:
+            raise ConfigError(f"dataset {path}: cannot be written ({error.strerror or error})") from None
+
+    def load_dataset(self, path: str | Path) -> None:
+        """Replace the dataset by a saved one.
+
+        :raises ConfigError: a file that is missing, damaged, or of other observations or actions
+        """
+        self.dataset.load(_with_suffix(path))
+
+    def _excluded_save_params(self) -> list[str]:
+        # Nothing of this package may be pickled: PPO.load must work where it is not installed.
+        return [*super()._excluded_save_params(), "expert", "_labeller", "dataset"]
+
+
+def _with_suffix(path: str | Path) -> Path:
+    path = Path(path)
+    return path if path.suffix else path.with_name(path.name + ".npz")

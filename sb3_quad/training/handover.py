@@ -1,0 +1,60 @@
+"""Starting from a trained agent: its policy and critic, in a new algorithm with a fresh optimiser."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch as th
+
+from sb3_quad.errors import ConfigError
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+
+def hand_over(path: str | Path, model: OnPolicyAlgorithm) -> None:
+    """Give ``model`` the policy and critic of an SB3 zip, of any on-policy algorithm with the same spaces and networks.
+
+    ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that holds. The optimiser
+    stays as it is, so a new model starts with a fresh one.
+
+    :raises ConfigError: a zip that cannot be read, or whose layers differ; the message names the first that does.
+    """
+    theirs = read_policy(path)
+    ours = model.policy.state_dict()
+    for layer in ours:
+        if layer not in theirs:
+            raise ConfigError(f"{path}: has no layer {layer}, which this {type(model).__name__} needs (policy_kwargs differ)")
+        if theirs[layer].shape != ours[layer].shape:
+            raise ConfigError(
+                f"{path}: layer {layer} has shape {tuple(theirs[layer].shape)}, here it is {tuple(ours[layer].shape)}; "
+                "environment spaces and policy_kwargs must be the same"
+            )
+    for layer in theirs:
+        if layer not in ours:
+            raise ConfigError(f"{path}: has a layer {layer} that this {type(model).__name__} lacks (policy_kwargs differ)")
+    if "log_std_init" in model.policy_kwargs and "log_std" in ours:
+        theirs = {**theirs, "log_std": ours["log_std"]}
+    model.policy.load_state_dict(theirs)
+
+
+def read_policy(path: str | Path) -> dict[str, th.Tensor]:
+    """The parameters of the policy in an SB3 zip; nothing in it is unpickled.
+
+    :raises ConfigError: a file that is missing or not a complete SB3 zip.
+    """
+    from stable_baselines3.common.save_util import load_from_zip_file
+
+    file = Path(path)
+    if not file.is_file():
+        raise ConfigError(f"{file}: no such file")
+    try:
+        _, parameters, _ = load_from_zip_file(file, load_data=False, device="cpu")
+        policy = parameters["policy"]
+    except Exception as error:  # what a damaged archive raises depends on where the damage is
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ConfigError(f"{file}: not a complete SB3 zip ({reason[:160]})") from None
+    if not all(th.isfinite(tensor).all() for tensor in policy.values()):
+        raise ConfigError(f"{file}: holds parameters that are not finite")
+    return dict(policy)

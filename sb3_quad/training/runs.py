@@ -1,0 +1,146 @@
+"""Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``.
+
+==========================  =========================================================================
+file                        what
+==========================  =========================================================================
+<Env>.zip                   the model at the end, or where it was interrupted
+best_model.zip              the best of the evaluations: by success, then by mean reward
+rl_model_<N>_steps.zip      checkpoints (``--save-freq``)
+evaluations.npz             every evaluation, as SB3's EvalCallback writes it
+0.monitor.csv               every training episode, as SB3's Monitor writes it
+<Env>/config.yml            the settings
+<Env>/args.yml              the command line's arguments
+resume.npz, dataset.npz     an interrupted run's random numbers, environments and dataset (``--resume``)
+==========================  =========================================================================
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.config import read_yaml
+from sb3_quad.training.files import write_text
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """The paths of one run."""
+
+    path: Path
+    name: str  # the environment id, as file names take it
+
+    @property
+    def model(self) -> Path:
+        return self.path / f"{self.name}.zip"
+
+    @property
+    def best_model(self) -> Path:
+        return self.path / "best_model.zip"
+
+    @property
+    def evaluations(self) -> Path:
+        return self.path / "evaluations.npz"
+
+    @property
+    def episodes(self) -> Path:
+        return self.path / "0.monitor.csv"
+
+    @property
+    def dataset(self) -> Path:
+        return self.path / "dataset.npz"
+
+    @property
+    def resume_state(self) -> Path:
+        return self.path / "resume.npz"
+
+    @property
+    def config(self) -> Path:
+        return self.path / self.name / "config.yml"
+
+    @property
+    def arguments(self) -> Path:
+        return self.path / self.name / "args.yml"
+
+    def checkpoint(self, timesteps: int) -> Path:
+        """Where the model after ``timesteps`` transitions goes."""
+        return self.path / f"rl_model_{timesteps}_steps.zip"
+
+    def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
+        """Write config.yml and args.yml."""
+        self.config.parent.mkdir(exist_ok=True)
+        write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
+        write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
+
+    def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """config.yml and args.yml.
+
+        :raises ConfigError: either missing, unreadable or not a mapping.
+        """
+        contents = []
+        for path in (self.config, self.arguments):
+            try:
+                content = read_yaml(path.read_text(encoding="utf-8"), str(path))
+            except (OSError, UnicodeDecodeError) as error:
+                raise ConfigError(f"{path}: cannot be read ({error})") from None
+            if not isinstance(content, dict):
+                raise ConfigError(f"{path}: must hold keys and values")
+            contents.append(content)
+        return contents[0], contents[1]
+
+
+def file_name(env_id: str) -> str:
+    """An environment id as part of a file name."""
+    return env_id.replace("/", "-").replace(":", "-")
+
+
+def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> RunFolder:
+    """Make the folder of a new run, with the next free number; no other process can get the same one.
+
+    :param unique: add a UUID to the name, as rl-zoo's ``--uuid`` does.
+    :raises ConfigError: a folder that cannot be made.
+    """
+    parent = Path(log_folder) / algo
+    name = file_name(env_id)
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        number = latest_run(parent, name) + 1
+        while True:
+            path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
+            try:
+                os.mkdir(path)  # fails if another run was quicker
+                return RunFolder(path, name)
+            except FileExistsError:
+                number += 1
+    except OSError as error:
+        raise ConfigError(f"log folder {parent}: cannot be written ({error.strerror or error}); give another with -f") from None
+
+
+def latest_run(parent: Path, name: str) -> int:
+    """The greatest run number in a folder, 0 if there is none."""
+    numbers = [0]
+    for entry in parent.glob(f"{name}_*"):
+        number = entry.name.removeprefix(f"{name}_").split("_")[0]
+        if number.isdigit():
+            numbers.append(int(number))
+    return max(numbers)
+
+
+def open_run(path: str | Path) -> RunFolder:
+    """The folder of an existing run.
+
+    :raises ConfigError: a folder that holds no run.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise ConfigError(f"run folder {folder}: no such folder")
+    configs = sorted(folder.glob("*/config.yml"))
+    if len(configs) != 1:
+        raise ConfigError(f"run folder {folder}: holds no run (<Env>/config.yml is missing)")
+    return RunFolder(folder, configs[0].parent.name)

@@ -1,0 +1,50 @@
+"""Ctrl-C and SIGTERM as a request to stop, answered where the training can be left cleanly."""
+
+from __future__ import annotations
+
+import signal
+import threading
+from types import FrameType, TracebackType
+from typing import Any
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StopSignals:
+    """Within its ``with`` block, the first SIGINT or SIGTERM is only noted; a second one raises KeyboardInterrupt.
+
+    Outside the main thread, where Python allows no handlers, signals act as ever.
+    """
+
+    def __init__(self) -> None:
+        self.received: int | None = None
+        self._previous: dict[int, Any] = {}
+
+    @property
+    def exit_code(self) -> int:
+        """What the shell expects of a program that a signal ended: 130 for SIGINT, 143 for SIGTERM; 0 if none came."""
+        return 128 + self.received if self.received else 0
+
+    @property
+    def name(self) -> str:
+        """The signal's name, empty if none came."""
+        return signal.Signals(self.received).name if self.received else ""
+
+    def __enter__(self) -> StopSignals:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.received is not None:
+            raise KeyboardInterrupt
+        self.received = number
+
+
+def ignore_interrupts() -> None:
+    """In a worker process: leave Ctrl-C, which the terminal sends to every process, to the one that trains."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

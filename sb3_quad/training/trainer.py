@@ -1,0 +1,225 @@
+"""Running a training job: from its settings to a run folder with a model, whatever happens on the way."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from sb3_quad.errors import ConfigError, SB3QuadError, TrainingError
+from sb3_quad.training.algorithms import get_algorithm, takes_expert
+from sb3_quad.training.config import TrainingConfig, build_config
+from sb3_quad.training.environments import make_environments
+from sb3_quad.training.files import save_model
+from sb3_quad.training.handover import hand_over
+from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.resume import forget_snapshot, load_snapshot, write_snapshot
+from sb3_quad.training.runs import RunFolder, claim_run, open_run
+from sb3_quad.training.signals import StopSignals
+from sb3_quad.training.values import import_class
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.callbacks import BaseCallback
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+    from stable_baselines3.common.vec_env import VecEnv
+
+    from sb3_quad.callbacks.best_model import BestModel
+    from sb3_quad.callbacks.last_good import LastGoodModel
+
+EVALUATION_SEED = 2**18  # added to the seed for the evaluations along the way; beyond any training environment's
+
+Report = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class TrainingResult:
+    """How a run ended.
+
+    :param seconds: wall-clock time of the training, evaluations along the way included.
+    :param signal: the name of the signal that interrupted it, empty if none did.
+    :param exit_code: 0; 130 after SIGINT, 143 after SIGTERM.
+    """
+
+    job: TrainingJob
+    run: RunFolder
+    model: OnPolicyAlgorithm
+    seconds: float
+    signal: str = ""
+    exit_code: int = 0
+
+
+def train(job: TrainingJob, report: Report = print) -> TrainingResult:
+    """Train as ``job`` says, in a run folder of its own.
+
+    :param report: told of each event in one line.
+    :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
+    """
+    config = job.config
+    with StopSignals() as signals, _environments(job) as (env, eval_env):
+        model = build_model(job, env)
+        if job.trained_agent is not None:
+            hand_over(job.trained_agent, model)
+        run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
+        run.write_yaml(config.settings, job.arguments())
+        return _learn(job, run, model, eval_env, signals, report, config.n_timesteps)
+
+
+def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
+    """Go on with an interrupted run, in its folder: same settings, seed, optimiser, schedules, dataset and step count.
+
+    :param changes: arguments of the job to change, such as ``progress``.
+    :raises SB3QuadError: a folder without an interrupted run, or with damaged files; else as :func:`train`.
+    """
+    run = open_run(run_folder)
+    settings, arguments = run.read_yaml()
+    if not {"algo", "env"} <= arguments.keys():
+        raise ConfigError(f"{run.arguments}: algo or env is missing")
+    config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
+    job = TrainingJob.from_arguments(config, {**arguments, **changes}, run.arguments)
+    with StopSignals() as signals, _environments(job) as (env, eval_env):
+        attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
+        model = load_snapshot(run, config.algo, env, job.device, **attributes)
+        report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} transitions")
+        return _learn(job, run, model, eval_env, signals, report, config.n_timesteps - model.num_timesteps)
+
+
+@contextmanager
+def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, VecEnv | None]]:
+    """The environments to train in and, if there are evaluations, those to evaluate in; closed in the end."""
+    config = job.config
+    made: list[VecEnv] = []
+    try:
+        made.append(make_environments(config, config.n_envs, job.seed))
+        if job.eval_episodes > 0:
+            n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
+            made.append(make_environments(_for_evaluation(job), min(n_envs, job.eval_episodes), job.seed + EVALUATION_SEED))
+        yield made[0], (made[1] if len(made) > 1 else None)
+    finally:
+        for env in made:
+            env.close()
+
+
+def _for_evaluation(job: TrainingJob) -> TrainingConfig:
+    return replace(job.config, env_kwargs={**job.config.env_kwargs, **(job.eval_env_kwargs or {})})
+
+
+def _expert(config: TrainingConfig) -> dict[str, Any]:
+    if not takes_expert(get_algorithm(config.algo)):
+        return {}
+    from sb3_quad.experts.resolve import resolve_expert
+
+    return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
+
+
+def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
+    """The algorithm of a job, new.
+
+    :raises ConfigError: settings that it refuses.
+    """
+    config = job.config
+    keywords = {**config.hyperparams, **_expert(config)}
+    if config.policy_kwargs:
+        keywords["policy_kwargs"] = config.policy_kwargs
+    try:
+        return get_algorithm(config.algo)(
+            config.policy,
+            env,
+            seed=job.seed,
+            device=job.device,
+            verbose=job.verbose,
+            tensorboard_log=job.tensorboard_log,
+            **keywords,
+        )
+    except SB3QuadError:
+        raise
+    except (TypeError, ValueError, AssertionError, RuntimeError) as error:
+        raise ConfigError(f"{config.algo} cannot be made with these settings ({' '.join(str(error).split())})") from error
+
+
+def _learn(
+    job: TrainingJob,
+    run: RunFolder,
+    model: OnPolicyAlgorithm,
+    eval_env: VecEnv | None,
+    signals: StopSignals,
+    report: Report,
+    timesteps: int,
+) -> TrainingResult:
+    callbacks, last_good, best = _callbacks(job, run, eval_env, signals, report)
+    start = time.perf_counter()
+    try:
+        model.learn(
+            timesteps,
+            callback=callbacks,
+            log_interval=job.log_interval,
+            tb_log_name=f"{job.config.algo}_{run.path.name}",
+            reset_num_timesteps=model.num_timesteps == 0,
+            progress_bar=job.progress,
+        )
+        if best is not None and signals.received is None:
+            best.evaluate()
+    except (Exception, KeyboardInterrupt) as error:
+        if signals.received is None:
+            _save_after(error, run, last_good, model)
+            raise
+    seconds = time.perf_counter() - start
+    if signals.received is None:
+        save_model(model, run.model)
+        forget_snapshot(run)
+        return TrainingResult(job, run, model, seconds)
+    if last_good.snapshot is not None:
+        write_snapshot(run, last_good.snapshot, model, resumable=True)
+        report(
+            f"interrupted by {signals.name} after {last_good.snapshot.timesteps:,} transitions: model saved to {run.model}; "
+            f"to go on: --resume {run.path}"
+        )
+    else:
+        report(f"interrupted by {signals.name} before the first rollout: nothing to save in {run.path}")
+    return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
+
+
+def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, model: OnPolicyAlgorithm) -> None:
+    """Save the last good model, and say so in ``error``; a numerical breakdown becomes a TrainingError."""
+    snapshot = last_good.snapshot
+    if snapshot is None:
+        return
+    write_snapshot(run, snapshot, model, resumable=False)
+    where = f"the model after {snapshot.timesteps:,} transitions is in {run.model}"
+    if isinstance(error, SB3QuadError):
+        raise type(error)(f"{error}; {where}") from error
+    if isinstance(error, ValueError) and not _finite(model):
+        raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate; {where}") from error
+    error.add_note(where) if hasattr(error, "add_note") else None
+
+
+def _finite(model: OnPolicyAlgorithm) -> bool:
+    import torch as th
+
+    return all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
+
+
+def _callbacks(
+    job: TrainingJob, run: RunFolder, eval_env: VecEnv | None, signals: StopSignals, report: Report
+) -> tuple[list[BaseCallback], LastGoodModel, BestModel | None]:
+    from sb3_quad.callbacks.best_model import BestModel
+    from sb3_quad.callbacks.checkpoint import Checkpoint
+    from sb3_quad.callbacks.episode_log import EpisodeLog
+    from sb3_quad.callbacks.last_good import LastGoodModel
+    from sb3_quad.callbacks.stop import StopWhen
+
+    last_good = LastGoodModel()
+    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
+    best = None
+    if eval_env is not None:
+        every = job.eval_freq if job.eval_freq > 0 else 2**62
+        seed = job.seed + EVALUATION_SEED
+        best = BestModel(eval_env, every, job.eval_episodes, seed, run.best_model, run.evaluations, report)
+        callbacks.append(best)
+    if job.save_freq > 0:
+        callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
+    for path, kwargs in job.config.callback:
+        callbacks.append(import_class(path, "callback")(**kwargs))
+    callbacks.append(StopWhen(lambda: signals.received is not None))
+    return callbacks, last_good, best

@@ -1,0 +1,385 @@
+"""DAgger: who flies, what is labelled, what is learnt, and what survives an interruption."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from sb3_quad.common.losses import actor_mean, gaussian_entropy, gaussian_nll, l2_loss, value_loss
+from sb3_quad.dagger import DAgger
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.experts.pid import PIDExpert
+
+SMALL = {"n_steps": 32, "batch_size": 64, "n_epochs": 2, "seed": 3, "device": "cpu"}
+N_ENVS = 2
+ROLLOUT = 32 * N_ENVS
+
+
+def turn_back(observation):
+    """A smooth expert for Pendulum-v1, from observations (n, 3) to torques (n, 1)."""
+    return np.clip(-observation[:, 1:2] - 0.3 * observation[:, 2:3], -2.0, 2.0)
+
+
+def pendulum(n_envs=N_ENVS, seed=1):
+    return make_vec_env("Pendulum-v1", n_envs, seed=seed)
+
+
+def build(env=None, expert=turn_back, **kwargs):
+    return DAgger("MlpPolicy", env or pendulum(), expert=expert, **{**SMALL, **kwargs})
+
+
+def parameters(model):
+    return th.cat([p.detach().flatten() for p in model.policy.parameters()])
+
+
+def actor_and_critic(model):
+    named = dict(model.policy.named_parameters())
+    critic = [p for name, p in named.items() if "value" in name]
+    actor = [p for name, p in named.items() if "value" not in name]
+    return th.cat([p.detach().flatten() for p in actor]), th.cat([p.detach().flatten() for p in critic])
+
+
+class Recorder(BaseCallback):
+    """Keeps, per step, what ``keys`` of the algorithm's local variables held; and what the last rollout logged."""
+
+    def __init__(self, *keys):
+        super().__init__()
+        self.keys, self.rows, self.logged = keys, [], {}
+
+    def _on_rollout_end(self):
+        self.logged = dict(self.logger.name_to_value)
+
+    def _on_step(self):
+        self.rows.append([np.copy(self.locals[key]) for key in self.keys])
+        return True
+
+
+# --- Learning ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_agent_becomes_the_expert():
+    model = build(n_epochs=20, learning_rate=1e-2).learn(ROLLOUT * 12)
+    observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
+    with th.no_grad():
+        error = (actor_mean(model.policy, observations) - labels).square().mean()
+    assert error < 0.02 * labels.square().mean()
+
+
+def test_it_learns_to_fly_from_the_true_state():
+    env = QuadcopterVecEnv(64, seed=0, max_episode_steps=400)
+    model = DAgger("MlpPolicy", env, PIDExpert(), learning_rate=LinearSchedule(8e-3, 0.0, 1.0), n_steps=100, batch_size=512,
+                   gradient_steps=40, n_epochs=1, seed=0, device="cpu").learn(64 * 100 * 8)  # fmt: skip
+    flight = QuadcopterVecEnv(32, seed=99, max_episode_steps=400)
+    observation = flight.reset()
+    for _ in range(399):
+        observation, _, dones, _ = flight.step(model.predict(observation, deterministic=True)[0])
+        assert not dones.any()
+    assert np.median(flight.true_state().distance) < 5.0  # of the 10 m it began with; the expert's 2.9 m
+
+
+@pytest.mark.parametrize("bc_loss", ["mse", "nll"])
+def test_an_sb3_model_teaches(bc_loss):
+    teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")
+    model = build(expert=teacher, bc_loss=bc_loss).learn(ROLLOUT)
+    observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
+    np.testing.assert_allclose(labels, teacher.predict(observations.numpy(), deterministic=True)[0], atol=1e-5)
+
+
+def test_without_a_value_term_only_the_actor_moves():
+    model = build(vf_coef=0.0)
+    actor, critic = actor_and_critic(model)
+    model.learn(ROLLOUT)
+    new_actor, new_critic = actor_and_critic(model)
+    assert th.equal(critic, new_critic)
+    assert not th.equal(actor, new_actor)
+
+
+def test_the_critic_does_not_disturb_the_actor():
+    """Their gradients are clipped separately: a large value loss leaves what the actor learns as it is."""
+    actors = [actor_and_critic(build(vf_coef=c, max_grad_norm=0.1).learn(ROLLOUT))[0] for c in (0.0, 100.0)]
+    assert th.equal(*actors)
+
+
+def test_the_critic_learns_the_returns():
+    model = build(n_epochs=30, gamma=0.5, learning_rate=3e-3)
+    losses = []
+    for _ in range(6):
+        model.learn(ROLLOUT, reset_num_timesteps=False)
+        losses.append(model.logger.name_to_value["train/value_loss"])
+    assert losses[-1] < 0.3 * losses[0]
+
+
+def test_the_deviation_stops_at_its_floor():
+    model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(ROLLOUT * 4)
+    assert model.policy.log_std.min().item() == pytest.approx(-1.98)
+
+
+def test_entropy_is_encouraged():
+    """The sign of Eq. 4.3's entropy term: with nothing else on log_std, it grows."""
+    model = build(ent_coef=0.01).learn(ROLLOUT)
+    assert model.policy.log_std.min().item() > -2.0
+
+
+def test_the_weight_penalty_shrinks_weights():
+    assert l2_loss(build(l2_coef=1.0).learn(ROLLOUT * 2).policy) < l2_loss(build().learn(ROLLOUT * 2).policy)
+
+
+# --- Loss terms -------------------------------------------------------------------------------------------------------
+
+
+def test_likelihood_and_entropy_are_those_of_the_policy():
+    policy = build().policy
+    observations, actions = th.randn(20, 3), th.randn(20, 1)
+    _, log_prob, entropy = policy.evaluate_actions(observations, actions)
+    th.testing.assert_close(-gaussian_nll(actor_mean(policy, observations), policy.log_std, actions), log_prob)
+    th.testing.assert_close(gaussian_entropy(policy.log_std).expand(20), entropy)
+
+
+def test_the_clipped_value_loss_is_the_larger_one():
+    values, old, returns = th.randn(100), th.randn(100), th.randn(100)
+    plain = value_loss(values, old, returns, None)
+    assert value_loss(values, old, returns, 1e9) == pytest.approx(plain.item())
+    assert value_loss(values, old, returns, 0.1) > plain
+
+
+# --- Who flies --------------------------------------------------------------------------------------------------------
+
+
+def flown(beta, **kwargs):
+    """One rollout of 32 environments: the share flown by the expert per step and environment, (32, 32)."""
+    recorder = Recorder("actions")
+    model = build(pendulum(32), beta=beta, beta_final=beta, **kwargs).learn(32 * 32, callback=recorder)
+    labels = model.dataset.pairs(th.arange(len(model.dataset)))[1].view(32, 32, 1).numpy()
+    return recorder.logged, (np.array([row[0] for row in recorder.rows]) == labels)[..., 0]
+
+
+def test_the_expert_flies_with_probability_beta():
+    assert flown(1.0)[1].all()
+    assert not flown(0.0)[1].any()
+    logged, by_expert = flown(0.5)
+    assert by_expert.mean() == pytest.approx(0.5, abs=0.08)  # five standard deviations
+    assert logged["rollout/expert_fraction"] == by_expert.mean()
+    assert logged["dagger/beta"] == 0.5
+
+
+def test_mixing_is_independent_per_step_and_environment():
+    by_expert = flown(0.5)[1].astype(float)
+    for axis in (0, 1):
+        assert by_expert.mean(axis=axis).std() == pytest.approx(0.5 / np.sqrt(32), rel=0.5)  # 0 or 0.5 if shared
+
+
+def test_beta_falls_with_every_rollout_and_survives_a_save(tmp_path):
+    model = build(beta=0.5, beta_decay=0.1, beta_final=0.25)
+    seen = []
+    for _ in range(4):
+        seen.append(model.current_beta)
+        model.learn(ROLLOUT, reset_num_timesteps=False)
+    np.testing.assert_allclose(seen, [0.5, 0.4, 0.3, 0.25])
+    model._n_rollouts = 2
+    model.save(tmp_path / "model")
+    assert DAgger.load(tmp_path / "model").current_beta == pytest.approx(0.3)
+    assert model.learn(ROLLOUT).current_beta == pytest.approx(0.4)  # a new count of time begins β anew
+
+
+# --- What is stored ---------------------------------------------------------------------------------------------------
+
+
+def test_labels_belong_to_the_state_before_the_step():
+    model = build().learn(ROLLOUT * 2)
+    observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
+    np.testing.assert_allclose(labels, turn_back(observations.numpy()), atol=1e-6)
+    np.testing.assert_array_equal(observations[-ROLLOUT:].view(32, N_ENVS, 3), model.rollout_buffer.observations)
+
+
+def test_labels_come_from_the_true_state_of_the_same_moment():
+    """Without noise the true state is in the observation, so both ways of asking must agree."""
+    expert = PIDExpert()
+    model = build(QuadcopterVecEnv(8, seed=0, noise=0.0), expert, n_steps=50).learn(400)
+    observations, labels = model.dataset.pairs(th.arange(400))
+    np.testing.assert_allclose(labels, expert.predict(observations.numpy())[0], atol=2e-3)
+
+
+def test_time_limits_are_bootstrapped():
+    """As in SB3: the reward of a truncated step gains γ V(terminal observation)."""
+    recorder = Recorder("rewards", "infos", "dones")
+    model = build(n_steps=201)
+    model._setup_learn(402)
+    model.set_expert(turn_back)
+    recorder.init_callback(model)
+    assert model.collect_rollouts(model.env, recorder, model.rollout_buffer, 201)
+    rewards = np.array([row[0] for row in recorder.rows], dtype=np.float32)
+    assert recorder.rows[199][2].all()
+    terminal = np.stack([info["terminal_observation"] for info in recorder.rows[199][1]])
+    with th.no_grad():
+        rewards[199] += model.gamma * model.policy.predict_values(th.from_numpy(terminal)).numpy().flatten()
+    np.testing.assert_allclose(model.rollout_buffer.rewards, rewards, rtol=1e-5)
+    np.testing.assert_array_equal(model.rollout_buffer.episode_starts[[0, 200]], 1.0)
+    with th.no_grad():
+        values = model.policy.predict_values(th.from_numpy(model.rollout_buffer.observations[7])).flatten()
+    np.testing.assert_allclose(model.rollout_buffer.values[7], values, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("capacity", "sizes"), [(0, [64, 64, 64]), (150, [64, 128, 150]), (1000, [64, 128, 192])])
+def test_the_dataset_grows_to_its_capacity(capacity, sizes):
+    model = build(dataset_capacity=capacity)
+    for size in sizes:
+        recorder = Recorder()
+        model.learn(ROLLOUT, recorder, reset_num_timesteps=False)
+        assert len(model.dataset) == size == recorder.logged["dagger/dataset_size"]
+
+
+# --- Repeating and resuming -------------------------------------------------------------------------------------------
+
+
+def test_a_seed_decides_the_run():
+    first, again, other = (parameters(build(seed=seed).learn(ROLLOUT * 2)) for seed in (3, 3, 4))
+    assert th.equal(first, again)
+    assert not th.equal(first, other)
+
+
+def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
+    settings = {"beta_decay": 0.05, "dataset_capacity": 150, "bc_loss": "nll", "clip_range_vf": 0.2, "seed": None}
+    whole = build(**settings).learn(ROLLOUT * 3)
+    whole.save(tmp_path / "model")
+    whole.save_dataset(tmp_path / "dataset")
+    whole.set_env(pendulum(seed=7))  # episodes begin anew after an interruption, so they do here too
+    whole.learn(ROLLOUT * 3, reset_num_timesteps=False)
+
+    resumed = DAgger.load(tmp_path / "model", env=pendulum(seed=7), device="cpu", expert=turn_back)
+    resumed.load_dataset(tmp_path / "dataset")
+    assert resumed.current_beta == pytest.approx(0.35)
+    resumed.learn(ROLLOUT * 3, reset_num_timesteps=False)
+    assert resumed.num_timesteps == whole.num_timesteps == ROLLOUT * 6
+    assert th.equal(parameters(whole), parameters(resumed))
+
+
+def test_without_its_dataset_a_run_goes_on_differently_but_goes_on(tmp_path):
+    model = build().learn(ROLLOUT)
+    model.save(tmp_path / "model")
+    resumed = DAgger.load(tmp_path / "model", env=pendulum())
+    resumed.set_expert(turn_back)
+    assert len(resumed.learn(ROLLOUT, reset_num_timesteps=False).dataset) == ROLLOUT
+
+
+def test_another_number_of_environments_can_take_over(tmp_path):
+    build().learn(ROLLOUT).save(tmp_path / "model")
+    DAgger.load(tmp_path / "model", env=pendulum(3), expert=turn_back).learn(96, reset_num_timesteps=False)
+
+
+# --- The life of an SB3 algorithm -------------------------------------------------------------------------------------
+
+
+def test_callbacks_progress_bar_and_tensorboard(tmp_path):
+    model = build(tensorboard_log=str(tmp_path / "tb"))
+    evaluation = EvalCallback(pendulum(1), n_eval_episodes=1, eval_freq=32, log_path=str(tmp_path), verbose=0)
+    model.learn(ROLLOUT * 8, callback=[evaluation], progress_bar=True)
+    assert (tmp_path / "evaluations.npz").is_file()
+    assert list((tmp_path / "tb" / "DAgger_1").iterdir())
+    names = set(model.logger.name_to_value)
+    train = ("bc_loss", "value_loss", "entropy_loss", "l2_loss", "std", "explained_variance", "learning_rate", "loss")
+    assert {f"train/{name}" for name in train} <= names
+    assert len(model.ep_info_buffer) == N_ENVS  # an episode of Pendulum-v1 has 200 steps
+
+
+def test_a_callback_can_stop_training():
+    class Stop(BaseCallback):
+        def _on_step(self):
+            return self.n_calls < 40
+
+    model = build().learn(ROLLOUT * 10, callback=Stop())
+    assert model.num_timesteps == 40 * N_ENVS
+    assert len(model.dataset) == ROLLOUT  # the rollout that was cut short is not used
+
+
+def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
+    model = build(policy_kwargs={"net_arch": [16]}).learn(ROLLOUT)
+    model.save(tmp_path / "model")
+    observation = pendulum().reset()
+    loaded = DAgger.load(tmp_path / "model")
+    np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0],
+                                  model.predict(observation, deterministic=True)[0])  # fmt: skip
+    with pytest.raises(ExpertError, match="set_expert"):
+        DAgger.load(tmp_path / "model", env=pendulum()).learn(ROLLOUT)
+
+
+# --- Faults -----------------------------------------------------------------------------------------------------------
+
+
+class BadRewards(VecEnvWrapper):
+    """Pendulum whose rewards turn NaN after some steps."""
+
+    n_good = ROLLOUT
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        observation, rewards, dones, infos = self.venv.step_wait()
+        self.n_good -= self.num_envs
+        return observation, rewards if self.n_good >= 0 else rewards * np.nan, dones, infos
+
+
+def test_a_loss_that_is_not_finite_stops_training_and_spares_the_parameters():
+    good = build().learn(ROLLOUT)
+    model = build(BadRewards(pendulum()))
+    with pytest.raises(TrainingError, match="lower learning_rate"):
+        model.learn(ROLLOUT * 4)
+    assert th.equal(parameters(good), parameters(model))
+
+
+def test_learning_needs_an_expert():
+    with pytest.raises(ExpertError, match="expert"):
+        build(expert=None).learn(ROLLOUT)
+
+
+def test_labels_that_are_not_finite_name_the_row():
+    with pytest.raises(ExpertError, match="row 1"):
+        build(expert=lambda observation: np.array([[0.0], [np.nan]])).learn(ROLLOUT)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"beta": 1.5}, "beta 1.5"),
+        ({"beta": 0.1}, "beta_final"),
+        ({"beta_decay": -0.1}, "beta_decay"),
+        ({"bc_loss": "mae"}, "did you mean"),
+        ({"n_epochs": 0}, "n_epochs"),
+        ({"gradient_steps": 0}, "gradient_steps"),
+        ({"batch_size": 0}, "batch_size"),
+        ({"dataset_capacity": 10}, "dataset_capacity"),
+        ({"dataset_capacity": -1}, "dataset_capacity"),
+        ({"clip_range_vf": -0.2}, "clip_range_vf"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        build(**arguments)
+
+
+class Nothing(gym.Env):
+    """An environment of the given spaces, in which nothing happens."""
+
+    def __init__(self, observation_space, action_space):
+        self.observation_space, self.action_space = observation_space, action_space
+
+
+@pytest.mark.parametrize("policy", ["MlpPolicy", "MultiInputPolicy"])
+def test_dict_observations_are_refused(policy):
+    env = Nothing(spaces.Dict(a=spaces.Box(-1, 1, (2,))), spaces.Box(-1, 1, (1,)))
+    with pytest.raises(ConfigError, match="Dict"):
+        DAgger(policy, env)
+
+
+def test_discrete_actions_are_refused():
+    with pytest.raises(ConfigError, match=r"Discrete\(2\)"):
+        DAgger("MlpPolicy", "CartPole-v1")

@@ -1,0 +1,98 @@
+"""The aggregated dataset: a ring that forgets the oldest, and its file."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+import torch as th
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_quad.dagger.dataset import AggregatedDataset, draw_rows
+from sb3_quad.errors import ConfigError
+
+
+def pairs(first, n):
+    numbers = np.arange(first, first + n, dtype=np.float32)
+    return np.stack([numbers, -numbers], axis=1), numbers[:, None] * 10
+
+
+def filled(capacity=8, *sizes):
+    dataset, first = AggregatedDataset(capacity, (2,), 1), 0
+    for n in sizes:
+        dataset.add(*pairs(first, n))
+        first += n
+    return dataset
+
+
+def contents(dataset):
+    observations, actions = dataset.pairs(th.arange(len(dataset)))
+    return observations.numpy(), actions.numpy()
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(1, 12), st.lists(st.integers(0, 30), max_size=8))
+def test_it_holds_the_last_pairs_in_order(capacity, sizes):
+    total = sum(sizes)
+    observations, actions = contents(filled(capacity, *sizes))
+    kept = min(total, capacity)
+    expected = pairs(total - kept, kept)
+    np.testing.assert_array_equal(observations, expected[0])
+    np.testing.assert_array_equal(actions, expected[1])
+
+
+@pytest.mark.parametrize("count", [3, 10, 25])
+def test_rows_are_drawn_in_whole_passes(count):
+    rows = draw_rows(10, count, np.random.default_rng(0))
+    assert len(rows) == count
+    for start in range(0, count - count % 10, 10):
+        assert sorted(rows[start : start + 10]) == list(range(10))
+
+
+def test_what_is_drawn_does_not_depend_on_where_the_ring_begins(tmp_path):
+    dataset = filled(8, 5, 6)
+    dataset.save(tmp_path / "d.npz")
+    other = AggregatedDataset(8, (2,), 1)
+    other.load(tmp_path / "d.npz")
+    for each in (dataset, other):
+        each.add(*pairs(11, 3))
+    for mine, theirs in zip(contents(dataset), contents(other), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+def test_a_smaller_capacity_keeps_the_last(tmp_path):
+    filled(8, 8).save(tmp_path / "d.npz")
+    small = AggregatedDataset(3, (2,), 1)
+    small.load(tmp_path / "d.npz")
+    np.testing.assert_array_equal(contents(small)[1][:, 0], [50, 60, 70])
+
+
+def test_unfit_files_are_named(tmp_path):
+    path = tmp_path / "d.npz"
+    filled(8, 8).save(path)
+    whole = path.read_bytes()
+    dataset = filled(8, 2)
+    for damaged in (b"", b"nonsense", whole[: len(whole) // 2], whole[:120] + b"x" + whole[121:]):
+        path.write_bytes(damaged)
+        with pytest.raises(ConfigError, match=r"d\.npz"):
+            dataset.load(path)
+    with pytest.raises(ConfigError, match=r"missing\.npz"):
+        dataset.load(tmp_path / "missing.npz")
+    path.write_bytes(whole)
+    with pytest.raises(ConfigError, match=r"\(8, 3\)"):
+        AggregatedDataset(8, (3,), 1).load(path)
+    assert len(dataset) == 2
+
+
+def test_an_interrupted_save_leaves_the_file_before_it(tmp_path, monkeypatch):
+    path = tmp_path / "d.npz"
+    filled(8, 3).save(path)
+    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        filled(8, 8).save(path)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["d.npz"]
+    dataset = filled(8)
+    dataset.load(path)
+    assert len(dataset) == 3

@@ -1,0 +1,194 @@
+"""The experts fly as the specification measured (section 8), and answer SB3's ``predict`` as they answer the true state."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3.common.evaluation import evaluate_policy
+
+import sb3_quad  # noqa: F401  (registers the environments)
+from sb3_quad.dynamics.rotation import nearest_rotation, quaternion_from_rotation
+from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError, ExpertError
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.experts.resolve import resolve_expert
+
+TO_R0 = np.array([0.0, 0.0, 15.0])
+
+
+def fly_one(expert, target, *, start=None, wrench=None, steps=1500):
+    """One flight without noise: distances to the target, path length, and the step on which it hit the ground (or None)."""
+    env = QuadcopterVecEnv(1, noise=0.0, seed=0)
+    env.reset()
+    env.set_target(np.asarray(target, dtype=float))
+    state = env.true_state()
+    for rows, value in (start or {}).items():
+        state.array[rows, 0] = value
+    distances, path, last = [], 0.0, state.position[0].copy()
+    for step in range(steps):
+        if wrench is not None:
+            env.set_wrench(**wrench(step))
+        _, _, dones, infos = env.step(expert.actions(env.true_state()))
+        if dones[0]:
+            distances.append(infos[0]["distance"])
+            return np.array(distances), path, (step + 1 if infos[0]["collision"] else None)
+        path += float(np.linalg.norm(state.position[0] - last))
+        last = state.position[0].copy()
+        distances.append(float(state.distance[0]))
+    return np.array(distances), path, None
+
+
+def time_to(distances, tolerance):
+    return (np.argmax(distances <= tolerance) + 1) * 0.01
+
+
+def test_pid_tracking_figures():
+    flights = fly(PIDExpert(), task="target_tracking", n_episodes=2400, seed=11)
+    assert flights.success.all()
+    for tolerance, seconds in ((0.1, 7.71), (0.2, 6.89), (0.5, 5.80), (1.0, 4.90)):
+        assert np.mean(flights.time_to[tolerance]) == pytest.approx(seconds, rel=0.02)
+    assert flights.path_length.mean() == pytest.approx(10.42, rel=0.02)
+    assert flights.reward.mean() == pytest.approx(-8.10, rel=0.02)
+
+
+def test_pid_recovery_figure():
+    flights = fly(PIDExpert(), task="state_recovery", n_episodes=2400, seed=12)
+    assert 100 * flights.success.mean() == pytest.approx(31.9, abs=2.0)
+
+
+@pytest.mark.parametrize(
+    ("sign", "times", "length"), [(1, (7.23, 6.45, 4.54), 10.19), (-1, (8.18, 7.26, 5.31), 11.05)]
+)
+def test_pid_fixed_targets(sign, times, length):
+    distances, path, _ = fly_one(PIDExpert(), TO_R0 + sign * 10 / np.sqrt(3))
+    for tolerance, seconds in zip((0.1, 0.2, 1.0), times, strict=True):
+        assert time_to(distances, tolerance) == pytest.approx(seconds, rel=0.01)
+    assert path == pytest.approx(length, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("quaternion", "velocity", "seconds"), [((0, -1, 0, 0), (2, 2, 0), 1.78), ((0.42, 0.41, 0.81, 0), (2, 2, -2), 1.46)]
+)
+def test_pid_hits_the_ground_from_the_fixed_initial_states(quaternion, velocity, seconds):
+    start = {QUATERNION: np.array(quaternion) / np.linalg.norm(quaternion), VELOCITY: velocity, BODY_RATES: (4, 4, 4)}
+    _, _, hit = fly_one(PIDExpert(), TO_R0, start=start)
+    assert hit is not None and hit * 0.01 == pytest.approx(seconds, rel=0.01)
+
+
+def test_pid_is_lost_after_the_side_hit():
+    def hit(step):
+        on = 250 <= step < 252  # 2.5 s, for 0.02 s
+        return {"force": (-20.0 * on, -20.0 * on, 0.0), "torque": (-5.0 * on,) * 3}
+
+    assert fly_one(PIDExpert(), (10, 10, 25), wrench=hit)[2] is not None
+
+
+def test_pid_error_under_a_constant_force():
+    distances, _, hit = fly_one(PIDExpert(), (10, 10, 25), wrench=lambda step: {"force": (-3.0, -3.0, -3.0)})
+    assert hit is None and distances[-1] == pytest.approx(5.6, rel=0.01)
+
+
+def test_pid_gains_of_itm_are_those_of_table_a1():
+    proportional, derivative = PIDExpert()._attitude
+    np.testing.assert_allclose(proportional, [0.54165, 0.81810, 0.80676], rtol=1e-4)
+    np.testing.assert_allclose(derivative, [0.12037, 0.18180, 0.17928], rtol=1e-4)
+
+
+def test_geometric_expert_recovers_and_arrives():
+    recovery = fly(GeometricExpert(), task="state_recovery", n_episodes=1200, seed=13)
+    tracking = fly(GeometricExpert(), task="target_tracking", n_episodes=240, seed=13)
+    assert recovery.success.mean() > 0.95
+    assert tracking.success.all() and np.isfinite(tracking.time_to[0.1]).all()
+    assert tracking.time_to[0.1].mean() < 7.7  # faster than the PID
+
+
+@pytest.mark.parametrize("expert", [PIDExpert(), GeometricExpert()], ids=["pid", "geometric"])
+def test_predict_on_noise_free_observations_equals_actions_on_the_true_state(expert):
+    env = QuadcopterVecEnv(64, task="state_recovery", noise=0.0, seed=5)
+    observations = env.reset()
+    for _ in range(20):
+        expected = expert.actions(env.true_state())
+        actions, state = expert.predict(observations)
+        assert state is None and actions.shape == (64, 4) and actions.dtype == np.float32
+        np.testing.assert_allclose(actions, expected, atol=2e-3)
+        np.testing.assert_array_equal(expert.predict(observations[0])[0], actions[0])
+        observations, *_ = env.step(expected)
+
+
+@pytest.mark.parametrize("expert", [PIDExpert(), GeometricExpert()], ids=["pid", "geometric"])
+@given(data=st.data())
+def test_actions_are_always_valid(expert, data):
+    """Any state at all gives finite actions within [-1, 1]."""
+    number = st.floats(-1e3, 1e3)
+    array = np.array(data.draw(st.lists(number, min_size=20, max_size=20)))[:, None]
+    norm = np.linalg.norm(array[QUATERNION])
+    array[QUATERNION] = array[QUATERNION] / norm if norm > 1e-3 else np.array([[1.0], [0], [0], [0]])
+    actions = expert.actions(QuadcopterState(array))
+    assert np.isfinite(actions).all() and np.abs(actions).max() <= 1.0
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_quaternions_and_rotations_agree(seed):
+    quaternion = np.random.default_rng(seed).normal(size=(8, 4))
+    quaternion /= np.linalg.norm(quaternion, axis=1, keepdims=True)
+    array = np.zeros((20, 8))
+    array[QUATERNION] = quaternion.T
+    rotation = QuadcopterState(array).rotation
+    back = quaternion_from_rotation(nearest_rotation(rotation))
+    np.testing.assert_allclose(np.abs(np.sum(back * quaternion, axis=1)), 1.0, atol=1e-12)
+
+
+def test_evaluate_policy_takes_an_expert():
+    env = gymnasium.make("QuadTargetTracking-v0")
+    mean, _ = evaluate_policy(PIDExpert(), env, n_eval_episodes=1, warn=False)
+    env.close()
+    assert -10 < mean < -6
+
+
+def test_experts_by_name(tmp_path):
+    assert isinstance(resolve_expert("pid"), PIDExpert) and isinstance(resolve_expert("geometric"), GeometricExpert)
+    module = types.ModuleType("my_experts")
+    module.hover = lambda vehicle: lambda observation: np.zeros((len(observation), 4))
+    module.broken = lambda vehicle: 1 / 0
+    sys.modules["my_experts"] = module
+    assert resolve_expert("my_experts:hover")(np.zeros((3, 18))).shape == (3, 4)
+    half_written = tmp_path / "half.zip"
+    half_written.write_bytes(b"PK\x03\x04 and no more")
+    for spec, error, message in (
+        ("pidd", ConfigError, "did you mean 'pid'"),
+        ("missing.zip", ConfigError, "no such file"),
+        (str(half_written), ConfigError, "not a complete SB3 zip"),
+        ("no_such_module:factory", ConfigError, "cannot be imported"),
+        ("my_experts:nothing", ConfigError, "has no 'nothing'"),
+        ("my_experts:broken", ExpertError, "ZeroDivisionError"),
+    ):
+        with pytest.raises(error, match=message):
+            resolve_expert(spec)
+
+
+def test_wrong_observations_and_gains_are_named():
+    with pytest.raises(ExpertError, match=r"\(18,\)"):
+        PIDExpert().predict(np.zeros(17))
+    with pytest.raises(ConfigError, match="kp"):
+        PIDExpert(kp=-1)
+
+
+def test_target_is_where_the_error_is_measured_from():
+    """Moving vehicle and target together changes no action."""
+    env = QuadcopterVecEnv(16, task="state_recovery", noise=0.0, seed=1)
+    env.reset()
+    state = env.true_state().copy()
+    moved = state.copy()
+    moved.array[POSITION] += 3.0
+    moved.array[TARGET] += 3.0
+    for expert in (PIDExpert(), GeometricExpert()):
+        np.testing.assert_allclose(expert.actions(state), expert.actions(moved), atol=1e-5)

@@ -1,0 +1,146 @@
+"""Expert labels: whom the labeller asks, with what, and which answers it accepts."""
+
+from __future__ import annotations
+
+import pickle
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+
+from sb3_quad.common.labels import ExpertLabeller
+from sb3_quad.dynamics.state import STATE_SIZE, QuadcopterState
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ExpertError
+from sb3_quad.experts.pid import PIDExpert
+
+
+class Stateful(gym.Env):
+    """An environment whose true state is its number in every entry; observations say nothing of it."""
+
+    observation_space = spaces.Box(-1, 1, (18,), np.float32)
+    action_space = spaces.Box(-1, 1, (4,), np.float32)
+
+    def __init__(self, number):
+        self.number = number
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(18, dtype=np.float32), {}
+
+    def true_state(self):
+        return QuadcopterState(np.full((STATE_SIZE, 1), self.number, dtype=np.float64))
+
+
+class FromState:
+    """Acts on the true state, and says so by a value that observations cannot give."""
+
+    def actions(self, state):
+        return np.repeat(state.position[:, :1], 4, axis=1).astype(np.float32)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.full((len(observation), 4), -0.5, dtype=np.float32), state
+
+
+def test_the_true_state_is_collected_from_single_environments():
+    env = VecMonitor(DummyVecEnv([lambda n=n: Stateful(n) for n in (0.25, 0.75)]))
+    labeller = ExpertLabeller(FromState(), env)
+    assert labeller.needs_state
+    np.testing.assert_array_equal(labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1))
+
+
+def test_a_state_can_come_from_another_process():
+    """SubprocVecEnv sends it through a pipe."""
+    state = pickle.loads(pickle.dumps(QuadcopterVecEnv(3, seed=0).true_state()))
+    assert PIDExpert().actions(state).shape == (3, 4)
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecNormalize(VecMonitor(env))])
+def test_the_true_state_of_the_batched_environment(wrap):
+    env = wrap(QuadcopterVecEnv(5, seed=0))
+    observation = env.reset()
+    labeller = ExpertLabeller(PIDExpert(), env)
+    state = env.unwrapped.true_state()
+    np.testing.assert_array_equal(labeller.labels(observation), PIDExpert().actions(state))
+    before = state.copy()
+    for _ in range(10):
+        observation = env.step(np.ones((5, 4), dtype=np.float32))[0]
+    labels = labeller.labels(observation)
+    np.testing.assert_array_equal(labels, PIDExpert().actions(env.unwrapped.true_state()))
+    assert not np.array_equal(labels, PIDExpert().actions(before))
+
+
+def test_without_a_true_state_predict_is_asked():
+    labeller = ExpertLabeller(FromState(), make_vec_env(lambda: Blind(), 3))
+    assert not labeller.needs_state
+    np.testing.assert_array_equal(labeller.labels(np.zeros((3, 18))), np.full((3, 4), -0.5))
+
+
+class Blind(gym.Env):
+    """Our spaces without a true state."""
+
+    observation_space = Stateful.observation_space
+    action_space = Stateful.action_space
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(18, dtype=np.float32), {}
+
+
+def test_an_sb3_model_and_its_policy():
+    env = make_vec_env("Pendulum-v1", 3, seed=0)
+    observation = env.reset()
+    model = PPO("MlpPolicy", env, device="cpu", seed=0)
+    expected = model.predict(observation, deterministic=True)[0]
+    for expert in (model, model.policy):
+        np.testing.assert_array_equal(ExpertLabeller(expert, env).labels(observation), expected)
+
+
+def test_a_function_sees_what_the_policy_sees():
+    env = VecNormalize(make_vec_env("Pendulum-v1", 3, seed=0))
+    observation = env.reset()
+    seen = []
+    ExpertLabeller(lambda given: seen.append(given) or given[:, :1], env).labels(observation)
+    np.testing.assert_array_equal(seen[0], observation)
+
+
+def test_labels_are_clipped_to_the_action_space():
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    labels = ExpertLabeller(lambda observation: np.array([[9.0], [-9.0]]), env).labels(env.reset())
+    np.testing.assert_array_equal(labels, [[2.0], [-2.0]])
+    assert labels.dtype == np.float32
+
+
+@pytest.mark.parametrize(
+    ("expert", "message"),
+    [
+        (lambda observation: np.zeros(2), r"shape \(2,\), expected \(2, 1\)"),
+        (lambda observation: np.zeros((2, 4)), r"shape \(2, 4\)"),
+        (lambda observation: np.array([[0.0], [np.inf]]), "row 1 is not finite"),
+    ],
+)
+def test_unfit_labels_are_named(expert, message):
+    env = make_vec_env("Pendulum-v1", 2, seed=0)
+    with pytest.raises(ExpertError, match=message):
+        ExpertLabeller(expert, env).labels(env.reset())
+
+
+class OnlyState:
+    def actions(self, state):
+        return np.zeros((state.n, 4))
+
+
+@pytest.mark.parametrize(
+    ("expert", "message"),
+    [(None, "no expert"), (PIDExpert, r"PIDExpert\(\)"), ("pid", "neither"), (OnlyState(), "true_state")],
+)
+def test_unfit_experts_are_refused_at_once(expert, message):
+    with pytest.raises(ExpertError, match=message):
+        ExpertLabeller(expert, make_vec_env("Pendulum-v1", 1))
+
+
+def test_a_model_of_another_environment_is_refused():
+    with pytest.raises(ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"):
+        ExpertLabeller(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), QuadcopterVecEnv(2))

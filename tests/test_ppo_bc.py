@@ -1,0 +1,156 @@
+"""PPO with behavioural cloning: what it adds moves the right parameters, and switched off it is PPO."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_quad.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.ppo_bc import PPOBC
+
+SMALL = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 3, "device": "cpu"}
+
+
+def swing_back(observation):
+    """A simple expert for Pendulum-v1: torque against the angular velocity."""
+    return -0.5 * observation[:, 2:3]
+
+
+def parameters(model):
+    return th.cat([p.detach().flatten() for p in model.policy.parameters()])
+
+
+def part(model, name):
+    return {key: p.detach().clone() for key, p in model.policy.named_parameters() if name in key}
+
+
+@pytest.mark.parametrize("clip_range_vf", [None, 0.2])
+def test_without_additions_it_is_ppo_bit_for_bit(clip_range_vf):
+    stock = PPO("MlpPolicy", "Pendulum-v1", clip_range_vf=clip_range_vf, ent_coef=0.01, **SMALL).learn(256)
+    ours = PPOBC(
+        "MlpPolicy", "Pendulum-v1", clip_range_vf=clip_range_vf, ent_coef=0.01, bc_coef=0.0, max_clipped_value=False, **SMALL
+    ).learn(256)
+    assert th.equal(parameters(stock), parameters(ours))
+
+
+def test_labelling_alone_changes_nothing():
+    """An expert whose weight is zero is not asked, and takes no random numbers from training."""
+    stock = PPO("MlpPolicy", "Pendulum-v1", **SMALL).learn(256)
+    ours = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=0.0, **SMALL).learn(256)
+    assert th.equal(parameters(stock), parameters(ours))
+
+
+@pytest.mark.parametrize("bc_loss", ["nll", "mse"])
+def test_cloning_pulls_towards_the_expert(bc_loss):
+    def error(model):
+        observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
+        return np.square(model.predict(observations, deterministic=True)[0] - np.clip(swing_back(observations), -2, 2)).mean()
+
+    free = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, learning_rate=3e-3, **SMALL).learn(1024)
+    cloned = PPOBC(
+        "MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=5.0, bc_loss=bc_loss, learning_rate=3e-3, **SMALL
+    ).learn(1024)
+    assert error(cloned) < 0.5 * error(free)
+
+
+def test_labels_belong_to_the_state_before_the_step():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, **SMALL)
+    seen = []
+    original = model.rollout_buffer.add
+
+    def add(obs, *args, **kwargs):
+        seen.append((obs.copy(), model.rollout_buffer.expert_actions[model.rollout_buffer.pos].copy()))
+        return original(obs, *args, **kwargs)
+
+    model.rollout_buffer.add = add
+    model.learn(64)
+    assert len(seen) == 64
+    for observation, label in seen:
+        np.testing.assert_allclose(label, np.clip(swing_back(observation), -2, 2), rtol=1e-6)
+
+
+def test_critic_warmup_moves_the_critic_only():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=1, **SMALL)
+    before = {name: part(model, name) for name in ("policy_net", "action_net", "log_std", "value_net")}
+    model.learn(64)
+    for name in ("policy_net", "action_net", "log_std"):
+        assert all(th.equal(old, part(model, name)[key]) for key, old in before[name].items()), name
+    assert not all(th.equal(old, part(model, "value_net")[key]) for key, old in before["value_net"].items())
+    model.learn(64, reset_num_timesteps=False)
+    assert not th.equal(before["log_std"]["log_std"], part(model, "log_std")["log_std"])
+
+
+def test_l2_shrinks_the_weights():
+    def size(model):
+        return sum(float(p.detach().square().sum()) for key, p in model.policy.named_parameters() if key.endswith("weight"))
+
+    plain = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **SMALL).learn(512)
+    shrunk = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, l2_coef=0.1, **SMALL).learn(512)
+    assert size(shrunk) < size(plain)
+
+
+def test_schedule_of_the_cloning_weight_follows_progress(tmp_path):
+    from stable_baselines3.common.logger import configure
+
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=LinearSchedule(0.4, 0.0, 0.5), **SMALL)
+    model.set_logger(configure(str(tmp_path), ["csv"]))
+    model.learn(256)
+    import csv
+
+    with open(tmp_path / "progress.csv", encoding="utf-8") as file:
+        weights = [float(row["train/bc_coef"]) for row in csv.DictReader(file) if row["train/bc_coef"]]
+    assert weights[0] == pytest.approx(0.2) and weights[-1] == 0.0  # a quarter of the way, and the end
+
+
+def test_an_expert_is_asked_for_when_learning_starts(tmp_path):
+    model = PPOBC("MlpPolicy", "Pendulum-v1", **SMALL)
+    with pytest.raises(ExpertError, match="set_expert"):
+        model.learn(64)
+    model.set_expert(swing_back)
+    model.learn(64)
+    model.save(tmp_path / "model.zip")
+    loaded = PPOBC.load(tmp_path / "model.zip", env=model.get_env(), expert=swing_back)
+    loaded.learn(64, reset_num_timesteps=False)
+    observations = np.zeros((1, 3), dtype=np.float32)
+    np.testing.assert_array_equal(
+        PPO.load(tmp_path / "model.zip").predict(observations, deterministic=True)[0],
+        PPOBC.load(tmp_path / "model.zip").predict(observations, deterministic=True)[0],
+    )
+
+
+@pytest.mark.parametrize(
+    ("expert", "message"),
+    [
+        (lambda observation: np.full((len(observation), 1), np.nan), "finite"),
+        (lambda observation: np.zeros((len(observation), 3)), "shape"),
+    ],
+)
+def test_labels_that_do_not_fit_stop_training(expert, message):
+    with pytest.raises(ExpertError, match=message):
+        PPOBC("MlpPolicy", "Pendulum-v1", expert=expert, **SMALL).learn(64)
+
+
+def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **SMALL)
+    before = parameters(model)
+    original = model.train
+
+    def train():
+        model.rollout_buffer.advantages[:] = np.nan
+        original()
+
+    model.train = train
+    with pytest.raises(TrainingError, match="learning_rate"):
+        model.learn(64)
+    assert th.equal(before, parameters(model))
+
+
+@pytest.mark.parametrize(
+    "arguments", [{"bc_loss": "mle"}, {"bc_filter": "advantage"}, {"l2_coef": -1.0}, {"critic_warmup": -1}]
+)
+def test_bad_arguments_are_named(arguments):
+    with pytest.raises(ConfigError, match=next(iter(arguments))):
+        PPOBC("MlpPolicy", "Pendulum-v1", **arguments, **SMALL)

@@ -1,0 +1,363 @@
+"""The PyBullet environment: Gymnasium's and SB3's contracts, its physics against written-out equations, bad input."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import warnings
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as sb3_check_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
+
+import sb3_quad
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.errors import ConfigError
+
+IDS = ["QuadTargetTracking-v0", "QuadStateRecovery-v0"]
+HIGH = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}  # nothing ends a flight up there
+FloatArray = npt.NDArray[np.float64]
+
+
+@pytest.fixture
+def env() -> Any:
+    made = QuadcopterEnv(noise=0.0)
+    yield made
+    made.close()
+
+
+def _rotation(q: FloatArray) -> FloatArray:
+    w, v = q[0], q[1:]
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    return np.asarray(np.eye(3) + 2 * w * cross + 2 * cross @ cross)
+
+
+def _product(p: FloatArray, q: FloatArray) -> FloatArray:
+    return np.array([p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))])
+
+
+class Reference:
+    """Specification section 1, a line for a line, for one vehicle."""
+
+    def __init__(self, state: FloatArray, delay: int = 1, **wrench: FloatArray) -> None:
+        self.vehicle = load_vehicle("itm")
+        self.r, self.q, self.v, self.w, self.rotor = (state[part].copy() for part in np.split(np.arange(17), [3, 7, 10, 13]))
+        self.queue = [np.full(4, self.vehicle.hover_rotor_speed)] * delay
+        zero = np.zeros(3)
+        self.force_world, self.force_body = wrench.get("force_world", zero), wrench.get("force_body", zero)
+        self.torque_world, self.torque_body = wrench.get("torque_world", zero), wrench.get("torque_body", zero)
+
+    def step(self, action: FloatArray) -> None:
+        vehicle, dt = self.vehicle, self.vehicle.physics_step
+        inertia = np.array(vehicle.inertia)
+        thrust = (0.5 * np.clip(action, -1, 1) + 1) * vehicle.mass * vehicle.gravity / 4
+        self.queue.append(np.sqrt(thrust / vehicle.thrust_coefficient))
+        wanted = self.queue.pop(0)
+        for _ in range(4):
+            self.rotor = self.rotor + vehicle.motor_gain * (wanted - self.rotor) * dt
+            total, *moment = vehicle.mixer @ (vehicle.thrust_coefficient * self.rotor**2)
+            rotation = _rotation(self.q)
+            force = rotation @ (np.array([0, 0, total]) + self.force_body) + self.force_world
+            torque = np.array(moment) + self.torque_body + rotation.T @ self.torque_world
+            self.v = self.v + dt * (force / vehicle.mass - np.array([0, 0, vehicle.gravity]))
+            self.w = self.w + dt * (torque - np.cross(self.w, inertia * self.w)) / inertia
+            self.r = self.r + dt * self.v
+            angle = np.linalg.norm(self.w) * dt
+            self.q = _product(self.q, np.array([np.cos(angle / 2), *(self.w / np.linalg.norm(self.w) * np.sin(angle / 2))]))
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+@pytest.mark.parametrize(
+    "wrench",
+    [{}, {"force_frame": "world", "torque_frame": "body"}, {"force_frame": "body", "torque_frame": "world"}],
+    ids=["free", "world_force", "body_force"],
+)
+def test_flight_is_the_specified_integrator(wrench: dict[str, str], delay: int) -> None:
+    """400 control steps of violent tumbling agree to 1e-9 with the specification's lines, pushed in any frame."""
+    rng = np.random.default_rng(1)
+    env = QuadcopterEnv(task_kwargs=HIGH, noise=0.0, vehicle=load_vehicle("itm").model_copy(update={"delay": delay}))
+    start = {"quaternion": rng.normal(size=4), "velocity": rng.normal(size=3) * 3, "body_rates": [12.0, -14.0, 10.0]}
+    env.reset(seed=3, options={"state": start})
+    parts: dict[str, FloatArray] = {}
+    if wrench:
+        force, torque = np.array([3.0, -2.0, 5.0]), np.array([0.05, 0.04, -0.05])
+        env.set_wrench(force, torque, **wrench)
+        parts = {f"force_{wrench['force_frame']}": force, f"torque_{wrench['torque_frame']}": torque}
+    state = env.true_state().array[:, 0]
+    reference = Reference(state, delay, **parts)
+    fastest = 0.0
+    for _ in range(400):
+        action = rng.choice([-1.5, 1.5], size=4)
+        env.step(action)
+        reference.step(action)
+        fastest = max(fastest, float(np.linalg.norm(reference.w)))
+    assert fastest > 20.0
+    expected = [reference.r, np.sign(state[3] * reference.q[0]) * reference.q, reference.v, reference.w, reference.rotor]
+    for part, value in zip(np.split(state[:17], [3, 7, 10, 13]), expected, strict=True):
+        np.testing.assert_allclose(part, value, rtol=0, atol=1e-9)
+    env.close()
+
+
+@pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
+def test_row_of_the_batched_environment_flies_the_same(task: str) -> None:
+    """Observation (with noise), reward and end of row i are those of this environment after reset(seed + i)."""
+    from sb3_quad.envs.vec_env import QuadcopterVecEnv
+
+    batched = QuadcopterVecEnv(2, task=task, seed=5)
+    envs = [QuadcopterEnv(task=task) for _ in range(2)]
+    rows = batched.reset()
+    for row, env in enumerate(envs):
+        np.testing.assert_allclose(env.reset(seed=5 + row)[0], rows[row], atol=1e-6)
+    rng = np.random.default_rng(0)
+    for _ in range(150):
+        actions = rng.uniform(-1.2, 1.2, (2, 4)).astype(np.float32)
+        rows, rewards, done, infos = batched.step(actions)
+        for row, env in enumerate(envs):
+            observation, reward, terminated, _, info = env.step(actions[row])
+            assert terminated == done[row]
+            np.testing.assert_allclose(reward, rewards[row], atol=1e-6)
+            if terminated:
+                np.testing.assert_allclose(observation, infos[row]["terminal_observation"], atol=1e-6)
+                assert {key: infos[row][key] for key in ("collision", "out_of_range", "is_success")} == {
+                    key: info[key] for key in ("collision", "out_of_range", "is_success")
+                }
+                observation, _ = env.reset()
+            np.testing.assert_allclose(observation, rows[row], atol=1e-6)
+    for env in envs:
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+@pytest.mark.parametrize("render_mode", [None, "rgb_array"])
+def test_both_checkers_pass(env_id: str, render_mode: str | None) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        # The observation is unbounded by design (thesis 3.3.1), of which Gymnasium's checker warns.
+        warnings.filterwarnings("ignore", message=".*A Box observation space m[a-z]+imum value is -?infinity.*")
+        env = gymnasium.make(env_id, render_mode=render_mode)
+        check_env(env.unwrapped, skip_render_check=render_mode is None)
+        env = gymnasium.make(env_id, render_mode=render_mode)
+        sb3_check_env(env.unwrapped, skip_render_check=render_mode is None)
+        env.close()
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_same_seed_same_episode(env_id: str) -> None:
+    """Bit for bit, on another instance and on a used one; the next episode differs and is as repeatable."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (50, 4)).astype(np.float32)
+
+    def fly(env: gymnasium.Env[Any, Any]) -> list[Any]:
+        seen: list[Any] = []
+        for seed in (7, None):
+            observation, _ = env.reset(seed=seed)
+            seen.append(observation)
+            for action in actions:
+                observation, reward, *_ = env.step(action)
+                seen += [observation, reward]
+        return seen
+
+    first, second = gymnasium.make(env_id), gymnasium.make(env_id)
+    one, two, again = fly(first), fly(second), fly(first)
+    assert all(np.array_equal(a, b) and np.array_equal(a, c) for a, b, c in zip(one, two, again, strict=True))
+    assert not np.array_equal(one[0], one[len(one) // 2])
+    first.close(), second.close()
+
+
+def test_each_observation_is_a_fresh_array(env: QuadcopterEnv) -> None:
+    observation, _ = env.reset(seed=0)
+    kept = observation.copy()
+    later, *_ = env.step(np.ones(4, dtype=np.float32))
+    assert observation.dtype == later.dtype == np.float32
+    assert later is not observation
+    np.testing.assert_array_equal(observation, kept)
+
+
+def test_hovers_on_zero_action(env: QuadcopterEnv) -> None:
+    env.reset(seed=0, options={"target": (1.0, 2.0, 15.0)})
+    for _ in range(100):
+        _, reward, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
+    np.testing.assert_allclose(env.true_state().position[0], [0, 0, 15], atol=1e-9)
+    np.testing.assert_allclose(info["distance"], np.sqrt(5.0))
+    np.testing.assert_allclose(reward, -0.003 * np.sqrt(5.0))
+    assert info["is_success"] and not terminated and not truncated
+
+
+def test_ends_on_touching_the_ground(env: QuadcopterEnv) -> None:
+    env.reset(seed=0, options={"state": {"position": (0, 0, 0.3), "velocity": (0, 0, -2)}, "target": (0, 0, 5)})
+    for _ in range(100):
+        _, reward, terminated, _, info = env.step(-np.ones(4, dtype=np.float32))
+        height = env.true_state().position[0, 2]
+        assert terminated == (height <= env.vehicle.collision_radius) == info["collision"] == (not info["is_success"])
+        if terminated:
+            break
+    assert terminated and reward < -15 and not info["out_of_range"]
+    assert height > 0.1  # stopped on the step of the contact, not pushed back by it
+
+
+def test_ends_out_of_range(env: QuadcopterEnv) -> None:
+    env.reset(seed=0)
+    env.set_target((0, 0, 45.5))
+    _, reward, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
+    assert terminated and not truncated and info["out_of_range"] and not info["is_success"] and reward < -15
+
+
+def test_truncated_after_1500_steps() -> None:
+    env = gymnasium.make("QuadTargetTracking-v0")
+    env.reset(seed=0)
+    for step in range(1, 1501):
+        _, _, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
+        assert not terminated and truncated == (step == 1500) and info["is_success"]
+    env.close()
+
+
+def test_setters_act_while_flying(env: QuadcopterEnv) -> None:
+    env.reset(seed=0)
+    env.set_target((1.0, 2.0, 20.0))
+    np.testing.assert_array_equal(env.target, [1.0, 2.0, 20.0])
+    mean, std = np.linspace(-1, 1, 18), np.linspace(1, 2, 18)
+    plain, *_ = env.step(np.zeros(4, dtype=np.float32))
+    features = plain * env.observation_std + env.observation_mean
+    np.testing.assert_allclose(features[:3], env.true_state().position[0] - env.target, atol=1e-5)
+    env.set_observation_scaling(mean, std)
+    scaled, *_ = env.step(np.zeros(4, dtype=np.float32))
+    np.testing.assert_allclose(scaled, (features - mean) / std, atol=1e-5)
+    env.set_noise(0.5)
+    noisy, *_ = env.step(np.zeros(4, dtype=np.float32))
+    assert env.noise == 0.5 and not np.allclose(noisy, scaled, atol=1e-3)
+    env.set_task("state_recovery")
+    env.reset()
+    np.testing.assert_array_equal(env.target, [0.0, 0.0, 15.0])
+    assert np.abs(env.true_state().body_rates).max() > 0
+
+
+def test_wrench_pushes_until_set_anew(env: QuadcopterEnv) -> None:
+    env.reset(seed=0)
+    env.set_wrench(force=(1.727, 0, 0))
+    for _ in range(10):
+        env.step(np.zeros(4, dtype=np.float32))
+    np.testing.assert_allclose(env.true_state().velocity[0], [0.1, 0, 0], atol=1e-12)
+    env.set_wrench()
+    env.step(np.zeros(4, dtype=np.float32))
+    np.testing.assert_allclose(env.true_state().velocity[0], [0.1, 0, 0], atol=1e-12)
+
+
+def test_fixed_start(env: QuadcopterEnv) -> None:
+    start = {"position": (1, 2, 3), "quaternion": (0, -2, 0, 0), "velocity": (2, 2, 0), "body_rates": (4, 4, 4)}
+    observation, info = env.reset(seed=0, options={"state": start, "target": (1, 2, 4)})
+    state = env.true_state()
+    np.testing.assert_array_equal(state.position[0], [1, 2, 3])
+    np.testing.assert_array_equal(state.quaternion[0], [0, -1, 0, 0])
+    np.testing.assert_array_equal(state.body_rates[0], [4, 4, 4])
+    np.testing.assert_allclose(observation * env.observation_std, [0, 0, -1, 1, 0, 0, 0, -1, 0, 0, 0, -1, 2, -2, 0, 4, 4, 4], atol=1e-6)
+    assert info["distance"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("action", "message"),
+    [
+        (np.full(4, np.nan), "finite"),
+        (np.array([0, 0, np.inf, 0]), "finite"),
+        (np.zeros(3), r"\(3,\).*\(4,\)"),
+        (np.zeros((1, 4)), r"\(1, 4\).*\(4,\)"),
+        (0.0, r"\(\).*\(4,\)"),
+    ],
+)
+def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) -> None:
+    env.reset(seed=0)
+    before = env.true_state().copy().array
+    with pytest.raises(ValueError, match=message):
+        env.step(action)
+    np.testing.assert_array_equal(env.true_state().array, before)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda env: env.reset(options={"targets": (0, 0, 1)}), "'targets': did you mean 'target'"),
+        (lambda env: env.reset(options={"state": {"velocty": (0, 0, 1)}}), "did you mean 'velocity'"),
+        (lambda env: env.reset(options={"state": {"quaternion": (0, 0, 0, 0)}}), "quaternion: must not be zero"),
+        (lambda env: env.reset(options={"state": {"position": (0, 0, 0.1)}}), "ground"),
+        (lambda env: env.reset(options={"state": 3}), "state"),
+        (lambda env: env.reset(options={"target": (0, 0)}), r"target of shape \(2,\)"),
+        (lambda env: env.set_target((0, 0, np.nan)), "target .*finite"),
+        (lambda env: env.set_target("up"), "target"),
+        (lambda env: env.set_wrench(force=(1, 2)), r"force of shape \(2,\): must be \(3,\)"),
+        (lambda env: env.set_wrench(torque=(1, 2, np.inf)), "torque .*finite"),
+        (lambda env: env.set_wrench(force=(1, 2, 3), force_frame="wrld"), "force_frame 'wrld'"),
+        (lambda env: env.set_noise(-1), "noise"),
+        (lambda env: env.set_observation_scaling(std=np.zeros(18)), "observation_std"),
+        (lambda env: env.set_observation_scaling(mean=np.zeros(17)), r"observation_mean of shape \(17,\)"),
+        (lambda env: env.set_task("target_trackin"), "did you mean 'target_tracking'"),
+        (lambda env: QuadcopterEnv(task_kwargs={"target_distnce": 3}), "did you mean 'target_distance'"),
+        (lambda env: QuadcopterEnv(vehicle="itn"), "did you mean 'itm'"),
+        (lambda env: QuadcopterEnv(render_mode="rgb_aray"), "did you mean 'rgb_array'"),
+    ],
+)
+def test_bad_input_names_the_thing(env: QuadcopterEnv, call: Any, message: str) -> None:
+    env.reset(seed=0)
+    with pytest.raises(ConfigError, match=message) as caught:
+        call(env)
+    assert "\n" not in str(caught.value)
+
+
+def test_step_before_reset_is_refused(env: QuadcopterEnv) -> None:
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(4, dtype=np.float32))
+
+
+def test_close_twice_and_neighbours_live_on() -> None:
+    first, second = QuadcopterEnv(), QuadcopterEnv()
+    first.reset(seed=0), second.reset(seed=0)
+    first.close()
+    first.close()
+    third = QuadcopterEnv()  # takes the client number that is free again
+    third.reset(seed=1)
+    first.close()
+    for env in (second, third):
+        assert np.isfinite(env.step(np.zeros(4, dtype=np.float32))[0]).all()
+        env.close()
+
+
+def _make() -> gymnasium.Env[Any, Any]:
+    return gymnasium.make("QuadStateRecovery-v0")
+
+
+@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
+def test_side_by_side_as_alone(kind: Any) -> None:
+    """Instances in one process and in several do not disturb each other."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32)
+    together = kind([_make] * 2)
+    together.seed(11)
+    rows = [together.reset()] + [together.step(np.stack([action, -action]))[0] for action in actions]
+    together.close()
+    for row, sign in ((0, 1), (1, -1)):
+        alone = _make()
+        seen = [alone.reset(seed=11 + row)[0]] + [alone.step(sign * action)[0] for action in actions]
+        np.testing.assert_array_equal(np.array(rows)[:, row], seen)
+        alone.close()
+
+
+def test_import_is_light() -> None:
+    """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for gymnasium.make."""
+    code = (
+        "import sys, sb3_quad, sb3_quad.envs, gymnasium;"
+        "print([m for m in ('pybullet', 'numba', 'torch') if m in sys.modules]);"
+        "gymnasium.make('QuadTargetTracking-v0').reset(seed=0); print('torch' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split("\n")[:2] == ["[]", "False"]
+
+
+def test_package_names() -> None:
+    from sb3_quad import envs
+
+    assert envs.QuadcopterEnv is QuadcopterEnv
+    assert set(IDS) <= set(gymnasium.registry) and sb3_quad.__version__
+    with pytest.raises(AttributeError):
+        _ = envs.Quadcopter
