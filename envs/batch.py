@@ -12,10 +12,10 @@ from gymnasium.utils import seeding
 from sb3_quad.dynamics.state import STATE_SIZE, QuadcopterState
 from sb3_quad.dynamics.streams import new_streams, stream_key
 from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.envs.batch_kernel import ADDRESSED
-from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE, observe
-from sb3_quad.envs.tasks import TaskSpec, TaskTable, reset_rows, resolve_tasks
-from sb3_quad.envs.threads import available_cpus, run
+from sb3_quad.envs.batch_kernel import ADDRESSED, MAX_STEPS
+from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.envs.tasks import TaskSpec, TaskTable, resolve_tasks
+from sb3_quad.envs.threads import available_cpus, compilation_notice, run
 from sb3_quad.errors import ConfigError
 
 FloatArray = npt.NDArray[np.float64]
@@ -34,6 +34,7 @@ class QuadcopterBatch:
     :param observation_std: σ of Eq. 3.16, likewise; None: Table A.2.
     :param max_episode_steps: control steps after which an episode is truncated.
     :param seed: row i draws from the stream of ``seed + i``; None: from the operating system's entropy.
+    :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
     """
 
     def __init__(
@@ -82,34 +83,32 @@ class QuadcopterBatch:
             DEFAULT_STD if observation_std is None else observation_std,
         )
         self._bind()
+        with compilation_notice():
+            self.observe()
         self.seed([None if seed is None else seed + row for row in range(n)])
 
-    def seed(self, seeds: Sequence[int | None]) -> None:
-        """New streams, one seed per row; the next reset begins their first episode."""
+    def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
+        """New streams of the given rows, from one seed each; their next reset begins the first episode."""
         keys = [stream_key(seeding.np_random(None if each is None else int(each))[0]) for each in seeds]
-        self.streams[:] = new_streams(np.array(keys, dtype=np.uint64))
+        self.streams[:, self.rows(rows)] = new_streams(np.array(keys, dtype=np.uint64))
 
     def reset(self, rows: Rows = None) -> npt.NDArray[np.float32]:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
-        chosen = self.rows(rows)
-        reset_rows(
-            chosen,
-            self.state,
-            self.queue,
-            self.streams,
-            self.task_index,
-            self.vehicles,
-            self.tasks.parameters,
-            self.tasks.weights,
-        )
-        self.returns[chosen] = 0.0
-        return self.observe()
+        return self._observe(self.rows(rows))
 
     def observe(self) -> npt.NDArray[np.float32]:
         """The present observations, float32 (n, 18); the same numbers until the next step."""
-        out = np.empty((self.n, OBSERVATION_SIZE), dtype=np.float32)
-        observe(self.state, self.streams, self.mean, self.std, self.noise_level, out)
-        return out
+        return self._observe([])
+
+    def _observe(self, resetting: Any) -> npt.NDArray[np.float32]:
+        observations = np.empty((self.n, OBSERVATION_SIZE), dtype=np.float32)
+        done = np.zeros(self.n, dtype=np.bool_)
+        done[resetting] = True
+        actions, rewards = np.zeros((self.n, 4), dtype=np.float32), np.empty(self.n, dtype=np.float32)
+        self.job[MAX_STEPS] = 0
+        run(self.job, self.n, self.threads, (actions, observations, rewards, done))
+        self.job[MAX_STEPS] = self.max_episode_steps
+        return observations
 
     def step(
         self, actions: npt.NDArray[Any]
@@ -177,7 +176,7 @@ class QuadcopterBatch:
     def set_noise(self, level: Any, rows: Rows = None) -> None:
         """Relative standard deviation of the observation noise, () or (rows,); 0: none."""
         chosen = self.rows(rows)
-        levels = _per_row("noise", np.asarray(level)[..., None], chosen.size, 1)[0]
+        levels = _per_row("noise", level, chosen.size, None)[0]
         if (levels < 0).any():
             raise ConfigError(f"noise {level!r}: must not be negative")
         if rows is None and self.noise_level.size == 1 and np.ndim(level) == 0:
@@ -258,14 +257,15 @@ def _vehicles(vehicle: Any, n: int) -> list[Vehicle]:
     return vehicles
 
 
-def _per_row(name: str, value: Any, rows: int, size: int) -> FloatArray:
-    """``value`` of shape (size,) or (rows, size) as (size, rows)."""
+def _per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
+    """``value`` of shape (size,) or (rows, size) as (size, rows); with no size, () or (rows,) as (1, rows)."""
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
         raise ConfigError(f"{name} {value!r}: must be numbers") from None
-    if array.shape not in ((size,), (rows, size)):
-        raise ConfigError(f"{name} of shape {array.shape}: must be ({size},), or ({rows}, {size}) for {rows} rows")
+    inner = () if size is None else (size,)
+    if array.shape not in (inner, (rows, *inner)):
+        raise ConfigError(f"{name} of shape {array.shape}: must be {inner}, or {(rows, *inner)} for {rows} rows")
     if not np.isfinite(array).all():
         raise ConfigError(f"{name} {array.tolist()}: every number must be finite")
-    return np.ascontiguousarray(np.broadcast_to(array, (rows, size)).T)
+    return np.ascontiguousarray(np.broadcast_to(array, (rows, *inner)).T).reshape(-1, rows)

@@ -1,4 +1,4 @@
-"""One control step of a whole batch in one pass over its blocks, shared out between threads.
+"""One control step of a whole batch, in one pass over its blocks, shared out between threads.
 
 ``work`` is all that the threads run. A job is an int64 array of addresses and sizes, the control array says which job is
 under way and how many of its blocks are not taken yet. Whoever comes takes the next block: a thread that is late, or never
@@ -12,7 +12,6 @@ from numba import carray, int64
 
 from sb3_quad.dynamics.blocks import (
     DISTANCE,
-    KEY_ROW,
     MAX_DISTANCE,
     PZ,
     RADIUS,
@@ -37,7 +36,6 @@ from sb3_quad.dynamics.lowlevel import (
     float64_rows,
     pointer,
     scratch_pointer,
-    uint32_rows,
 )
 from sb3_quad.dynamics.state import STATE_SIZE
 from sb3_quad.dynamics.streams import STEP
@@ -68,131 +66,90 @@ _TASK_COLUMNS = 13
 _PARAMETERS = len(PARAMETER_NAMES)
 
 
-@compiled
-def step_block(
-    scratch,
-    fresh,
-    first,
-    count,
-    physics_step,
-    substeps,
-    max_steps,
-    state,
-    queue,
-    wrench,
-    vehicles,
-    streams,
-    mean,
-    std,
-    noise_level,
-    task_index,
-    task_parameters,
-    task_weights,
-    returns,
-    final_observation,
-    final_return,
-    final_length,
-    truncated,
-    collided,
-    out_of_range,
-    distance,
-    actions,
-    observations,
-    rewards,
-    dones,
-):
-    """Fly, score, observe; rows that end leave how they ended and begin their next episode.
-
-    What is the same for all rows is in scratch memory already unless it is ``fresh``.
-    """
-    b = float64_rows(scratch)
-    load_state(scratch, state, first, count)
-    load_columns(wrench, first, count, b, WRENCH)
-    if fresh or vehicles.shape[1] > 1:
-        load_vehicles(scratch, vehicles, first, count, physics_step)
-    if fresh or mean.shape[1] > 1:
-        load_scaling(scratch, mean, std, noise_level, first, count)
-    if fresh or task_parameters.shape[0] > 1:
-        load_limits(scratch, task_index, task_parameters, first, count)
-    load_commands(scratch, actions, queue, first, count)
-    fly_block(scratch, physics_step, substeps)
-    store_state(scratch, state, first, count)
-    score_block(scratch)
-    for lane in range(count):
-        streams[STEP, first + lane] += np.uint32(1)
-    load_streams(scratch, streams, first, count)
-    observe_block(scratch)
-    store_observations(scratch, observations, first, count)
-
-    w = uint32_rows(scratch)
-    ended = 0
-    for lane in range(count):
-        i = first + lane
-        returns[i] += b[REWARD, lane]
-        rewards[i] = b[REWARD, lane]
-        lost = (b[PZ, lane] <= b[RADIUS, lane]) | (b[DISTANCE, lane] > b[MAX_DISTANCE, lane])
-        over = lost | (w[KEY_ROW + STEP, lane] >= max_steps)
-        dones[i] = over
-        ended += over
-    if ended == 0:
-        return
-    for lane in range(count):
-        i = first + lane
-        if not dones[i]:
-            continue
-        collided[i] = b[PZ, lane] <= b[RADIUS, lane]
-        out_of_range[i] = b[DISTANCE, lane] > b[MAX_DISTANCE, lane]
-        truncated[i] = not (collided[i] or out_of_range[i])
-        distance[i] = b[DISTANCE, lane]
-        final_return[i] = returns[i]
-        final_length[i] = streams[STEP, i]
-        for k in range(OBSERVATION_SIZE):
-            final_observation[i, k] = observations[i, k]
-        returns[i] = 0.0
-        start_episode(i, state, queue, streams, task_index, vehicles, task_parameters, task_weights)
-    load_state(scratch, state, first, count)
-    load_streams(scratch, streams, first, count)
-    observe_block(scratch)
-    store_observations(scratch, observations, first, count)
-
-
-@compiled
+@compiled(inline="always")
 def run_block(job, block, scratch, fresh):
-    """One block of a job: cut its arrays out of memory, and step."""
-    n, columns, scaling, tasks = job[N], job[VEHICLE_COLUMNS], job[SCALING_COLUMNS], job[TASKS]
+    """One block of a job: fly, score, observe; rows that end leave how they ended and begin their next episode.
+
+    What is the same for all rows is in scratch memory already unless it is ``fresh``. With ``MAX_STEPS`` 0 nothing flies:
+    the rows whose ``dones`` are set begin their next episode, and all are observed.
+    """
+    n, columns, scaling, tasks, max_steps = job[N], job[VEHICLE_COLUMNS], job[SCALING_COLUMNS], job[TASKS], job[MAX_STEPS]
+    physics_step = carray(pointer(job[A_STEP]), (1,), np.float64)[0]
+    state = carray(pointer(job[A_STATE]), (STATE_SIZE, n), np.float64)
+    queue = carray(pointer(job[A_QUEUE]), (job[DELAY], 4, n), np.float64)
+    wrench = carray(pointer(job[A_WRENCH]), (12, n), np.float64)
+    vehicles = carray(pointer(job[A_VEHICLES]), (_PARAMETERS, columns), np.float64)
+    streams = carray(pointer(job[A_STREAMS]), (4, n), np.uint32)
+    mean = carray(pointer(job[A_MEAN]), (OBSERVATION_SIZE, scaling), np.float64)
+    std = carray(pointer(job[A_STD]), (OBSERVATION_SIZE, scaling), np.float64)
+    noise_level = carray(pointer(job[A_NOISE]), (scaling,), np.float64)
+    task_index = carray(pointer(job[A_TASK_INDEX]), (n,), np.int64)
+    task_parameters = carray(pointer(job[A_TASKS]), (tasks, _TASK_COLUMNS), np.float64)
+    task_weights = carray(pointer(job[A_WEIGHTS]), (tasks,), np.float64)
+    returns = carray(pointer(job[A_RETURNS]), (n,), np.float64)
+    observations = carray(pointer(job[A_OBSERVATIONS]), (n, OBSERVATION_SIZE), np.float32)
+    dones = carray(pointer(job[A_DONES]), (n,), np.bool_)
     first = block * LANES
-    step_block(
-        scratch,
-        fresh,
-        first,
-        min(LANES, n - first),
-        carray(pointer(job[A_STEP]), (1,), np.float64)[0],
-        job[SUBSTEPS],
-        job[MAX_STEPS],
-        carray(pointer(job[A_STATE]), (STATE_SIZE, n), np.float64),
-        carray(pointer(job[A_QUEUE]), (job[DELAY], 4, n), np.float64),
-        carray(pointer(job[A_WRENCH]), (12, n), np.float64),
-        carray(pointer(job[A_VEHICLES]), (_PARAMETERS, columns), np.float64),
-        carray(pointer(job[A_STREAMS]), (4, n), np.uint32),
-        carray(pointer(job[A_MEAN]), (OBSERVATION_SIZE, scaling), np.float64),
-        carray(pointer(job[A_STD]), (OBSERVATION_SIZE, scaling), np.float64),
-        carray(pointer(job[A_NOISE]), (scaling,), np.float64),
-        carray(pointer(job[A_TASK_INDEX]), (n,), np.int64),
-        carray(pointer(job[A_TASKS]), (tasks, _TASK_COLUMNS), np.float64),
-        carray(pointer(job[A_WEIGHTS]), (tasks,), np.float64),
-        carray(pointer(job[A_RETURNS]), (n,), np.float64),
-        carray(pointer(job[A_FINAL_OBSERVATION]), (n, OBSERVATION_SIZE), np.float32),
-        carray(pointer(job[A_FINAL_RETURN]), (n,), np.float64),
-        carray(pointer(job[A_FINAL_LENGTH]), (n,), np.int64),
-        carray(pointer(job[A_TRUNCATED]), (n,), np.bool_),
-        carray(pointer(job[A_COLLIDED]), (n,), np.bool_),
-        carray(pointer(job[A_OUT_OF_RANGE]), (n,), np.bool_),
-        carray(pointer(job[A_DISTANCE]), (n,), np.float64),
-        carray(pointer(job[A_ACTIONS]), (n, 4), np.float32),
-        carray(pointer(job[A_OBSERVATIONS]), (n, OBSERVATION_SIZE), np.float32),
-        carray(pointer(job[A_REWARDS]), (n,), np.float32),
-        carray(pointer(job[A_DONES]), (n,), np.bool_),
-    )
+    count = min(LANES, n - first)
+
+    if fresh or scaling > 1:
+        load_scaling(scratch, mean, std, noise_level, first, count)
+    if max_steps > 0:
+        b = float64_rows(scratch)
+        load_state(scratch, state, first, count)
+        load_columns(wrench, first, count, b, WRENCH)
+        if fresh or columns > 1:
+            load_vehicles(scratch, vehicles, first, count, physics_step)
+        if fresh or tasks > 1:
+            load_limits(scratch, task_index, task_parameters, first, count)
+        load_commands(scratch, carray(pointer(job[A_ACTIONS]), (n, 4), np.float32), queue, first, count)
+        fly_block(scratch, physics_step, job[SUBSTEPS])
+        store_state(scratch, state, first, count)
+        score_block(scratch)
+        for lane in range(count):
+            streams[STEP, first + lane] += np.uint32(1)
+        load_streams(scratch, streams, first, count)
+        observe_block(scratch)
+        store_observations(scratch, observations, first, count)
+
+        rewards = carray(pointer(job[A_REWARDS]), (n,), np.float32)
+        ended = 0
+        for lane in range(count):
+            i = first + lane
+            returns[i] += b[REWARD, lane]
+            rewards[i] = b[REWARD, lane]
+            lost = (b[PZ, lane] <= b[RADIUS, lane]) | (b[DISTANCE, lane] > b[MAX_DISTANCE, lane])
+            dones[i] = lost | (streams[STEP, i] >= max_steps)
+            ended += dones[i]
+        if ended == 0:
+            return
+        final_observation = carray(pointer(job[A_FINAL_OBSERVATION]), (n, OBSERVATION_SIZE), np.float32)
+        final_return = carray(pointer(job[A_FINAL_RETURN]), (n,), np.float64)
+        final_length = carray(pointer(job[A_FINAL_LENGTH]), (n,), np.int64)
+        truncated = carray(pointer(job[A_TRUNCATED]), (n,), np.bool_)
+        collided = carray(pointer(job[A_COLLIDED]), (n,), np.bool_)
+        out_of_range = carray(pointer(job[A_OUT_OF_RANGE]), (n,), np.bool_)
+        distance = carray(pointer(job[A_DISTANCE]), (n,), np.float64)
+        for lane in range(count):
+            i = first + lane
+            if dones[i]:
+                collided[i] = b[PZ, lane] <= b[RADIUS, lane]
+                out_of_range[i] = b[DISTANCE, lane] > b[MAX_DISTANCE, lane]
+                truncated[i] = not (collided[i] or out_of_range[i])
+                distance[i] = b[DISTANCE, lane]
+                final_return[i] = returns[i]
+                final_length[i] = streams[STEP, i]
+                for k in range(OBSERVATION_SIZE):
+                    final_observation[i, k] = observations[i, k]
+
+    for i in range(first, first + count):
+        if dones[i]:
+            returns[i] = 0.0
+            start_episode(i, state, queue, streams, task_index, vehicles, task_parameters, task_weights)
+    load_state(scratch, state, first, count)
+    load_streams(scratch, streams, first, count)
+    observe_block(scratch)
+    store_observations(scratch, observations, first, count)
 
 
 @compiled
@@ -218,7 +175,6 @@ def work(control, helper, patience, job, actions, observations, rewards, dones):
     :return: whether all is done; -1 if an action is not finite, and then nothing has been done.
     """
     memory = np.empty(SCRATCH_SIZE + 8)
-    scratch = scratch_pointer(memory)
     blocks = int64(0)
     if helper < 0:
         if not _finite(actions):
@@ -233,6 +189,7 @@ def work(control, helper, patience, job, actions, observations, rewards, dones):
     idle = 0
     known = int64(-1)  # the job whose common numbers lie in this thread's scratch memory
     while True:
+        scratch = scratch_pointer(memory)  # in the loop: numba frees what is not used again
         if atomic_get(control, LEFT) > 0:
             block = atomic_add(control, LEFT, -1) - 1
             if block >= 0:

@@ -31,14 +31,15 @@ class BulletBody:
     with the ground is decided by the task from the position, not here.
 
     :param vehicle: mass, inertia, gravity, collision radius and physics step.
-    :param window: width and height in pixels of PyBullet's window; needs a display, and PyBullet allows one per process.
-        None: no window.
+    :param window: width and height in pixels of PyBullet's window, of which it allows one per process; None: no window.
+        Without a display there is none either, and a line on stderr says so.
     :param visuals: load the body's looks, too; only needed for pictures.
     :raises ConfigError: the window cannot be opened.
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None, visuals: bool = False) -> None:
-        self.client = int(p.connect(p.DIRECT)) if window is None else _open_window(*window)
+        self.has_window = window is not None and _display()
+        self.client = _open_window(*window) if window is not None and self.has_window else int(p.connect(p.DIRECT))
         # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's clients are limited.
         self._close = weakref.finalize(self, _disconnect, self.client)
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
@@ -100,15 +101,20 @@ def load_urdf_text(urdf: str, client: int, **options: Any) -> int:
         return int(p.loadURDF(str(path), physicsClientId=client, **options))
 
 
+def _display() -> bool:
+    # PyBullet would end the whole process.
+    if not sys.platform.startswith("linux") or os.environ.get("DISPLAY"):
+        return True
+    print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
+    return False
+
+
 def _open_window(width: int, height: int) -> int:
-    # Without a display PyBullet ends the whole process instead of failing.
-    if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
-        raise ConfigError("render_mode 'human' needs a display, and DISPLAY is not set; use render_mode='rgb_array'")
     sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
     try:
         client = int(p.connect(p.GUI, options=f"--width={width} --height={height} {sky}"))
-    except p.error as error:
-        raise ConfigError(f"render_mode 'human': PyBullet opens one window per process ({error})") from None
+    except p.error:
+        raise ConfigError("render_mode 'human': PyBullet opens one window per process, and one is open already") from None
     if client < 0:
         raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
     return client

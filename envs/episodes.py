@@ -37,7 +37,7 @@ from sb3_quad.dynamics.blocks import (
     load_state,
 )
 from sb3_quad.dynamics.lowlevel import LANES, SCRATCH_SIZE, compiled, float64_rows, scratch_pointer
-from sb3_quad.dynamics.streams import EPISODE, EPISODE_START, STEP, normal_pair, uniform_pair
+from sb3_quad.dynamics.streams import EPISODE, EPISODE_START, STEP, uniforms
 
 START, TARGET_DISTANCE, RANDOM_ATTITUDE, VELOCITY_STD, BODY_RATES_STD, LIMITS = 0, 3, 4, 5, 6, 7  # columns of the table
 POSITION_COST, TILT_COST, RATES_COST, COLLISION_COST, RANGE_COST = range(MAX_DISTANCE + 1, MAX_DISTANCE + 6)
@@ -49,9 +49,8 @@ def start_episode(i, state, queue, streams, task_index, vehicles, task_parameter
     """Begin the next episode of row i: its stream's next, with a task, state and target drawn from it."""
     streams[EPISODE, i] += np.uint32(1)
     streams[STEP, i] = np.uint32(0)
-    choice, height = uniform_pair(streams, i, 0, EPISODE_START)
-    azimuth, u0 = uniform_pair(streams, i, 1, EPISODE_START)
-    u1, u2 = uniform_pair(streams, i, 2, EPISODE_START)
+    u = uniforms(streams, i, 6, EPISODE_START)
+    choice, height, azimuth = u[0], u[1], TURN * u[2]
     k = 0
     while k < task_weights.shape[0] - 1 and choice >= task_weights[k]:
         k += 1
@@ -65,24 +64,19 @@ def start_episode(i, state, queue, streams, task_index, vehicles, task_parameter
     up = lowest + (1.0 - lowest) * height
     across = math.sqrt(max(0.0, 1.0 - up * up))
     state[PX, i], state[PY, i], state[PZ, i] = task[START], task[START + 1], task[START + 2]
-    state[TX, i] = task[START] + distance * across * math.cos(TURN * azimuth)
-    state[TY, i] = task[START + 1] + distance * across * math.sin(TURN * azimuth)
+    state[TX, i] = task[START] + distance * across * math.cos(azimuth)
+    state[TY, i] = task[START + 1] + distance * across * math.sin(azimuth)
     state[TZ, i] = task[START + 2] + distance * up
 
     state[QW, i], state[QX, i], state[QY, i], state[QZ, i] = 1.0, 0.0, 0.0, 0.0
     if task[RANDOM_ATTITUDE] != 0.0:  # uniform on SO(3) (Shoemake)
-        a, b = math.sqrt(1.0 - u0), math.sqrt(u0)
-        state[QW, i], state[QX, i] = b * math.cos(TURN * u2), a * math.sin(TURN * u1)
-        state[QY, i], state[QZ, i] = a * math.cos(TURN * u1), b * math.sin(TURN * u2)
-    for pair in range(3):
-        first, second = normal_pair(streams, i, 3 + pair, EPISODE_START)
-        for axis in range(2):
-            k = 2 * pair + axis
-            value = first if axis == 0 else second
-            if k < 3:
-                state[VX + k, i] = task[VELOCITY_STD] * value
-            else:
-                state[WX + k - 3, i] = task[BODY_RATES_STD] * value
+        a, b, alpha, beta = math.sqrt(1.0 - u[3]), math.sqrt(u[3]), TURN * u[4], TURN * u[5]
+        state[QW, i], state[QX, i] = b * math.cos(beta), a * math.sin(alpha)
+        state[QY, i], state[QZ, i] = a * math.cos(alpha), b * math.sin(beta)
+    for axis in range(3):  # two normals from two uniforms (Box-Muller)
+        radius, angle = math.sqrt(-2.0 * math.log(u[6 + 2 * axis])), TURN * u[7 + 2 * axis]
+        state[VX + axis, i] = task[VELOCITY_STD] * radius * math.cos(angle)
+        state[WX + axis, i] = task[BODY_RATES_STD] * radius * math.sin(angle)
     hover = math.sqrt(vehicle[P_HOVER] / vehicle[P_LIFT])
     for rotor in range(4):
         state[S0 + rotor, i] = hover
@@ -171,10 +165,10 @@ def score(state, vehicles, task_index, task_parameters, reward, collided, out_of
     :param distance: float64 (n,), written: |r - r_T|, m.
     """
     memory = np.empty(SCRATCH_SIZE + 8)
-    scratch = scratch_pointer(memory)
-    b = float64_rows(scratch)
     n = state.shape[1]
     for first in range(0, n, LANES):
+        scratch = scratch_pointer(memory)  # in the loop: numba frees what is not used again
+        b = float64_rows(scratch)
         count = min(LANES, n - first)
         load_state(scratch, state, first, count)
         load_limits(scratch, task_index, task_parameters, first, count)

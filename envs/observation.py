@@ -27,7 +27,7 @@ from sb3_quad.dynamics.blocks import (
     load_state,
     load_streams,
 )
-from sb3_quad.dynamics.gaussian import draw_normals
+from sb3_quad.dynamics.gaussian import draw_normals, draw_words
 from sb3_quad.dynamics.lowlevel import LANES, SCRATCH_SIZE, compiled, float32_rows, float64_rows, scratch_pointer
 
 FEATURE_NAMES = (
@@ -77,10 +77,11 @@ def _disturb_and_scale(scratch):
             b[FEATURE + k, lane] = (noisy - b[MEAN + k, lane]) * b[INVERSE_STD + k, lane]
 
 
-@compiled
+@compiled(inline="always")
 def observe_block(scratch):
     """Observations of a loaded block, in its ``FEATURE`` rows: each feature times (1 + level N(0, 1)), then scaled."""
     _features(scratch)
+    draw_words(scratch)
     draw_normals(scratch)
     _disturb_and_scale(scratch)
 
@@ -107,9 +108,9 @@ def observe(state, streams, mean, std, noise_level, out):
     :param out: float32 (n, 18).
     """
     memory = np.empty(SCRATCH_SIZE + 8)
-    scratch = scratch_pointer(memory)
     n = state.shape[1]
     for first in range(0, n, LANES):
+        scratch = scratch_pointer(memory)  # in the loop: numba frees what is not used again
         count = min(LANES, n - first)
         load_state(scratch, state, first, count)
         load_streams(scratch, streams, first, count)

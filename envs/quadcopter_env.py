@@ -12,18 +12,18 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_quad.dynamics.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.dynamics.streams import STEP, new_streams, stream_key
 from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.envs.batch import QuadcopterBatch
 from sb3_quad.envs.bullet import BulletBody
-from sb3_quad.envs.observation import OBSERVATION_SIZE
+from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE, observe
 from sb3_quad.envs.rendering import RENDER_MODES, Renderer, check_size
-from sb3_quad.envs.tasks import TaskSpec, score
+from sb3_quad.envs.tasks import TaskSpec, reset_rows, resolve_tasks, score
 from sb3_quad.errors import ConfigError, unknown
 
 FloatArray = npt.NDArray[np.float64]
 Observation = npt.NDArray[np.float32]
+_ROW = np.zeros(1, dtype=np.int64)
 _START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
 
 
@@ -117,7 +117,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.dynamics.vehicle.Vehicle` |
     | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
-    | `render_mode` | `None` | `"human"` (a window, in real time), `"rgb_array"` (pictures, without a display) |
+    | `render_mode` | `None` | `"human"` (a window, in real time; one per process), `"rgb_array"` (pictures, without a display) |
     | `render_width`, `render_height` | 640, 480 | size of pictures and window, pixels |
 
     ## While Flying
@@ -149,53 +149,69 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         self._vehicle = load_vehicle(vehicle)
-        self._batch = QuadcopterBatch(1, task, task_kwargs, self._vehicle, noise, observation_mean, observation_std)
+        self._tasks = self._next_tasks = resolve_tasks(task, task_kwargs)
+        # Arrays of one vehicle for the functions that the batched environment uses, too.
+        self._state = np.zeros((STATE_SIZE, 1))
+        self._queue = np.zeros((self._vehicle.delay, 4, 1))
+        self._wrench = np.zeros((12, 1))
+        self._streams = np.zeros((4, 1), dtype=np.uint32)
+        self._parameters = self._vehicle.parameters()[:, None].copy()
+        self._task_index = np.zeros(1, dtype=np.int64)
+        self._mean, self._std = DEFAULT_MEAN[:, None].copy(), DEFAULT_STD[:, None].copy()
+        self._noise = np.zeros(1)
         self._wrenches = np.zeros((self._vehicle.substeps, 2, 3))
-        self._reward = np.zeros(1)
-        self._seeded = False
-        self._ready = False
+        self._reward, self._distance = np.zeros(1), np.zeros(1)
+        self._collided, self._out_of_range = np.zeros(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
+        self._seeded = self._ready = False
+        self.set_noise(noise)
+        self.set_observation_scaling(observation_mean, observation_std)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.render_mode = render_mode
         if render_mode is not None:
             self.metadata = {**self.metadata, "render_fps": round(1.0 / self._vehicle.control_step)}
         check_size(render_width, render_height)
-        human = render_mode == "human"
-        window = (render_width, render_height) if human else None
-        self._body = BulletBody(self._vehicle, window, visuals=render_mode == "rgb_array")
+        self._size = render_width, render_height
+        self._open()
+
+    def _open(self) -> None:
+        self._body = BulletBody(
+            self._vehicle, self._size if self.render_mode == "human" else None, visuals=self.render_mode == "rgb_array"
+        )
         self._renderer = None
-        if render_mode is not None:
-            self._renderer = Renderer(self._vehicle, self._body, render_width, render_height, human)
+        if self._body.has_window or self.render_mode == "rgb_array":
+            self._renderer = Renderer(self._vehicle, self._body, *self._size)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Begin an episode.
+        """Begin an episode; after :meth:`close`, in a new simulation.
 
         :param seed: begins a new stream of random numbers; None: the next episode of the present one.
         :param options: a fixed ``target`` and parts of the ``state``, as the class says.
         :raises ConfigError: an unknown option, or a value that is no start.
         """
         super().reset(seed=seed)
-        batch = self._batch
         fixed = _check_options(options, self._vehicle)
         if seed is not None or not self._seeded:
-            batch.streams[:] = new_streams(np.array([stream_key(self.np_random)], dtype=np.uint64))
+            self._streams[:] = new_streams(np.array([stream_key(self.np_random)], dtype=np.uint64))
             self._seeded = True
-        batch.reset()
+        self._tasks = tasks = self._next_tasks
+        state, parameters = self._state, self._parameters
+        reset_rows(_ROW, state, self._queue, self._streams, self._task_index, parameters, tasks.parameters, tasks.weights)
         for rows, values in fixed:
-            batch.state[rows, 0] = values
-        self._body.place(batch.state)
+            state[rows, 0] = values
+        if not self._body.connected:
+            self._open()
+        self._body.place(state)
         self._ready = True
-        # The start itself is never scored; these are for the info only.
-        position, target = batch.state[POSITION, 0], batch.state[TARGET, 0]
-        batch.distance[0] = np.linalg.norm(position - target)
-        batch.collided[0] = batch.out_of_range[0] = False
+        self._distance[:] = self.true_state().distance
+        self._collided[:] = self._out_of_range[:] = False  # only the end of a control step is judged
         if self._renderer is not None:
-            self._renderer.reset(batch.state)
+            self._renderer.reset(state)
             if self.render_mode == "human":
                 self.render()
-        return batch.observe()[0], self._info()
+        return self._observe(), self._info()
 
     def step(self, action: npt.NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Fly one control step.
@@ -203,14 +219,13 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         :param action: (4,), clipped to [-1, 1].
         :raises ValueError: a wrong shape, or a number that is not finite.
         """
-        batch, body, wrenches = self._batch, self._body, self._wrenches
         array = np.asarray(action, dtype=np.float32)
         if array.shape != (4,):
             raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        state, wrench, vehicles = batch.state, batch.wrench, batch.vehicles
-        kind = rotor_wrenches(state, batch.queue, array, wrench, vehicles, self._vehicle.physics_step, wrenches)
+        body, state, wrench, parameters, wrenches = self._body, self._state, self._wrench, self._parameters, self._wrenches
+        kind = rotor_wrenches(state, self._queue, array, wrench, parameters, self._vehicle.physics_step, wrenches)
         if kind == NOT_FINITE:
             raise ValueError(f"action {array.tolist()}: every number must be finite")
         if kind == WORLD_FRAME_TOO:
@@ -218,21 +233,21 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         else:
             body.fly(wrenches)
         body.read(state)
-        batch.streams[STEP, 0] += 1
-        collided, out_of_range = batch.collided, batch.out_of_range
-        parameters = batch.tasks.parameters
-        score(state, vehicles, batch.task_index, parameters, self._reward, collided, out_of_range, batch.distance)
+        self._streams[STEP, 0] += 1
+        collided, out_of_range, tasks = self._collided, self._out_of_range, self._tasks.parameters
+        score(state, parameters, self._task_index, tasks, self._reward, collided, out_of_range, self._distance)
         if self.render_mode == "human":
             self.render()
         info = self._info()
-        return batch.observe()[0], float(self._reward[0]), not info["is_success"], False, info
+        return self._observe(), float(self._reward[0]), not info["is_success"], False, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, which draws into its window."""
-        if self._renderer is None:
+        if self.render_mode is None:
             gymnasium.logger.warn("render() does nothing without a render_mode; pass render_mode='rgb_array' to make()")
+        if self._renderer is None:
             return None
-        return self._renderer.render(self._batch.state, self._batch.wrench)
+        return self._renderer.render(self._state, self._wrench)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
@@ -241,7 +256,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     def true_state(self) -> QuadcopterState:
         """The true state, a live view of one row."""
-        return self._batch.true_state()
+        return QuadcopterState(self._state)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -251,26 +266,26 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     @property
     def target(self) -> FloatArray:
         """r_T, (3,), world frame, m."""
-        return self._batch.state[TARGET, 0].copy()
+        return self._state[TARGET, 0].copy()
 
     @property
     def noise(self) -> float:
         """Relative standard deviation of the observation noise."""
-        return float(self._batch.noise_level[0])
+        return float(self._noise[0])
 
     @property
     def observation_mean(self) -> FloatArray:
         """μ of Eq. 3.16, (18,)."""
-        return self._batch.mean[:, 0].copy()
+        return self._mean[:, 0].copy()
 
     @property
     def observation_std(self) -> FloatArray:
         """σ of Eq. 3.16, (18,)."""
-        return self._batch.std[:, 0].copy()
+        return self._std[:, 0].copy()
 
     def set_target(self, position: npt.ArrayLike) -> None:
         """Move the target, (3,), world frame, m; until the next reset."""
-        self._batch.set_target(_vector("target", position, 3))
+        self._state[TARGET, 0] = _vector("target", position, 3)
 
     def set_wrench(
         self,
@@ -283,29 +298,42 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
         :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of ``torque``.
         """
-        self._batch.set_wrench(_vector("force", force, 3), _vector("torque", torque, 3), force_frame, torque_frame)
+        wrench = np.zeros((4, 3))
+        for number, (name, value, frame) in enumerate((("force", force, force_frame), ("torque", torque, torque_frame))):
+            if frame not in ("world", "body"):
+                raise ConfigError(f"{name}_frame {frame!r}: must be 'world' or 'body'")
+            wrench[2 * number + (frame == "body")] = _vector(name, value, 3)
+        self._wrench[:, 0] = wrench.ravel()
 
     def set_noise(self, level: float) -> None:
         """Set the relative standard deviation of the observation noise; 0: none."""
-        self._batch.set_noise(level)
+        value = _vector("noise", np.atleast_1d(np.asarray(level)), 1)
+        if value[0] < 0:
+            raise ConfigError(f"noise {level!r}: must not be negative")
+        self._noise[:] = value
 
     def set_observation_scaling(self, mean: npt.ArrayLike | None = None, std: npt.ArrayLike | None = None) -> None:
         """Set μ and σ of Eq. 3.16, (18,) each; None leaves one as it is."""
-        self._batch.set_observation_scaling(
-            None if mean is None else _vector("observation_mean", mean, OBSERVATION_SIZE),
-            None if std is None else _vector("observation_std", std, OBSERVATION_SIZE),
-        )
+        new_mean = self.observation_mean if mean is None else _vector("observation_mean", mean, OBSERVATION_SIZE)
+        new_std = self.observation_std if std is None else _vector("observation_std", std, OBSERVATION_SIZE)
+        if (new_std <= 0).any():
+            raise ConfigError("observation_std: every value must be positive")
+        self._mean[:, 0], self._std[:, 0] = new_mean, new_std
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> None:
         """Set the task of all episodes that begin from now on."""
-        self._batch.set_task(task, task_kwargs)
+        self._next_tasks = resolve_tasks(task, task_kwargs)
+
+    def _observe(self) -> Observation:
+        out = np.empty((1, OBSERVATION_SIZE), dtype=np.float32)
+        observe(self._state, self._streams, self._mean, self._std, self._noise, out)
+        return out[0]
 
     def _info(self) -> dict[str, Any]:
-        batch = self._batch
-        collision, out_of_range = bool(batch.collided[0]), bool(batch.out_of_range[0])
+        collision, out_of_range = bool(self._collided[0]), bool(self._out_of_range[0])
         return {
             "is_success": not (collision or out_of_range),
-            "distance": float(batch.distance[0]),
+            "distance": float(self._distance[0]),
             "collision": collision,
             "out_of_range": out_of_range,
         }

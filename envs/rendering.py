@@ -27,6 +27,7 @@ ELEVATION_AT_TARGET = math.radians(-8.0)
 NEAR, FAR = 0.05, 120.0
 SUPERSAMPLING = 2  # PyBullet's software renderer draws hard edges
 MAX_SIZE = 2048
+WINDOW_FPS = 25.0  # frames a second; PyBullet's window lets the simulation wait for each
 RING = 0.42  # radius of the rings around the target, m
 MARKER: Colour = (0.10, 0.72, 0.28, 1.0)
 FORCE: Colour = (0.86, 0.10, 0.14, 1.0)
@@ -40,27 +41,28 @@ class Renderer:
 
     What it adds to the simulation has no mass and touches nothing, so that a flight is the same with and without it.
 
-    :param body: the simulation; loaded with its looks.
+    :param body: the simulation. If it has a window, that is drawn into, in real time; else it must have its looks.
     :param width: of the pictures, pixels; ``height`` likewise.
-    :param human: draw into the simulation's window, in real time, and return no picture.
     """
 
-    def __init__(self, vehicle: Vehicle, body: BulletBody, width: int, height: int, human: bool) -> None:
+    def __init__(self, vehicle: Vehicle, body: BulletBody, width: int, height: int) -> None:
         self.vehicle, self.body, self.client = vehicle, body, body.client
-        self.width, self.height, self.human = width, height, human
+        self.width, self.height, self.human = width, height, body.has_window
         self.scale = arm_length(vehicle) / 0.24  # all distances below suit a vehicle of the default one's size
         self.rotor_angles = np.zeros(4)
         self.direction = np.array([1.0, 0.0, 0.0])  # of the camera: course (x, y) and elevation, rad
-        self.drawn_at = time.perf_counter()
-        urdfs = [rotor_urdf(vehicle, rotor) for rotor in range(4)]
-        self.frame = [load_urdf_text(urdf, self.client, useFixedBase=True) for urdf in frame_urdfs(vehicle)] if human else []
-        self.rotors = [load_urdf_text(urdf, self.client, useFixedBase=True) for urdf in urdfs]
+        self.shown_at = time.perf_counter()
+        self.frames_due = 1.0
+        self.frame: list[int] = []
+        if self.human:
+            self._furnish_window()
+        self.rotors = [self._load(rotor_urdf(vehicle, rotor)) for rotor in range(4)]
         self.ball = self._add(p.createVisualShape(p.GEOM_SPHERE, radius=0.14, rgbaColor=MARKER, physicsClientId=self.client))
         self.rings = [self._add_mesh(meshes.ring(RING * self.scale, 0.014), MARKER) for _ in range(2)]
         self.force_arrow = self._add_mesh(meshes.arrow(0.5 * self.scale, 0.012 * self.scale), FORCE)
         self.torque_arrow = self._add_mesh(meshes.arrow(0.4 * self.scale, 0.012 * self.scale), TORQUE)
-        if human:
-            self._furnish_window()
+        if self.human:
+            p.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1, physicsClientId=self.client)
 
     def reset(self, state: FloatArray) -> None:
         """A new episode: the camera jumps to column 0 of ``state``, (STATE_SIZE, n)."""
@@ -78,10 +80,10 @@ class Renderer:
         # The drawn rotors turn slower than the real ones, which would seem to stand or to turn backwards in a film.
         turning = -np.sign(self.vehicle.rotor_directions) * state[ROTOR_SPEEDS, 0]
         self.rotor_angles += turning * self.vehicle.control_step / 12.0
-        self._place(state, wrench[:, 0])
         if self.human:
-            self._show(state)
+            self._show(state, wrench)
             return None
+        self._place(state, wrench[:, 0])
         return self._picture(state)
 
     def _place(self, state: FloatArray, wrench: FloatArray) -> None:
@@ -174,31 +176,46 @@ class Renderer:
         ]
         return np.array(discs)[np.argsort(-np.linalg.norm(centres - camera.eye, axis=1))]
 
-    def _show(self, state: FloatArray) -> None:
-        """Turn the window's camera to the vehicle, and wait until real time has caught up."""
-        camera = self._camera(state)
-        forward = camera.axes[0]
-        distance = float(np.linalg.norm(state[POSITION, 0] - camera.eye))
-        p.resetDebugVisualizerCamera(
-            cameraDistance=distance,
-            cameraYaw=math.degrees(math.atan2(forward[1], forward[0])) - 90.0,
-            cameraPitch=math.degrees(math.asin(np.clip(forward[2], -0.999, 0.999))),
-            cameraTargetPosition=(camera.eye + distance * forward).tolist(),
-            physicsClientId=self.client,
-        )
-        ahead = self.drawn_at + self.vehicle.control_step - time.perf_counter()
+    def _show(self, state: FloatArray, wrench: FloatArray) -> None:
+        """Wait until real time has caught up, and show what is to be seen WINDOW_FPS times a second."""
+        self.frames_due += WINDOW_FPS * self.vehicle.control_step
+        if self.frames_due >= 1.0:
+            self.frames_due %= 1.0
+            self._place(state, wrench[:, 0])
+            camera = self._camera(state)
+            forward = camera.axes[0]
+            distance = float(np.linalg.norm(state[POSITION, 0] - camera.eye))
+            p.resetDebugVisualizerCamera(
+                cameraDistance=distance,
+                cameraYaw=math.degrees(math.atan2(forward[1], forward[0])) - 90.0,
+                cameraPitch=math.degrees(math.asin(np.clip(forward[2], -0.999, 0.999))),
+                cameraTargetPosition=(camera.eye + distance * forward).tolist(),
+                physicsClientId=self.client,
+            )
+            p.configureDebugVisualizer(p.COV_ENABLE_SINGLE_STEP_RENDERING, 1, physicsClientId=self.client)
+        self.shown_at += self.vehicle.control_step
+        ahead = self.shown_at - time.perf_counter()
         if ahead > 0:
             time.sleep(ahead)
-        self.drawn_at = time.perf_counter()
+        else:
+            self.shown_at -= ahead  # too slow for real time: do not hurry afterwards
 
     def _furnish_window(self) -> None:
         import pybullet_data
 
-        for option in (p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS):
+        hidden = (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS)
+        for option in hidden:
             p.configureDebugVisualizer(option, 0, physicsClientId=self.client)
         plane = f"{pybullet_data.getDataPath()}/plane.urdf"
         ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=self.client)
         p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=self.client)
+        p.changeVisualShape(ground, -1, specularColor=(0.1, 0.1, 0.1), physicsClientId=self.client)
+        # The window draws a link in one colour, and its collision sphere where it has no looks.
+        p.changeVisualShape(self.body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
+        self.frame = [self._load(urdf) for urdf in frame_urdfs(self.vehicle)]
+
+    def _load(self, urdf: str) -> int:
+        return load_urdf_text(urdf, self.client, useFixedBase=True)
 
     def _add(self, shape: int) -> int:
         return int(p.createMultiBody(0.0, -1, shape, _NOWHERE, physicsClientId=self.client))

@@ -46,9 +46,19 @@ class QuadcopterVecEnv(VecEnv):
         observation_std: Any = None,
         max_episode_steps: int = 1500,
         seed: int | None = None,
+        n_threads: int | None = None,
     ) -> None:
         self.batch = QuadcopterBatch(
-            n_envs, task, task_kwargs, vehicle, noise, observation_mean, observation_std, max_episode_steps, seed
+            n_envs,
+            task,
+            task_kwargs,
+            vehicle,
+            noise,
+            observation_mean,
+            observation_std,
+            max_episode_steps,
+            seed,
+            n_threads,
         )
         self.render_mode: str | None = None
         self.spec = None
@@ -131,17 +141,17 @@ class QuadcopterVecEnv(VecEnv):
     @property
     def noise(self) -> npt.NDArray[np.float64]:
         """Observation noise levels, (n,)."""
-        return self.batch.noise_level.copy()
+        return np.broadcast_to(self.batch.noise_level, (self.num_envs,)).copy()
 
     @property
     def observation_mean(self) -> npt.NDArray[np.float64]:
         """μ of Eq. 3.16, (n, 18)."""
-        return self.batch.mean.T.copy()
+        return np.broadcast_to(self.batch.mean.T, (self.num_envs, OBSERVATION_SIZE)).copy()
 
     @property
     def observation_std(self) -> npt.NDArray[np.float64]:
         """σ of Eq. 3.16, (n, 18)."""
-        return self.batch.std.T.copy()
+        return np.broadcast_to(self.batch.std.T, (self.num_envs, OBSERVATION_SIZE)).copy()
 
     @property
     def max_episode_steps(self) -> int:

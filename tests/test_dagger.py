@@ -76,8 +76,18 @@ def test_the_agent_becomes_the_expert():
 
 def test_it_learns_to_fly_from_the_true_state():
     env = QuadcopterVecEnv(64, seed=0, max_episode_steps=400)
-    model = DAgger("MlpPolicy", env, PIDExpert(), learning_rate=LinearSchedule(8e-3, 0.0, 1.0), n_steps=100, batch_size=512,
-                   gradient_steps=40, n_epochs=1, seed=0, device="cpu").learn(64 * 100 * 8)  # fmt: skip
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        PIDExpert(),
+        learning_rate=LinearSchedule(8e-3, 0.0, 1.0),
+        n_steps=100,
+        batch_size=512,
+        gradient_steps=40,
+        n_epochs=1,
+        seed=0,
+        device="cpu",
+    ).learn(64 * 100 * 8)
     flight = QuadcopterVecEnv(32, seed=99, max_episode_steps=400)
     observation = flight.reset()
     for _ in range(399):
@@ -305,8 +315,9 @@ def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
     model.save(tmp_path / "model")
     observation = pendulum().reset()
     loaded = DAgger.load(tmp_path / "model")
-    np.testing.assert_array_equal(loaded.predict(observation, deterministic=True)[0],
-                                  model.predict(observation, deterministic=True)[0])  # fmt: skip
+    np.testing.assert_array_equal(
+        loaded.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
+    )
     with pytest.raises(ExpertError, match="set_expert"):
         DAgger.load(tmp_path / "model", env=pendulum()).learn(ROLLOUT)
 

@@ -135,13 +135,14 @@ def test_row_of_the_batched_environment_flies_the_same(task: str) -> None:
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
-def test_both_checkers_pass(env_id: str, render_mode: str | None) -> None:
+def test_both_checkers_pass(env_id: str, render_mode: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # The observation is unbounded by design (thesis 3.3.1), of which Gymnasium's checker warns.
         warnings.filterwarnings("ignore", message=".*A Box observation space m[a-z]+imum value is -?infinity.*")
         env = gymnasium.make(env_id, render_mode=render_mode)
-        check_env(env.unwrapped, skip_render_check=render_mode is None)
+        check_env(env.unwrapped)  # makes one in human mode, too: without a display that flies without a window
         env = gymnasium.make(env_id, render_mode=render_mode)
         sb3_check_env(env.unwrapped, skip_render_check=render_mode is None)
         env.close()
@@ -316,12 +317,17 @@ def test_close_twice_and_neighbours_live_on() -> None:
     first.reset(seed=0), second.reset(seed=0)
     first.close()
     first.close()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        first.step(np.zeros(4, dtype=np.float32))
     third = QuadcopterEnv()  # takes the client number that is free again
     third.reset(seed=1)
     first.close()
     for env in (second, third):
         assert np.isfinite(env.step(np.zeros(4, dtype=np.float32))[0]).all()
         env.close()
+    first.reset(seed=0)  # opens anew
+    first.step(np.zeros(4, dtype=np.float32))
+    first.close()
 
 
 def _make() -> gymnasium.Env[Any, Any]:
@@ -332,7 +338,9 @@ def _make() -> gymnasium.Env[Any, Any]:
 def test_side_by_side_as_alone(kind: Any) -> None:
     """Instances in one process and in several do not disturb each other."""
     actions = np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32)
-    together = kind([_make] * 2)
+    # Forked workers need not import torch again; the default start method takes seconds for that.
+    options = {"start_method": "fork"} if kind is SubprocVecEnv and sys.platform == "linux" else {}
+    together = kind([_make] * 2, **options)
     together.seed(11)
     rows = [together.reset()] + [together.step(np.stack([action, -action]))[0] for action in actions]
     together.close()

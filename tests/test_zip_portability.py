@@ -29,8 +29,17 @@ json.dump(model.predict(np.load(sys.argv[2]), deterministic=True)[0].tolist(), s
 @pytest.mark.parametrize("clip_range_vf", [None, 0.2])
 def test_ppo_loads_it_where_sb3_quad_cannot_be_imported(tmp_path, clip_range_vf):
     env = QuadcopterVecEnv(16, seed=0, max_episode_steps=20)
-    model = DAgger("MlpPolicy", env, PIDExpert(), learning_rate=LinearSchedule(1e-3, 0.0, 1.0), n_steps=32, batch_size=128,
-                   clip_range_vf=clip_range_vf, seed=0, device="cpu").learn(1024)  # fmt: skip
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        PIDExpert(),
+        learning_rate=LinearSchedule(1e-3, 0.0, 1.0),
+        n_steps=32,
+        batch_size=128,
+        clip_range_vf=clip_range_vf,
+        seed=0,
+        device="cpu",
+    ).learn(1024)
     assert model.ep_info_buffer  # it is saved too, so it must not be empty here
     observations = env.reset()
     np.save(tmp_path / "observations.npy", observations)

@@ -7,19 +7,23 @@ import importlib
 import random
 import sys
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_quad.cli.arguments import pairs, whole
+from sb3_quad.cli.stages import is_pipeline_run, resume_stages, run_stages
 from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
     from sb3_quad.training.trainer import TrainingResult
 
-HELP = "Train an agent. Without arguments: stage one, DAgger from the PID expert on QuadTargetTracking-v0."
+HELP = "Train an agent. Without arguments: both stages of the thesis, DAgger from the PID expert, then PPO with cloning."
 EXAMPLES = """examples:
-  sb3-quad train                                          stage one, on the batched environment
-  sb3-quad train --vec-env subproc --n-envs 8             the same on PyBullet, one process each
+  sb3-quad train                                          both stages, on the batched environment
+  sb3-quad train --reference                              and PPO alone on the same budget, in the same table
+  sb3-quad train --algo dagger                            stage one alone
+  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, one process each
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
@@ -28,8 +32,8 @@ EXAMPLES = """examples:
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
-FRESH_SEED = 2**19  # added to the seed: targets that neither training nor evaluations along the way have seen
 FRESH_EPISODES = 240
+DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
@@ -48,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--eval-env-kwargs", nargs="+", metavar="K:V", help="the same, for the evaluation's environments only")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
     add("-i", "--trained-agent", metavar="ZIP", help="agent to start from: policy and critic of an SB3 on-policy zip")
+    add("--reference", action="store_true", help="with a pipeline: also train PPO alone on the same budget, for comparison")
     add("--resume", metavar="RUN_FOLDER", help="go on with an interrupted run; all its settings are kept")
     add("-f", "--log-folder", metavar="DIR", help="where run folders go (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a UUID to the run folder's name")
@@ -74,10 +79,23 @@ def run(options: argparse.Namespace) -> int:
     if options.num_threads is not None:
         _set_threads(options.num_threads)
     if options.resume is not None:
-        result = _resume(options)
+        folder = Path(options.resume)
+        changes = _changes(options)
+        if is_pipeline_run(folder):
+            return resume_stages(folder, changes, options.reference, _say)
+        from sb3_quad.training.trainer import resume
+
+        result = resume(options.resume, _say, **changes)
     else:
-        job = make_job(options)
         from sb3_quad.training.job import describe
+        from sb3_quad.training.pipeline import is_pipeline
+
+        conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
+        if conf_file is not None and is_pipeline(conf_file):
+            return run_stages(options, conf_file, make_overrides(options), job_arguments(options), _say)
+        if options.reference:
+            raise ConfigError("--reference goes with a pipeline, such as train without --algo and --env")
+        job = make_job(options)
         from sb3_quad.training.trainer import train
 
         _say(describe(job))
@@ -92,36 +110,40 @@ def make_job(options: argparse.Namespace) -> TrainingJob:
     from sb3_quad.training.config import load_config
     from sb3_quad.training.job import TrainingJob
 
+    config = load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, make_overrides(options))
+    return TrainingJob(config, **job_arguments(options))
+
+
+def make_overrides(options: argparse.Namespace) -> dict[str, Any]:
+    """The settings that a command line changes."""
     overrides = pairs(options.hyperparams, "--hyperparams")
     for name in ("n_timesteps", "n_envs", "vec_env", "expert"):
         if getattr(options, name) is not None:
             overrides[name] = getattr(options, name)
     if options.env_kwargs is not None:
         overrides["env_kwargs"] = pairs(options.env_kwargs, "--env-kwargs")
-    config = load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, overrides)
+    return overrides
+
+
+def job_arguments(options: argparse.Namespace) -> dict[str, Any]:
+    """The arguments of a job that a command line gives, beside its settings."""
     seed = 0 if options.seed is None else options.seed if options.seed >= 0 else random.SystemRandom().randrange(2**31)
     names = ("log_folder", "device", "trained_agent", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq")
     given = {name: getattr(options, name) for name in (*names, "log_interval", "tensorboard_log", "verbose")}
     given["eval_env_kwargs"] = pairs(options.eval_env_kwargs, "--eval-env-kwargs") or None
-    return TrainingJob(
-        config,
-        seed=seed,
-        unique=options.uuid,
-        progress=_progress(options),
-        **{name: value for name, value in given.items() if value is not None},
-    )
+    given |= {"seed": seed, "unique": options.uuid, "progress": _progress(options)}
+    return {name: value for name, value in given.items() if value is not None}
 
 
-def _resume(options: argparse.Namespace) -> TrainingResult:
-    from sb3_quad.training.trainer import resume
-
+def _changes(options: argparse.Namespace) -> dict[str, Any]:
+    """What a command line changes of a job that is resumed."""
     kept = ("algo", "env", "conf_file", "n_timesteps", "n_envs", "vec_env", "expert", "hyperparams", "env_kwargs")
     for name in (*kept, "eval_env_kwargs", "trained_agent", "log_folder", "seed"):
         if getattr(options, name) is not None:
             raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
     names = ("device", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "log_interval", "verbose")
-    changes: dict[str, Any] = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    return resume(options.resume, _say, progress=_progress(options), **changes)
+    changes = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    return {**changes, "progress": _progress(options)}
 
 
 def _finish(result: TrainingResult) -> None:
@@ -144,9 +166,12 @@ def _compare(result: TrainingResult) -> Any:
     from sb3_quad.evaluation.summary import summarise
     from sb3_quad.evaluation.tables import THESIS, comparison
     from sb3_quad.experts.resolve import resolve_expert
+    from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
 
-    config = result.job.config
+    config = for_evaluation(result.job)
     keywords = {key: config.env_kwargs[key] for key in ("vehicle", "noise", "task_kwargs") if key in config.env_kwargs}
+    if "max_episode_steps" in config.env_kwargs:
+        keywords["max_steps"] = config.env_kwargs["max_episode_steps"]
     expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
     columns = {
         name: summarise(fly(pilot, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords))

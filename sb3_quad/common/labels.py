@@ -75,7 +75,8 @@ class ExpertLabeller:
         n = len(observation)
         if raw.shape not in ((n, *self._space.shape), (n, self._action_dim)):
             raise ExpertError(
-                f"expert {self.name}: gave labels of shape {raw.shape}, expected {(n, *self._space.shape)} (row, action)"
+                f"expert {self.name}: gave labels of shape {raw.shape}, "
+                f"expected {(n, *self._space.shape)} (row, action)"
             )
         labels = raw.reshape(n, self._action_dim).astype(np.float32)
         if not np.isfinite(labels).all():
@@ -89,7 +90,8 @@ class ExpertLabeller:
             theirs, ours = getattr(self.expert, kind, None), getattr(env, kind)
             if isinstance(theirs, spaces.Space) and theirs.shape != ours.shape:
                 raise ExpertError(
-                    f"expert {self.name}: its {kind.replace('_', ' ')} has shape {theirs.shape}, the environment's {ours.shape}"
+                    f"expert {self.name}: its {kind.replace('_', ' ')} has shape {theirs.shape}, "
+                    f"the environment's {ours.shape}"
                 )
 
     def _choose_source(self, env: VecEnv) -> _Source:
@@ -106,7 +108,8 @@ class ExpertLabeller:
         if hasattr(expert, "actions"):
             raise ExpertError(f"expert {self.name}: needs the true state, and this environment has no true_state()")
         raise ExpertError(
-            f"expert {expert!r}: has neither actions(state) nor predict(observation), and is no function of observations"
+            f"expert {expert!r}: has neither actions(state) nor predict(observation), and is no function of "
+            "observations"
         )
 
 

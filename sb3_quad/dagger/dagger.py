@@ -47,8 +47,8 @@ class DAgger(OnPolicyAlgorithm):
     In every control step and every environment, independently, the expert's action flies with probability β, else the
     agent's sampled action. Each visited observation joins a bounded dataset together with the expert's action for the
     state *before* the step. The actor learns from mini-batches of the dataset, the critic from the GAE returns of the
-    rollout just flown. The loss is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss that
-    is minimised; entropy is to be encouraged)::
+    rollout just flown. The loss is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss
+    that is minimised; entropy is to be encouraged)::
 
         L_BC + l2_coef * 1/2 Σw² - ent_coef * H + vf_coef * value loss (Eq. 3.8)
 
@@ -63,9 +63,9 @@ class DAgger(OnPolicyAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds
         ``log_std_init``, it begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3 model, or
-        a function from observations to actions; see :class:`~sb3_quad.common.labels.ExpertLabeller` for what each is
-        shown. Never saved: give it again to ``load``, or call :meth:`set_expert`, before learning goes on
+    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3
+        model, or a function from observations to actions; :class:`~sb3_quad.common.labels.ExpertLabeller` says what
+        each is shown. Never saved: give it again to ``load``, or call :meth:`set_expert`, before learning goes on
     :param learning_rate: The learning rate, it can be a function
         of the current progress remaining (from 1 to 0)
     :param n_steps: The number of steps to run for each environment per update
@@ -78,10 +78,11 @@ class DAgger(OnPolicyAlgorithm):
         remaining (from 1 to 0). None: plain mean squared error
     :param ent_coef: Entropy coefficient c_H
     :param vf_coef: Value function coefficient
-    :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a large
-        error of the critic does not hold up the actor. None: no clipping
-    :param gradient_steps: Optimiser steps after each rollout. Each takes ``batch_size`` pairs of the dataset and an equal
-        share of the critic's ``n_epochs`` passes. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO
+    :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a
+        large error of the critic does not hold up the actor. None: no clipping
+    :param gradient_steps: Optimiser steps after each rollout. Each takes ``batch_size`` pairs of the dataset and an
+        equal share of the critic's ``n_epochs`` passes. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in
+        PPO
     :param beta: β of the first rollout, from 0 to 1
     :param beta_decay: What β loses with every rollout
     :param beta_final: Where β stops falling
@@ -232,7 +233,8 @@ class DAgger(OnPolicyAlgorithm):
         Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The critic evaluates the
         whole rollout at the end, since it does not change before.
         """
-        assert self._labeller is not None and self._last_obs is not None
+        assert self._labeller is not None
+        assert self._last_obs is not None
         self.policy.set_training_mode(False)
         rng = self._generator(0)
         beta = self.current_beta
@@ -276,7 +278,7 @@ class DAgger(OnPolicyAlgorithm):
             rollout_buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)  # type: ignore[arg-type]
             n_steps += 1
             self._last_obs = new_obs  # type: ignore[assignment]
-            self._last_episode_starts = dones  # type: ignore[assignment]
+            self._last_episode_starts = dones
 
         flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
         rollout_buffer.values = self._values(flown).reshape(n_rollout_steps, n_envs)
@@ -312,7 +314,7 @@ class DAgger(OnPolicyAlgorithm):
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
 
-        :raises TrainingError: a loss or gradient that is not finite; the parameters stay as the last good step left them
+        :raises TrainingError: a loss or gradient that is not finite; the parameters stay those of the last good step
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
@@ -382,7 +384,7 @@ class DAgger(OnPolicyAlgorithm):
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
     ) -> Self:
-        """As in SB3. ``reset_num_timesteps=True`` also begins β anew; the dataset stays until :meth:`AggregatedDataset.clear`.
+        """As in SB3. ``reset_num_timesteps=True`` also begins β anew; the dataset stays until ``dataset.clear()``.
 
         :raises ExpertError: no expert, or one that does not fit the environment
         """

@@ -40,7 +40,7 @@ class AggregatedDataset:
         self._size = self._oldest = 0
 
     def add(self, observations: npt.NDArray[np.generic], actions: npt.NDArray[np.float32]) -> None:
-        """Add pairs, oldest first: observations (n, ...), actions (n, action_dim). Of more than ``capacity``, the last."""
+        """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
         observations, actions = observations[-self.capacity :], actions[-self.capacity :]
         n = len(observations)
         start = (self._oldest + self._size) % self.capacity

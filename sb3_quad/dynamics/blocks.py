@@ -44,12 +44,8 @@ P_ARM, P_HOVER, P_MIDDLE, P_HALF, P_RADIUS = (
 
 @compiled
 def load_columns(source, first, count, target, row):
-    """Copy columns of a (rows, n) array to the lanes of the rows from ``row`` on; of a (rows, 1) array, to every lane."""
-    if source.shape[1] == 1:
-        for k in range(source.shape[0]):
-            for lane in range(LANES):
-                target[row + k, lane] = source[k, 0]
-    elif count == LANES:
+    """Copy columns of a (rows, n) array to the lanes of the rows from ``row`` on."""
+    if count == LANES:
         for k in range(source.shape[0]):
             for lane in range(LANES):
                 target[row + k, lane] = source[k, first + lane]
@@ -77,7 +73,10 @@ def store_state(scratch, state, first, count):
 @compiled
 def load_streams(scratch, streams, first, count):
     """The keys and counters of a block."""
-    load_columns(streams, first, count, uint32_rows(scratch), KEY_ROW)
+    w = uint32_rows(scratch)
+    for k in range(4):
+        for lane in range(LANES):
+            w[KEY_ROW + k, lane] = streams[k, first + min(lane, count - 1)]
 
 
 @compiled
@@ -123,17 +122,15 @@ def load_commands(scratch, actions, queue, first, count):
             b[COMMAND + k, lane] = actions[i, k]
     command_rotors(scratch)
     delay = queue.shape[0]
-    for k in range(4):
-        if delay == 0:
-            for lane in range(LANES):
-                b[WANTED + k, lane] = b[COMMAND + k, lane]
-        else:
-            for lane in range(LANES):
-                b[WANTED + k, lane] = queue[0, k, first + min(lane, count - 1)]
-            for late in range(delay - 1):
-                for lane in range(count):
+    for lane in range(LANES):
+        i = first + min(lane, count - 1)
+        for k in range(4):
+            b[WANTED + k, lane] = queue[0, k, i] if delay > 0 else b[COMMAND + k, lane]
+    if delay > 0:
+        for lane in range(count):
+            for k in range(4):
+                for late in range(delay - 1):
                     queue[late, k, first + lane] = queue[late + 1, k, first + lane]
-            for lane in range(count):
                 queue[delay - 1, k, first + lane] = b[COMMAND + k, lane]
 
 
@@ -141,11 +138,13 @@ def load_commands(scratch, actions, queue, first, count):
 def load_scaling(scratch, mean, std, noise_level, first, count):
     """μ, 1/σ and the noise level of a block, in float32."""
     b = float32_rows(scratch)
-    load_columns(mean, first, count, b, MEAN)
-    last = std.shape[1] - 1
-    for k in range(std.shape[0]):
-        for lane in range(LANES):
-            b[INVERSE_STD + k, lane] = np.float32(1.0 / std[k, min(first + min(lane, count - 1), last)])
     last = noise_level.shape[0] - 1
     for lane in range(LANES):
         b[LEVEL, lane] = noise_level[min(first + min(lane, count - 1), last)]
+    for k in range(std.shape[0]):
+        for lane in range(LANES):
+            i = min(first + min(lane, count - 1), last)
+            b[MEAN + k, lane] = mean[k, i]
+            b[INVERSE_STD + k, lane] = std[k, i]
+        for lane in range(LANES):
+            b[INVERSE_STD + k, lane] = np.float32(1.0) / b[INVERSE_STD + k, lane]

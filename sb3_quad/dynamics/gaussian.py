@@ -61,7 +61,6 @@ def _log(x):
 @compiled(fastmath=True)
 def draw_normals(scratch):
     """18 standard normals per lane from its 20 words."""
-    draw_words(scratch)
     w = uint32_rows(scratch)
     b = float32_rows(scratch)
     for pair in range(NORMALS // 2):

@@ -190,7 +190,7 @@ def move_far(scratch, dt):
         b[QW, lane], b[QX, lane], b[QY, lane], b[QZ, lane] = nw * scale, nx * scale, ny * scale, nz * scale
 
 
-@compiled
+@compiled(inline="always")
 def fly_block(scratch, physics_step, substeps):
     """The physics steps of one control step of a loaded block, in place."""
     for _ in range(substeps):
@@ -215,9 +215,9 @@ def control_step(state, queue, actions, wrench, vehicles, physics_step, substeps
     :param substeps: physics steps in one control step.
     """
     memory = np.empty(SCRATCH_SIZE + 8)
-    scratch = scratch_pointer(memory)
     n = state.shape[1]
     for first in range(0, n, LANES):
+        scratch = scratch_pointer(memory)  # in the loop: numba frees what is not used again
         count = min(LANES, n - first)
         load_state(scratch, state, first, count)
         load_columns(wrench, first, count, float64_rows(scratch), WRENCH)

@@ -38,8 +38,8 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 def _source_stamp() -> tuple[tuple[str, float, int], ...]:
-    folders = [Path(root) / name for root in sb3_quad.__path__ for name in ("dynamics", "envs")]
-    files = sorted(path for folder in folders if folder.is_dir() for path in folder.glob("*.py"))
+    names = ("dynamics/*.py", "envs/observation.py", "envs/episodes.py", "envs/batch_kernel.py")
+    files = sorted(path for root in sb3_quad.__path__ for name in names for path in Path(root).glob(name))
     return tuple((path.name, os.stat(path).st_mtime, os.stat(path).st_size) for path in files)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from sb3_quad.dynamics.blocks import P_ARM, P_HALF, P_LIFT, P_MIDDLE, P_MOTOR
+from sb3_quad.dynamics.lowlevel import compiled
 
 NOT_FINITE, BODY_FRAME_ONLY, WORLD_FRAME_TOO = 0, 1, 2
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def rotor_wrenches(state, queue, action, wrench, vehicles, physics_step, out):
     """Advance delay and motors of vehicle 0 and write what acts on its body in each physics step; in place.
 
@@ -26,14 +27,14 @@ def rotor_wrenches(state, queue, action, wrench, vehicles, physics_step, out):
         if not math.isfinite(action[j]):
             return NOT_FINITE
     delay = queue.shape[0]
-    thrust_coefficient, motor_gain = vehicles[4, 0], vehicles[5, 0]
+    thrust_coefficient, motor_gain = vehicles[P_LIFT, 0], vehicles[P_MOTOR, 0]
     for step in range(out.shape[0]):
         for axis in range(3):
             out[step, 0, axis] = wrench[3 + axis, 0]
             out[step, 1, axis] = wrench[9 + axis, 0]
     for j in range(4):
         clipped = min(max(float(action[j]), -1.0), 1.0)
-        command = math.sqrt((vehicles[20, 0] + vehicles[21, 0] * clipped) / thrust_coefficient)  # Eqs. 3.18, 2.4
+        command = math.sqrt((vehicles[P_MIDDLE, 0] + vehicles[P_HALF, 0] * clipped) / thrust_coefficient)  # Eqs. 3.18, 2.4
         wanted = command
         if delay > 0:
             wanted = queue[0, j, 0]
@@ -46,7 +47,7 @@ def rotor_wrenches(state, queue, action, wrench, vehicles, physics_step, out):
             thrust = thrust_coefficient * speed * speed
             out[step, 0, 2] += thrust
             for axis in range(3):
-                out[step, 1, axis] += vehicles[7 + 4 * axis + j, 0] * thrust  # Eq. 2.7, X layout
+                out[step, 1, axis] += vehicles[P_ARM + 4 * axis + j, 0] * thrust  # Eq. 2.7, X layout
         state[13 + j, 0] = speed
     for axis in range(3):
         if wrench[axis, 0] != 0.0 or wrench[6 + axis, 0] != 0.0:
@@ -54,7 +55,7 @@ def rotor_wrenches(state, queue, action, wrench, vehicles, physics_step, out):
     return BODY_FRAME_ONLY
 
 
-@njit(cache=True, error_model="numpy")
+@compiled
 def write_body(state, position, quaternion, velocity, angular_velocity):
     """Write a simulator's pose and velocity into the state of vehicle 0, in place.
 

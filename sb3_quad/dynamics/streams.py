@@ -9,8 +9,6 @@ counter: the key names the row, the counter is ``(block, step, episode, purpose)
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import numpy.typing as npt
 from numba import uint32, uint64
@@ -59,19 +57,18 @@ def philox(c0, c1, c2, c3, k0, k1):
 
 
 @compiled
-def uniform_pair(streams, row, block, purpose):
-    """Two doubles, uniform on (0, 1), of 53 bits each."""
-    w0, w1, w2, w3 = philox(
-        uint32(block), streams[STEP, row], streams[EPISODE, row], uint32(purpose), streams[KEY_LO, row], streams[KEY_HI, row]
-    )
-    first = ((uint64(w0) << uint64(32) | uint64(w1)) >> uint64(11)) + 0.5
-    second = ((uint64(w2) << uint64(32) | uint64(w3)) >> uint64(11)) + 0.5
-    return first * 2.0**-53, second * 2.0**-53
-
-
-@compiled
-def normal_pair(streams, row, block, purpose):
-    """Two independent standard normal doubles (Box-Muller)."""
-    u, v = uniform_pair(streams, row, block, purpose)
-    radius = math.sqrt(-2.0 * math.log(u))
-    return radius * math.cos(2.0 * math.pi * v), radius * math.sin(2.0 * math.pi * v)
+def uniforms(streams, row, blocks, purpose):
+    """Doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 blocks,)."""
+    numbers = np.empty(2 * blocks)
+    for block in range(blocks):
+        w0, w1, w2, w3 = philox(
+            uint32(block),
+            streams[STEP, row],
+            streams[EPISODE, row],
+            uint32(purpose),
+            streams[KEY_LO, row],
+            streams[KEY_HI, row],
+        )
+        numbers[2 * block] = (((uint64(w0) << _SHIFT | uint64(w1)) >> uint64(11)) + 0.5) * 2.0**-53
+        numbers[2 * block + 1] = (((uint64(w2) << _SHIFT | uint64(w3)) >> uint64(11)) + 0.5) * 2.0**-53
+    return numbers

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from collections.abc import Mapping
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,8 +40,8 @@ PARAMETER_NAMES = (
 class Vehicle(BaseModel):
     """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
 
-    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another. Raises :class:`ConfigError` through
-    :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
+    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises :class:`ConfigError`
+    through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -79,26 +80,30 @@ class Vehicle(BaseModel):
             raise ValueError(f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step}")
         if self.motor_gain * self.physics_step > 1.0:
             raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
-        if abs(np.linalg.det(self.mixer)) < 1e-12:
-            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently")
+        try:
+            _ = self.mixer
+        except np.linalg.LinAlgError:
+            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently") from None
         if not np.allclose(self.mixer[1:].sum(axis=1), 0.0, atol=1e-9):
             raise ValueError("rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)")
         return self
 
-    @cached_property
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Vehicle:
+        """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated."""
+        return Vehicle.model_validate({**self.model_dump(), **(update or {})})
+
+    @property
     def mixer(self) -> FloatArray:
         """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N.
 
         Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and pitch.
         """
-        positions = np.asarray(self.rotor_positions, dtype=np.float64)
-        yaw = self.moment_thrust_ratio * np.asarray(self.rotor_directions, dtype=np.float64)
-        return np.stack([np.ones(4), positions[:, 1], -positions[:, 0], yaw])
+        return _mixers(self.rotor_positions, self.rotor_directions, self.moment_thrust_ratio)[0]
 
-    @cached_property
+    @property
     def mixer_inverse(self) -> FloatArray:
         """Rotor thrusts from [ΣF; Mx; My; Mz], shape (4, 4)."""
-        return np.asarray(np.linalg.inv(self.mixer))
+        return _mixers(self.rotor_positions, self.rotor_directions, self.moment_thrust_ratio)[1]
 
     @property
     def hover_thrust(self) -> float:
@@ -142,6 +147,19 @@ class Vehicle(BaseModel):
         head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
         tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius)
         return np.array([*head, *self.mixer[1:].ravel(), *tail], dtype=np.float64)
+
+
+@lru_cache(maxsize=256)
+def _mixers(positions: PerRotor, directions: tuple[int, int, int, int], ratio: float) -> tuple[FloatArray, FloatArray]:
+    """Mixer and inverse, kept outside the model, whose copies and comparisons they would otherwise disturb; read-only."""
+    x, y = np.asarray(positions, dtype=np.float64).T
+    mixer = np.stack([np.ones(4), y, -x, ratio * np.asarray(directions, dtype=np.float64)])
+    if abs(np.linalg.det(mixer)) < 1e-12:
+        raise np.linalg.LinAlgError("singular mixer")
+    inverse = np.asarray(np.linalg.inv(mixer))
+    mixer.setflags(write=False)
+    inverse.setflags(write=False)
+    return mixer, inverse
 
 
 def vehicle_names() -> list[str]:

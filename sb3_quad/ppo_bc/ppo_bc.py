@@ -26,7 +26,8 @@ from sb3_quad.ppo_bc.gradients import gradient_norms
 
 SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
 BC_LOSSES = ("nll", "mse")
-BC_FILTERS = ("none", "negative_advantage")
+BC_FILTERS = ("none", "negative_advantage", "agreement")
+AGREEMENT = 0.5  # root mean squared difference of actions (half of the range is 1) up to which "agreement" clones
 
 
 class PPOBC(PPO):
@@ -335,8 +336,11 @@ class PPOBC(PPO):
             per_sample = (mean - expert_actions).square().mean(dim=1)
         if self.bc_filter == "none":
             return per_sample.mean()
-        mask = (advantages < 0).float()
-        return (per_sample * mask).sum() / mask.sum().clamp(min=1.0)
+        if self.bc_filter == "negative_advantage":
+            mask = (advantages < 0).float()
+        else:
+            mask = ((mean - expert_actions).square().mean(dim=1) < AGREEMENT**2).float()
+        return (per_sample * mask).mean()
 
     def learn(
         self: SelfPPOBC,

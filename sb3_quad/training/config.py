@@ -7,6 +7,7 @@ n_timesteps           transitions to train on, over all environments
 n_envs                environments flown side by side (1)
 vec_env               batch (default for this package's environments), dummy (default for others) or subproc
 env_kwargs            keywords of the environment's constructor
+eval_env_kwargs       put over them in the evaluation's environments
 policy                name of a policy, MlpPolicy by default
 policy_kwargs         mapping, or a string such as "dict(net_arch=[64, 64], activation_fn=nn.Tanh)"
 expert                pid, path/to/model.zip or package.module:factory, for algorithms that learn from one
@@ -36,7 +37,7 @@ from sb3_quad.training.values import convert, positive_whole, qualified_classes
 
 VEC_ENVS = ("batch", "dummy", "subproc")
 _JOB_KEYS = (
-    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "policy", "policy_kwargs", "expert"),
+    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "policy", "policy_kwargs", "expert"),
     *("callback", "env_wrapper", "vec_env_wrapper", "normalize"),
 )
 # What env_kwargs may give to a quadcopter environment, batched or not.
@@ -55,6 +56,7 @@ class TrainingConfig:
     n_envs: int
     vec_env: str
     env_kwargs: dict[str, Any]
+    eval_env_kwargs: dict[str, Any]
     policy: str
     policy_kwargs: dict[str, Any]
     expert: Any
@@ -81,7 +83,7 @@ def load_config(
     """
     get_algorithm(algo)
     check_environment(env_id)
-    content, where = _read(conf_file if conf_file is not None else f"{algo}.yml")
+    content, where = read_settings(conf_file if conf_file is not None else f"{algo}.yml")
     if not isinstance(content, dict):
         raise ConfigError(f"{where}: must hold environment ids with their settings")
     if env_id not in content:
@@ -131,6 +133,7 @@ def build_config(
         n_envs=positive_whole(settings.get("n_envs", 1), at("n_envs")),
         vec_env=_vec_env(settings.get("vec_env"), env_id, at("vec_env")),
         env_kwargs=_env_kwargs(settings.get("env_kwargs"), env_id, at("env_kwargs")),
+        eval_env_kwargs=_env_kwargs(settings.get("eval_env_kwargs"), env_id, at("eval_env_kwargs")),
         policy=_known(settings.get("policy", "MlpPolicy"), algorithm.policy_aliases, at("policy")),
         policy_kwargs=parse_mapping(settings.get("policy_kwargs"), at("policy_kwargs")),
         expert=settings.get("expert") or ("pid" if learns else None),
@@ -166,8 +169,11 @@ def read_yaml(text: str, where: str) -> Any:
         raise ConfigError(f"{where}: not valid YAML ({' '.join(str(error).split())})") from None
 
 
-def _read(conf_file: str | Path) -> tuple[Any, str]:
-    """The content of a settings file on disk or in the package, and what to call it."""
+def read_settings(conf_file: str | Path) -> tuple[Any, str]:
+    """The content of a settings file on disk or in the package, and what to call it.
+
+    :raises ConfigError: no such file, or one that cannot be read.
+    """
     name = str(conf_file)
     path = Path(conf_file)
     if path.is_file():

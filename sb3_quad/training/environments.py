@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
 # Of QuadcopterVecEnv.batch: all that its future flight depends on.
-_BATCH_STATE = ("state", "queue", "wrench", "streams", "task_index", "returns", "noise_level", "mean", "std")
+_BATCH_STATE = ("state", "queue", "wrench", "streams", "task_index", "returns")
 
 
 def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:

@@ -106,8 +106,15 @@ def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = Fal
     :param unique: add a UUID to the name, as rl-zoo's ``--uuid`` does.
     :raises ConfigError: a folder that cannot be made.
     """
-    parent = Path(log_folder) / algo
     name = file_name(env_id)
+    return RunFolder(claim_folder(Path(log_folder) / algo, name, unique), name)
+
+
+def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
+    """Make ``<parent>/<name>_<number>`` with the next free number; no other process can get the same one.
+
+    :raises ConfigError: a folder that cannot be made.
+    """
     try:
         parent.mkdir(parents=True, exist_ok=True)
         number = latest_run(parent, name) + 1
@@ -115,7 +122,7 @@ def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = Fal
             path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
             try:
                 os.mkdir(path)  # fails if another run was quicker
-                return RunFolder(path, name)
+                return path
             except FileExistsError:
                 number += 1
     except OSError as error:

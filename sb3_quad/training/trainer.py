@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from sb3_quad.callbacks.last_good import LastGoodModel
 
 EVALUATION_SEED = 2**18  # added to the seed for the evaluations along the way; beyond any training environment's
+FRESH_SEED = 2**19  # added to the seed for the figures at the end: episodes that nothing before has seen
 
 Report = Callable[[str], None]
 
@@ -50,10 +51,13 @@ class TrainingResult:
     exit_code: int = 0
 
 
-def train(job: TrainingJob, report: Report = print) -> TrainingResult:
+def train(
+    job: TrainingJob, report: Report = print, started: Callable[[RunFolder], None] = lambda run: None
+) -> TrainingResult:
     """Train as ``job`` says, in a run folder of its own.
 
     :param report: told of each event in one line.
+    :param started: told of the run folder before the training begins.
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
@@ -63,6 +67,7 @@ def train(job: TrainingJob, report: Report = print) -> TrainingResult:
             hand_over(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
         run.write_yaml(config.settings, job.arguments())
+        started(run)
         return _learn(job, run, model, eval_env, signals, report, config.n_timesteps)
 
 
@@ -94,15 +99,17 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, VecEnv | None]]:
         made.append(make_environments(config, config.n_envs, job.seed))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
-            made.append(make_environments(_for_evaluation(job), min(n_envs, job.eval_episodes), job.seed + EVALUATION_SEED))
+            made.append(make_environments(for_evaluation(job), min(n_envs, job.eval_episodes), job.seed + EVALUATION_SEED))
         yield made[0], (made[1] if len(made) > 1 else None)
     finally:
         for env in made:
             env.close()
 
 
-def _for_evaluation(job: TrainingJob) -> TrainingConfig:
-    return replace(job.config, env_kwargs={**job.config.env_kwargs, **(job.eval_env_kwargs or {})})
+def for_evaluation(job: TrainingJob) -> TrainingConfig:
+    """The settings with the environments as evaluations have them."""
+    config = job.config
+    return replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs, **(job.eval_env_kwargs or {})})
 
 
 def _expert(config: TrainingConfig) -> dict[str, Any]:

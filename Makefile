@@ -1,0 +1,62 @@
+# Everything runs in a virtual environment of its own, made on first use: make test, make train.
+# Another interpreter: make PYTHON=python3.11 test. Arguments: make test ARGS="-m 'not slow'", make train ARGS="--seed 1".
+PYTHON ?= python3
+VENV ?= .venv
+ARGS ?=
+
+PY := $(VENV)/bin/python
+INSTALLED := $(VENV)/.installed
+LINKS := build/type/sb3_quad
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help install train test lint format type commit-checks clean
+
+help:
+	@echo "make train          train with the default settings"
+	@echo "make test           run the tests"
+	@echo "make lint           check code style"
+	@echo "make format         put code into that style"
+	@echo "make type           check types"
+	@echo "make commit-checks  format, type and lint"
+	@echo "make clean          remove what was built and cached; logs/ and $(VENV)/ stay"
+
+install: $(INSTALLED)
+
+train: $(INSTALLED)
+	$(PY) -m sb3_quad.cli train $(ARGS)
+
+test: $(INSTALLED)
+	$(PY) -m pytest $(ARGS)
+
+lint: $(INSTALLED)
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+
+format: $(INSTALLED)
+	$(PY) -m ruff check --fix --exit-zero --quiet .
+	$(PY) -m ruff format .
+
+# mypy does not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: it sees links instead.
+type: $(INSTALLED)
+	@rm -rf $(LINKS) && mkdir -p $(LINKS)
+	@for path in sb3_quad/* envs callbacks zoo_configs; do ln -s "$(CURDIR)/$$path" $(LINKS); done
+	$(PY) -m mypy
+
+commit-checks: format type lint
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find sb3_quad envs callbacks zoo_configs tests -name __pycache__ -prune -exec rm -rf {} +
+
+$(PY):
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || { \
+		echo "Python 3.10 or later is needed, and $(PYTHON) is none; name one: make PYTHON=python3.11 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip, venv' || { \
+		echo "$(PYTHON) cannot make virtual environments; its venv package is missing (Debian: python3-venv)" >&2; exit 1; }
+	$(PYTHON) -m venv $(VENV)
+
+$(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
+	@echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."
+	@$(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@

@@ -1,0 +1,59 @@
+"""``plot``: learning curves of one or more runs as a picture."""
+
+from __future__ import annotations
+
+import argparse
+import glob
+import io
+from pathlib import Path
+
+from sb3_quad.errors import ConfigError
+
+HELP = "Draw learning curves: success and reward over transitions and wall-clock time, seeds as mean and range."
+EXAMPLES = """examples:
+  sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
+  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of ``plot``."""
+    add = parser.add_argument
+    add("groups", nargs="+", metavar="NAME=PATTERN", help="an agent's name and its run folders, * allowed (quote it)")
+    add("--line", action="append", default=[], metavar="NAME:SUCCESS:REWARD", help="a horizontal line: success in %%, reward")
+    add("--title", default="", help="above the picture")
+    add("-o", "--output", default="curves.png", metavar="FILE", help="picture to write: .png, .svg or .pdf (curves.png)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Read the runs, draw, write. Returns the exit code."""
+    from sb3_quad.evaluation.curves import plot_curves, read_curve
+    from sb3_quad.training.files import write_bytes
+
+    groups = {}
+    for text in options.groups:
+        name, separator, pattern = text.partition("=")
+        folders = sorted(glob.glob(pattern))
+        if not separator or not name:
+            raise ConfigError(f"{text!r}: give NAME=PATTERN, such as 'RL-agent=logs/ppo_bc/*'")
+        if not folders:
+            raise ConfigError(f"{name}: no folder fits {pattern}")
+        groups[name] = [read_curve(folder) for folder in folders]
+    output = Path(options.output)
+    kind = output.suffix.removeprefix(".")
+    if kind not in ("png", "svg", "pdf"):
+        raise ConfigError(f"--output {output}: must end in .png, .svg or .pdf")
+    figure = plot_curves(groups, dict(_line(text) for text in options.line), options.title)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, dpi=130)
+    write_bytes(output, buffer.getvalue())
+    print(f"saved {output}")
+    return 0
+
+
+def _line(text: str) -> tuple[str, tuple[float, float]]:
+    try:
+        name, success, reward = text.split(":")
+        return name, (float(success) / 100, float(reward))
+    except ValueError:
+        raise ConfigError(f"--line {text!r}: give NAME:SUCCESS:REWARD, such as expert:31.9:-16.1") from None

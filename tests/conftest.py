@@ -1,0 +1,28 @@
+"""What every test starts from: the CPU, one thread of torch, fixed seeds, no display."""
+
+from __future__ import annotations
+
+import os
+import random
+
+os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read when torch is imported; the tests are the same on every machine
+os.environ["MPLBACKEND"] = "Agg"
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import settings
+
+# The first example of a test may compile, so no deadline. In CI, the same examples every time.
+settings.register_profile("default", deadline=None)
+settings.register_profile("ci", deadline=None, derandomize=True, database=None, print_blob=True)
+settings.load_profile("ci" if os.environ.get("CI") else "default")
+
+
+@pytest.fixture(autouse=True)
+def same_start():
+    """Sums come out the same on any number of cores, and global generators start from the same seed in every test."""
+    torch.set_num_threads(1)
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 - SB3's buffers draw from it
+    torch.manual_seed(0)

@@ -1,0 +1,169 @@
+"""Callbacks: with any algorithm and environment, each does its one thing."""
+
+from __future__ import annotations
+
+import random
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, PPO
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.results_plotter import load_results
+
+from sb3_quad.callbacks import best_model
+from sb3_quad.callbacks.best_model import BestModel
+from sb3_quad.callbacks.checkpoint import Checkpoint
+from sb3_quad.callbacks.episode_log import EpisodeLog
+from sb3_quad.callbacks.last_good import LastGoodModel, random_state, set_random_state
+from sb3_quad.callbacks.stop import StopWhen
+from sb3_quad.errors import TrainingError
+
+
+class Walk(gymnasium.Env):
+    """Ten steps; a success when the last action is positive."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self._observation(), {}
+
+    def step(self, action):
+        self.steps += 1
+        return self._observation(), float(action[0]), False, self.steps == 10, {"is_success": bool(action[0] > 0)}
+
+    def _observation(self):
+        return self.np_random.uniform(-1, 1, 2).astype(np.float32)
+
+
+def make_model(algorithm=PPO, n_envs=2, **kwargs):
+    size = {"batch_size": 20} if algorithm is PPO else {}
+    env = make_vec_env(Walk, n_envs)
+    return algorithm("MlpPolicy", env, n_steps=20, policy_kwargs={"net_arch": [4]}, seed=0, device="cpu", **size, **kwargs)
+
+
+def make_best(tmp_path, every=1000, **kwargs):
+    return BestModel(make_vec_env(Walk, 2), every, 4, 5, tmp_path / "best_model.zip", tmp_path / "evaluations.npz", **kwargs)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C])
+def test_evaluations_are_regular_and_recorded(tmp_path, algorithm):
+    lines = []
+    best = make_best(tmp_path, every=60, report=lines.append)
+    make_model(algorithm).learn(160, callback=best)
+    best.evaluate()
+    with np.load(tmp_path / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [60, 120, 160]
+        assert file["results"].shape == file["successes"].shape == file["ep_lengths"].shape == (3, 4)
+        assert (np.diff(file["seconds"]) >= 0).all()
+    assert len(lines) == 3
+    assert (tmp_path / "best_model.zip").is_file()
+
+
+def test_success_comes_before_reward(tmp_path, monkeypatch):
+    best = make_best(tmp_path)
+    model = make_model()
+    model.set_logger(configure(None, []))
+    best.init_callback(model)
+    best.on_training_start({}, {})
+    kept = []
+    monkeypatch.setattr(best_model, "save_model", lambda model, path: kept.append(best.best))
+    for success, reward in [(0.5, 10.0), (1.0, -5.0), (0.5, 99.0), (1.0, -5.0), (1.0, -4.0)]:
+
+        def evaluate(model, env, n, callback, success=success, reward=reward, **kwargs):
+            for value in np.arange(4) < 4 * success:
+                callback({"done": True, "info": {"is_success": value}}, {})
+            return [reward] * 4, [10] * 4
+
+        monkeypatch.setattr(best_model, "evaluate_policy", evaluate)
+        best.evaluate()
+    assert kept == [(0.5, 10.0), (1.0, -5.0), (1.0, -4.0)]
+
+
+def test_evaluations_fly_the_same_episodes_each_time(tmp_path):
+    best = make_best(tmp_path, every=10_000)
+    make_model().learn(40, callback=best)
+    best.evaluate()
+    best.evaluate()
+    with np.load(tmp_path / "evaluations.npz") as file:
+        assert (file["results"][0] == file["results"][1]).all()
+
+
+def test_records_are_continued(tmp_path):
+    for _ in range(2):
+        model, best = make_model(), make_best(tmp_path, every=40)
+        model.learn(80, callback=best)
+    with np.load(tmp_path / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [40, 80] * 2
+        means = file["results"].mean(axis=1), file["successes"].mean(axis=1)
+    assert best.best == max(zip(means[1].tolist(), means[0].tolist(), strict=True))
+
+
+def test_checkpoints_are_whole_models_at_their_number_of_steps(tmp_path):
+    model = make_model()
+    model.learn(160, callback=Checkpoint(50, lambda steps: tmp_path / f"rl_model_{steps}_steps.zip"))
+    names = sorted(entry.name for entry in tmp_path.iterdir())
+    assert names == ["rl_model_100_steps.zip", "rl_model_150_steps.zip", "rl_model_50_steps.zip"]
+    assert PPO.load(tmp_path / "rl_model_150_steps.zip").num_timesteps == 150
+
+
+def test_the_episode_log_is_a_monitor_file(tmp_path):
+    for _ in range(2):
+        make_model().learn(80, callback=EpisodeLog(tmp_path / "0.monitor.csv", "Walk-v0"))
+    results = load_results(str(tmp_path))
+    assert len(results) == 2 * 80 / 10
+    assert (results.l == 10).all()
+    assert set(results.is_success) <= {True, False}
+    assert (tmp_path / "0.monitor.csv").read_text().count("#") == 1
+
+
+def test_stopping_leaves_after_the_step():
+    model = make_model()
+    model.learn(1000, callback=StopWhen(lambda: model.num_timesteps >= 50))
+    assert model.num_timesteps == 50
+
+
+def test_the_snapshot_is_of_the_last_rollout_start(tmp_path):
+    model, last_good = make_model(), LastGoodModel()
+    model.learn(1000, callback=[last_good, StopWhen(lambda: model.num_timesteps >= 90)])
+    assert last_good.snapshot.timesteps == 80
+    (tmp_path / "model.zip").write_bytes(last_good.snapshot.model)
+    saved = PPO.load(tmp_path / "model.zip")
+    assert saved.num_timesteps == 80
+    for ours, theirs in zip(model.policy.parameters(), saved.policy.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+
+
+class Spoil(BaseCallback):
+    """Makes the parameters NaN at the end of the second rollout, as a diverging update does."""
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        if self.num_timesteps == 80:
+            self.model.train = lambda: [p.data.fill_(torch.nan) for p in self.model.policy.parameters()]
+
+
+def test_parameters_that_are_not_finite_end_the_training():
+    model, last_good = make_model(), LastGoodModel()
+    with pytest.raises(TrainingError, match="no longer finite"):
+        model.learn(1000, callback=[last_good, Spoil()])
+    assert last_good.snapshot.timesteps == 40
+
+
+def test_random_numbers_can_be_repeated():
+    def draw():
+        return torch.rand(3).tolist(), np.random.normal(size=3).tolist(), [random.gauss(0, 1) for _ in range(3)]
+
+    draw()
+    state = random_state()
+    first = draw()
+    set_random_state(state)
+    assert draw() == first

@@ -1,0 +1,305 @@
+"""The command line: one line and code 2 on bad input, nothing lost on interruption, a run that resumes as if nothing was."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_quad.cli import main
+from sb3_quad.training.config import build_config
+from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.trainer import resume, train
+
+ENV = "QuadTargetTracking-v0"
+SMALL = {
+    "n_timesteps": 1200,
+    "n_envs": 8,
+    "n_steps": 50,
+    "batch_size": 100,
+    "learning_rate": "lin_1e-3",
+    "policy_kwargs": {"net_arch": [8]},
+    "env_kwargs": {"max_episode_steps": 60},
+}
+SMALL_DAGGER = {**SMALL, "dataset_capacity": 1000}
+
+
+class Interrupt(BaseCallback):
+    """Sends this process a signal, once, after a number of transitions."""
+
+    sent: bool = True
+
+    def __init__(self, number: int = signal.SIGTERM, after: int = 900) -> None:
+        super().__init__()
+        self.number, self.after = number, after
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps >= self.after and not Interrupt.sent:
+            Interrupt.sent = True
+            os.kill(os.getpid(), self.number)
+        return True
+
+
+class Diverge(BaseCallback):
+    """Poisons the policy in its second rollout."""
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps > 500:
+            with torch.no_grad():
+                next(iter(self.model.policy.action_net.parameters())).fill_(torch.nan)
+        return True
+
+
+@pytest.fixture
+def settings_file(tmp_path):
+    path = tmp_path / "small.yml"
+    path.write_text(yaml.safe_dump({ENV: SMALL_DAGGER}))
+    return str(path)
+
+
+def job(tmp_path, algo="dagger", **changes):
+    settings = {**(SMALL_DAGGER if algo == "dagger" else SMALL), **changes}
+    return TrainingJob(build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0)
+
+
+def one_line_of_error(capsys) -> str:
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("sb3_quad: compiling")]
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("error: "), lines
+    return lines[0]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["trian"], "did you mean 'train'"),
+        (["train", "--sede", "1"], "did you mean '--seed'"),
+        (["train", "--algo", "dager"], "did you mean 'dagger'"),
+        (["train", "--env", "QuadTargetTraking-v0"], "did you mean 'QuadTargetTracking-v0'"),
+        (["train", "--algo", "dagger", "--n-envs", "0"], "at least 1"),
+        (["train", "--algo", "dagger", "-n", "many"], "no whole number"),
+        (["train", "--algo", "dagger", "--hyperparams", "n_setps:3"], "did you mean 'n_steps'"),
+        (["train", "--algo", "dagger", "--hyperparams", "n_steps"], "key:value"),
+        (["train", "--algo", "dagger", "--hyperparams", "batch_size:0"], "batch_size 0"),
+        (["train", "--algo", "dagger", "--env-kwargs", "noise:-1"], "noise -1"),
+        (["train", "--algo", "dagger", "--env-kwargs", "vehicle:itn"], "did you mean 'itm'"),
+        (["train", "--algo", "dagger", "--env-kwargs", "task_kwargs:{'target_distanse':3}"], "did you mean 'target_distance'"),
+        (["train", "--algo", "dagger", "--vec-env", "bath"], "did you mean 'batch'"),
+        (["train", "--algo", "dagger", "--expert", "pit"], "unknown expert"),
+        (["train", "--algo", "dagger", "--conf-file", "thesis/dager.yml"], "did you mean 'thesis/dagger.yml'"),
+        (["train", "--algo", "dagger", "-i", "missing.zip"], "missing.zip: no such file"),
+        (["train", "--algo", "dagger", "--seed", str(2**40)], "seed"),
+        (["train", "--algo", "dagger", "--gym-packages", "no_such_package"], "no_such_package"),
+        (["train", "--algo", "dagger", "--num-threads", "0"], "at least 1"),
+        (["train", "--resume", "no_such_folder"], "no such folder"),
+        (["train", "--resume", ".", "--seed", "1"], "leave --seed away"),
+        (["benchmark", "--sizes", "0"], "at least 1"),
+    ],
+)
+def test_bad_input_is_one_line_and_code_2(arguments, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == 2
+    assert message in one_line_of_error(capsys)
+    assert not any(tmp_path.rglob("*.zip"))
+
+
+def test_a_log_folder_that_cannot_be_written(capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert main(["train", "--algo", "dagger", "-f", str(tmp_path / "file")]) == 2
+    assert "cannot be written" in one_line_of_error(capsys)
+
+
+def damaged_zip(tmp_path, kind):
+    path = tmp_path / "agent.zip"
+    PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu").save(path)
+    content = path.read_bytes()
+    if kind == "half":
+        path.write_bytes(content[: len(content) // 2])
+    elif kind == "other":
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr("readme", "no model")
+    elif kind == "text":
+        path.write_text("no zip at all")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("half", "not a complete SB3 zip"),
+        ("other", "not a complete SB3 zip"),
+        ("text", "not a complete SB3 zip"),
+        ("of another space", "layer mlp_extractor.policy_net.0.weight has shape (64, 3), here it is (8, 18)"),
+    ],
+)
+def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, settings_file):
+    path = damaged_zip(tmp_path, kind)
+    assert main(["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "-i", str(path)]) == 2
+    assert message in one_line_of_error(capsys)
+    assert not (tmp_path / "logs").exists()
+
+
+def test_help_has_examples_and_needs_no_torch():
+    code = (
+        "import sys\nfrom sb3_quad.cli import main\n"
+        "codes = [main(a) for a in (['--help'], ['train', '--help'], ['benchmark', '--help'])]\n"
+        "sys.exit(any(codes) or 'torch' in sys.modules or 'numba' in sys.modules)"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert result.returncode == 0, result.stderr
+    assert result.stdout.count("examples:") == 2
+    assert "exit codes:" in result.stdout
+
+
+def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
+    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "--no-progress"]
+    more = ["--eval-freq", "400", "--eval-episodes", "4", "--save-freq", "800", "--env-kwargs", "noise:0.1", "--seed", "3"]
+    assert main(arguments + more) == 0
+    output = capsys.readouterr().out
+    run = tmp_path / "logs" / "dagger" / f"{ENV}_1"
+    for part in ("agent", "expert", "thesis", "success", "mean time to 0.1 m", "mean path", "trained in", str(run)):
+        assert part in output
+    files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
+    assert files == {
+        *(f"{ENV}.zip", "best_model.zip", "rl_model_800_steps.zip", "evaluations.npz", "0.monitor.csv"),
+        *(f"{ENV}/config.yml", f"{ENV}/args.yml"),
+    }
+    assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
+    arguments_file = yaml.safe_load((run / ENV / "args.yml").read_text())
+    assert arguments_file["seed"] == 3
+    assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {"max_episode_steps": 60, "noise": 0.1}
+    with np.load(run / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
+
+
+@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+def test_pybullet_gives_the_same_run_as_the_batch(tmp_path, vec_env):
+    changes = {"n_timesteps": 200, "n_envs": 2, "env_kwargs": {"noise": 0, "max_episode_steps": 60}}
+    models = [train(job(tmp_path, vec_env=kind, **changes), report=lambda line: None).model for kind in ("batch", vec_env)]
+    for ours, theirs in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
+        torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5)
+
+
+def test_other_environments_train_too(tmp_path):
+    settings = {"n_timesteps": 128, "n_envs": 2, "n_steps": 32, "batch_size": 32}
+    config = build_config("ppo", "Pendulum-v1", settings)
+    result = train(TrainingJob(config, log_folder=str(tmp_path), eval_episodes=1), report=lambda line: None)
+    assert PPO.load(result.run.model).num_timesteps == 128
+    assert result.run.best_model.is_file()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_signals_save_the_model_and_say_where(tmp_path, number, code, settings_file):
+    """In a process of its own, as a shell would send them."""
+    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path), "-n", "1e9"]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sb3_quad.cli", *arguments, "--eval-episodes", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=Path(__file__).parent.parent,
+    )
+    log = tmp_path / "dagger" / f"{ENV}_1" / "0.monitor.csv"
+    end = time.monotonic() + 120
+    while process.poll() is None and time.monotonic() < end and (not log.is_file() or log.read_text().count("\n") < 20):
+        time.sleep(0.05)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == code, errors
+    assert signal.Signals(number).name in output
+    assert "Traceback" not in errors
+    saved = log.parent / f"{ENV}.zip"
+    assert f"model saved to {saved}" in output
+    assert PPO.load(saved).num_timesteps > 0
+
+
+@pytest.mark.parametrize("algo", ["dagger", "ppo"])
+@pytest.mark.parametrize("after", [8, 900, 1000])
+def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after):
+    interruption = {"test_cli.Interrupt": {"after": after}}
+    Interrupt.sent = True
+    whole = train(job(tmp_path, algo, callback=interruption), report=lambda line: None)
+    Interrupt.sent = False
+    lines = []
+    interrupted = train(job(tmp_path, algo, callback=interruption), report=lines.append)
+    assert (interrupted.exit_code, interrupted.signal) == (143, "SIGTERM")
+    assert f"--resume {interrupted.run.path}" in lines[-1]
+    assert PPO.load(interrupted.run.model).num_timesteps == after // 400 * 400
+    assert whole.run.path != interrupted.run.path
+
+    again = resume(str(interrupted.run.path), report=lambda line: None)
+    assert again.exit_code == 0
+    assert again.model.num_timesteps == whole.model.num_timesteps == 1200
+    ours, theirs = again.model.get_parameters(), whole.model.get_parameters()
+    for name, tensor in theirs["policy"].items():
+        assert torch.equal(tensor, ours["policy"][name]), name
+    assert str(ours["policy.optimizer"]["param_groups"]) == str(theirs["policy.optimizer"]["param_groups"])
+    assert not again.run.resume_state.exists()
+
+
+def test_only_interrupted_runs_resume(tmp_path, capsys):
+    result = train(job(tmp_path, n_timesteps=400), report=lambda line: None)
+    assert main(["train", "--resume", str(result.run.path)]) == 2
+    assert f"-i {result.run.model}" in one_line_of_error(capsys)
+
+
+@pytest.mark.parametrize("name", ["model", "resume_state", "dataset", "config"])
+def test_damaged_run_folders_are_refused(tmp_path, capsys, name):
+    Interrupt.sent = False
+    run = train(job(tmp_path, callback={"test_cli.Interrupt": {"after": 500}}), report=lambda line: None).run
+    path = getattr(run, name)
+    path.write_bytes(path.read_bytes()[:100].replace(b": ", b"; "))
+    assert main(["train", "--resume", str(run.path)]) == 2
+    assert path.name in one_line_of_error(capsys)
+
+
+@pytest.mark.parametrize("algo", ["dagger", "ppo"])
+def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo):
+    path = tmp_path / "diverging.yml"
+    settings = SMALL_DAGGER if algo == "dagger" else SMALL
+    path.write_text(yaml.safe_dump({ENV: {**settings, "callback": "test_cli.Diverge"}}))
+    assert main(["train", "--algo", algo, "--conf-file", str(path), "-f", str(tmp_path), "--eval-episodes", "0"]) == 2
+    saved = tmp_path / algo / f"{ENV}_1" / f"{ENV}.zip"
+    assert str(saved) in one_line_of_error(capsys)
+    model = PPO.load(saved)
+    assert model.num_timesteps == 400
+    assert all(torch.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
+def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
+    quiet = {"report": lambda line: None}
+    first = train(job(tmp_path, n_timesteps=400), **quiet)
+    small = {"n_timesteps": 400, "learning_rate": 0.0}
+    start = TrainingJob(job(tmp_path, "ppo", **small).config, log_folder=str(tmp_path), trained_agent=str(first.run.model))
+    second = train(start, **quiet)
+    ours, theirs = second.model.policy.state_dict(), first.model.policy.state_dict()
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert second.model.num_timesteps == 400
+    fixed = {**small, "policy_kwargs": {"net_arch": [8], "log_std_init": -1.25}}
+    start = TrainingJob(job(tmp_path, "ppo", **fixed).config, log_folder=str(tmp_path), trained_agent=str(first.run.model))
+    third = train(start, **quiet).model.policy
+    assert torch.equal(third.log_std.data, torch.full((4,), -1.25))
+    assert torch.equal(third.action_net.weight, first.model.policy.action_net.weight)
+
+
+@pytest.mark.slow
+def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
+    output = tmp_path / "benchmark.json"
+    assert main(["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training", "--output", str(output)]) == 0
+    content = json.loads(output.read_text())
+    assert {"processor", "cores", "versions", "threads"} <= content["machine"].keys()
+    assert [entry["n_envs"] for entry in content["results"]] == [1, 2, 2, 64]
+    assert all(entry["rate"] > 0 for entry in content["results"])
+    assert f"{content['results'][-1]['rate']:,.0f}" in capsys.readouterr().out

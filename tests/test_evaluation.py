@@ -1,0 +1,150 @@
+"""Flights: what is measured is the true flight of the episodes that were asked for, in either environment."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rich.console import Console
+
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
+from sb3_quad.evaluation.summary import summarise
+from sb3_quad.evaluation.tables import THESIS, comparison
+from sb3_quad.experts.pid import PIDExpert
+
+
+def fall(observation):
+    return -np.ones((len(observation), 4), dtype=np.float32)
+
+
+def hover(observation):
+    return np.zeros((len(observation), 4), dtype=np.float32)
+
+
+def same(a: Flights, b: Flights) -> None:
+    assert (a.success == b.success).all()
+    assert (a.length == b.length).all()
+    for name in ("reward", "path_length", "final_error"):
+        np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-6)
+    for tolerance in TOLERANCES:
+        np.testing.assert_allclose(a.time_to[tolerance], b.time_to[tolerance], atol=1e-9)
+
+
+@pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
+def test_pybullet_gives_the_same_flights(task):
+    flights = [fly(PIDExpert(), task, 3, seed=11, backend=backend, max_steps=400) for backend in ("batch", "pybullet")]
+    same(*flights)
+
+
+@settings(max_examples=5)
+@given(seed=st.integers(0, 2**20), n=st.integers(1, 5))
+def test_rows_do_not_depend_on_their_number(seed, n):
+    alone = fly(PIDExpert(), "state_recovery", 1, seed + n - 1, max_steps=150)
+    among = fly(PIDExpert(), "state_recovery", n, seed, max_steps=150)
+    same(alone, Flights(**{k: v[-1:] if k != "time_to" else {t: x[-1:] for t, x in v.items()} for k, v in vars(among).items()}))
+
+
+def test_figures_are_those_of_the_environment():
+    env = QuadcopterVecEnv(6, task="state_recovery", seed=3, max_episode_steps=300)
+    expert, ended = PIDExpert(), {}
+    env.reset()
+    while len(ended) < 6:
+        _, _, dones, infos = env.step(expert.actions(env.true_state()))
+        for row in np.flatnonzero(dones):
+            ended.setdefault(int(row), infos[row])
+    flights = fly(expert, "state_recovery", 6, seed=3, max_steps=300)
+    for row, info in ended.items():
+        assert flights.success[row] == info["is_success"]
+        assert flights.length[row] == info["episode"]["l"]
+        assert flights.reward[row] == pytest.approx(info["episode"]["r"], abs=1e-4)
+        assert flights.final_error[row] == pytest.approx(info["distance"], abs=1e-9)
+
+
+def test_a_fall_is_as_long_as_it_is_high():
+    flights = fly(fall, "target_tracking", 4, seed=0)
+    assert not flights.success.any()
+    assert flights.path_length == pytest.approx(np.full(4, 15 - 0.135), abs=0.15)  # at most one step's way past contact
+    assert (flights.length == flights.length[0]).all()
+    assert np.isnan(flights.time_to[0.1]).all()
+
+
+def test_hovering_covers_no_distance():
+    flights = fly(hover, "target_tracking", 4, seed=0, max_steps=200)
+    assert flights.success.all()
+    assert (flights.length == 200).all()
+    assert flights.path_length == pytest.approx(np.zeros(4), abs=1e-9)
+    assert flights.final_error == pytest.approx(np.full(4, 10.0))
+    assert np.isnan(flights.time_to[1.0]).all()
+
+
+def test_time_zero_is_the_start():
+    flights = fly(hover, "target_tracking", 2, seed=0, max_steps=5, task_kwargs={"target_distance": 0.3})
+    assert (flights.time_to[0.5] == 0.0).all()
+    assert np.isnan(flights.time_to[0.2]).all()
+
+
+def test_the_conventions_give_the_specified_figures():
+    summary = summarise(fly(PIDExpert(), "target_tracking", 480, seed=0))
+    for tolerance, seconds in {0.1: 7.71, 0.2: 6.89, 0.5: 5.80, 1.0: 4.90}.items():
+        assert summary.time_to[tolerance][0] == pytest.approx(seconds, rel=0.02)
+        assert summary.time_to[tolerance][1] == 1.0
+    assert summary.mean_path == pytest.approx(10.42, rel=0.02)
+    assert summary.mean_reward == pytest.approx(-8.10, rel=0.02)
+    assert summary.success_rate == 1.0
+
+
+def test_times_fall_with_the_tolerance():
+    flights = fly(PIDExpert(), "target_tracking", 20, seed=5, max_steps=900)
+    times = [np.nan_to_num(flights.time_to[tolerance], nan=np.inf) for tolerance in TOLERANCES]
+    assert all((tight >= loose).all() for tight, loose in zip(times, times[1:], strict=False))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"backend": "bulet"}, "did you mean"),
+        ({"n_episodes": 0}, "at least 1"),
+        ({"controller": 3}, "actions"),
+        ({"controller": PIDExpert}, "is a class"),
+        ({"task": "state_recovry"}, "did you mean"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        fly(**{"controller": hover, "n_episodes": 1, "max_steps": 2, **arguments})
+
+
+def text_of(table) -> str:
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table)
+    return console.file.getvalue()
+
+
+def test_tables_say_how_many_arrived():
+    n = 4
+    flights = Flights(
+        success=np.array([True, True, False, True]),
+        reward=np.full(n, -8.0),
+        length=np.full(n, 1500),
+        time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},
+        path_length=np.full(n, 10.0),
+        final_error=np.array([0.1, 0.2, 9.0, 0.3]),
+    )
+    summary = summarise(flights)
+    assert summary.success_rate == 0.75
+    assert summary.time_to[1.0] == (5.0, 0.75)
+    assert summary.max_final_error == 0.3
+    text = text_of(comparison("title", {"agent": summary}, {"expert": THESIS["target_tracking"]["expert"]}))
+    for part in ("75 %", "5.00 s (75 % of flights)", "never", "0.300 m", "thesis: expert", "7.75 s"):
+        assert part in text
+
+
+def test_tables_stand_without_a_single_success():
+    text = text_of(comparison("title", {"agent": summarise(fly(fall, "state_recovery", 2, seed=0))}))
+    assert "0 %" in text
+    assert "nan" not in text

@@ -1,0 +1,212 @@
+"""The compiled control step against PyBullet, and its independence of batch size and position."""
+
+from __future__ import annotations
+
+import numpy as np
+import pybullet
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from sb3_quad.dynamics.kernel import control_step
+from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+
+URDF = """<robot name="body"><link name="base"><inertial><mass value="{m!r}"/>
+<inertia ixx="{i[0]!r}" iyy="{i[1]!r}" izz="{i[2]!r}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+ITM = load_vehicle("itm")
+
+
+class BulletReference:
+    """One body in PyBullet, pushed by rotors that this test works out by itself."""
+
+    def __init__(self, vehicle, folder, state):
+        path = folder / "body.urdf"
+        path.write_text(URDF.format(m=vehicle.mass, i=vehicle.inertia))
+        self.vehicle, self.client = vehicle, {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
+        pybullet.setGravity(0, 0, -vehicle.gravity, **self.client)
+        pybullet.setTimeStep(vehicle.physics_step, **self.client)
+        self.body = pybullet.loadURDF(str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, **self.client)
+        pybullet.changeDynamics(self.body, -1, linearDamping=0, angularDamping=0, **self.client)
+        w, x, y, z = state[QUATERNION]
+        pybullet.resetBasePositionAndOrientation(self.body, state[POSITION], (x, y, z, w), **self.client)
+        rates = self.rotation((x, y, z, w)) @ state[BODY_RATES]
+        pybullet.resetBaseVelocity(self.body, state[VELOCITY], rates, **self.client)
+        self.speeds = state[ROTOR_SPEEDS].copy()
+        self.waiting = [np.full(4, vehicle.hover_rotor_speed)] * vehicle.delay
+
+    @staticmethod
+    def rotation(quaternion):
+        return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+
+    def fly(self, action, wrench):
+        vehicle, body, client = self.vehicle, self.body, self.client
+        thrust = vehicle.action_to_thrust(action.astype(np.float64))
+        self.waiting.append(np.sqrt(thrust / vehicle.thrust_coefficient))
+        wanted = self.waiting.pop(0)
+        for _ in range(vehicle.substeps):
+            self.speeds = self.speeds + vehicle.motor_gain * (wanted - self.speeds) * vehicle.physics_step
+            lift, *moments = vehicle.mixer @ (vehicle.thrust_coefficient * self.speeds**2)
+            centre, _ = pybullet.getBasePositionAndOrientation(body, **client)
+            pybullet.applyExternalForce(body, -1, wrench[:3], centre, pybullet.WORLD_FRAME, **client)
+            pybullet.applyExternalForce(body, -1, wrench[3:6] + [0, 0, lift], (0, 0, 0), pybullet.LINK_FRAME, **client)
+            pybullet.applyExternalTorque(body, -1, wrench[6:9], pybullet.WORLD_FRAME, **client)
+            pybullet.applyExternalTorque(body, -1, wrench[9:] + moments, pybullet.LINK_FRAME, **client)
+            pybullet.stepSimulation(**client)
+        position, quaternion = pybullet.getBasePositionAndOrientation(body, **client)
+        velocity, rates = pybullet.getBaseVelocity(body, **client)
+        x, y, z, w = quaternion
+        return np.concatenate([position, (w, x, y, z), velocity, self.rotation(quaternion).T @ rates, self.speeds])
+
+    def close(self):
+        pybullet.disconnect(**self.client)
+
+
+def random_state(rng, vehicle, velocity=5.0, rates=8.0):
+    state = np.zeros(STATE_SIZE)
+    state[POSITION] = rng.normal(size=3) * 10
+    state[QUATERNION] = rng.normal(size=4)
+    state[QUATERNION] /= np.linalg.norm(state[QUATERNION])
+    state[VELOCITY], state[BODY_RATES] = rng.normal(size=3) * velocity, rng.normal(size=3) * rates
+    state[ROTOR_SPEEDS] = vehicle.hover_rotor_speed * rng.uniform(0.8, 1.2, size=4)
+    return state
+
+
+def random_actions(rng, steps):
+    """Full deflection for a fifth of a second at a time, disturbed, at times beyond the limits."""
+    held = np.repeat(rng.choice([-1.0, 1.0], size=(steps // 20 + 1, 4)), 20, axis=0)[:steps]
+    return (held + 0.5 * rng.normal(size=(steps, 4))).astype(np.float32)
+
+
+def fly(vehicle, states, actions, wrenches):
+    """The states after each control step, (steps, STATE_SIZE, n), of n vehicles of one kind."""
+    state, n = states.copy(), states.shape[1]
+    queue = np.full((vehicle.delay, 4, n), vehicle.hover_rotor_speed)
+    parameters = np.repeat(vehicle.parameters()[:, None], n, axis=1)
+    history = []
+    for action in actions:
+        control_step(state, queue, action, wrenches, parameters, vehicle.physics_step, vehicle.substeps)
+        history.append(state.copy())
+    return np.array(history)
+
+
+def worst_difference(vehicle, folder, state, actions, wrench):
+    """Greatest distance to PyBullet in each number, over all control steps."""
+    reference = BulletReference(vehicle, folder, state)
+    try:
+        flown = fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, :17, 0]
+        expected = np.array([reference.fly(action, wrench) for action in actions])
+    finally:
+        reference.close()
+    sign = np.sign(np.einsum("ti,ti->t", flown[:, QUATERNION], expected[:, QUATERNION]))
+    expected[:, QUATERNION] *= sign[:, None]
+    return np.abs(flown - expected).max(axis=0)
+
+
+@st.composite
+def vehicles(draw):
+    size = draw(st.floats(0.3, 3.0))
+    spread = draw(st.tuples(st.floats(0.8, 1.2), st.floats(0.8, 1.2), st.floats(0.8, 1.2)))
+    arm = 0.17 * size
+    return Vehicle(
+        name="random",
+        mass=1.7 * size**3,
+        inertia=tuple(0.009 * size**5 * factor for factor in spread),
+        rotor_positions=((arm, arm), (arm, -arm), (-arm, -arm), (-arm, arm)),
+        rotor_directions=(1, -1, 1, -1),
+        moment_thrust_ratio=draw(st.floats(0.005, 0.05)),
+        thrust_coefficient=draw(st.floats(1e-7, 1e-4)),
+        motor_gain=draw(st.floats(5.0, 60.0)),
+        gravity=draw(st.floats(1.6, 12.0)),
+        thrust_limits=(draw(st.floats(0.0, 0.8)), draw(st.floats(1.2, 1.5))),
+        delay=draw(st.integers(0, 3)),
+        collision_radius=0.1,
+    )
+
+
+@settings(max_examples=12, suppress_health_check=[HealthCheck.too_slow])
+@given(vehicle=vehicles(), seed=st.integers(0, 2**32 - 1), pushed=st.booleans())
+def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
+    rng = np.random.default_rng(seed)
+    state, actions = random_state(rng, vehicle), random_actions(rng, 400)
+    size = vehicle.mass * vehicle.gravity
+    scale = np.repeat([0.2 * size, 0.2 * size, 1e-3 * size, 1e-3 * size], 3)
+    wrench = pushed * scale * rng.normal(size=12)
+    folder = tmp_path_factory.mktemp("bullet")
+    if np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, BODY_RATES]).max() > 60.0:
+        return  # where PyBullet cuts velocities at 100 rad/s rounding grows fast; another test is about that
+    assert worst_difference(vehicle, folder, state, actions, wrench).max() < 1e-9
+
+
+@pytest.mark.parametrize("physics_step", [0.001, 0.005, 0.01])
+def test_other_physics_steps(physics_step, tmp_path):
+    vehicle = ITM.model_copy(update={"physics_step": physics_step, "control_step": 0.01})
+    rng = np.random.default_rng(3)
+    state, actions = random_state(rng, vehicle), random_actions(rng, 200)
+    assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
+
+
+def test_velocities_are_cut_as_pybullet_cuts_them(tmp_path):
+    rng = np.random.default_rng(0)
+    state = random_state(rng, ITM, velocity=90.0, rates=55.0)
+    wrench = np.array([90.0, -30.0, 80.0, 0, 0, 0, 0.3, 0.2, -0.4, 0, 0, 0])
+    actions = np.zeros((60, 4), dtype=np.float32)
+    flown = fly(ITM, state[:, None], actions[:, None], wrench[:, None])
+    assert np.abs(flown[:, VELOCITY]).max() == 100.0
+    assert np.linalg.norm(flown[:, BODY_RATES], axis=1).max() > 100.0
+    assert worst_difference(ITM, tmp_path, state, actions, wrench).max() < 1e-9
+
+
+def test_large_steps_cut_the_angle_as_pybullet_does(tmp_path):
+    vehicle = ITM.model_copy(update={"physics_step": 0.01})
+    state = random_state(np.random.default_rng(1), vehicle, rates=0.0)
+    state[BODY_RATES] = 70.0, -50.0, 60.0  # more than pi / 4 in one physics step
+    actions = np.zeros((20, 4), dtype=np.float32)
+    assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
+
+
+def test_rows_do_not_depend_on_the_batch():
+    rng = np.random.default_rng(5)
+    n, steps = 150, 30
+    states = np.stack([random_state(rng, ITM) for _ in range(n)], axis=1)
+    states[BODY_RATES, 70] *= 15.0  # one row beyond PyBullet's cut must not touch its neighbours
+    wrenches = rng.normal(size=(12, n)) * (rng.random(n) < 0.3)
+    actions = np.stack([random_actions(rng, steps) for _ in range(n)], axis=1)
+    together = fly(ITM, states, actions, wrenches)
+    for row in (0, 1, 63, 64, 70, 71, 127, 128, 149):
+        alone = fly(ITM, states[:, [row]], actions[:, [row]], wrenches[:, [row]])
+        np.testing.assert_array_equal(alone[:, :, 0], together[:, :, row])
+
+
+def test_vehicles_may_differ_by_row():
+    heavy = ITM.model_copy(update={"mass": 3.0, "motor_gain": 40.0})
+    rng = np.random.default_rng(6)
+    states = np.stack([random_state(rng, ITM), random_state(rng, heavy)], axis=1)
+    actions = np.stack([random_actions(rng, 50) for _ in range(2)], axis=1)
+    state = states.copy()
+    queue = np.array([[[vehicle.hover_rotor_speed] * 4 for vehicle in (ITM, heavy)]]).transpose(0, 2, 1).copy()
+    parameters = np.stack([ITM.parameters(), heavy.parameters()], axis=1)
+    for action in actions:
+        control_step(state, queue, action, np.zeros((12, 2)), parameters, 0.0025, 4)
+    for row, vehicle in enumerate((ITM, heavy)):
+        alone = fly(vehicle, states[:, [row]], actions[:, [row]], np.zeros((12, 1)))[-1, :, 0]
+        np.testing.assert_array_equal(alone, state[:, row])
+
+
+@pytest.mark.parametrize("delay", [0, 1, 3])
+def test_a_command_acts_after_the_delay(delay):
+    vehicle = ITM.model_copy(update={"delay": delay})
+    state = random_state(np.random.default_rng(0), vehicle)[:, None]
+    state[ROTOR_SPEEDS] = vehicle.hover_rotor_speed
+    actions = np.zeros((6, 1, 4), dtype=np.float32)
+    actions[1:] = 1.0
+    speeds = fly(vehicle, state, actions, np.zeros((12, 1)))[:, ROTOR_SPEEDS, 0]
+    moved = np.abs(speeds - vehicle.hover_rotor_speed).max(axis=1) > 1e-6
+    assert moved.tolist() == [step >= 1 + delay for step in range(6)]
+
+
+def test_hover_stays_where_it_is():
+    state = np.zeros((STATE_SIZE, 1))
+    state[3], state[2], state[ROTOR_SPEEDS] = 1.0, 15.0, ITM.hover_rotor_speed
+    flown = fly(ITM, state, np.zeros((1500, 1, 4), dtype=np.float32), np.zeros((12, 1)))
+    assert np.abs(flown[-1] - state).max() < 1e-9

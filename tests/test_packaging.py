@@ -1,0 +1,179 @@
+"""The package as others get it: built, installed in an environment of its own, used from anywhere."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
+DATA = {".yaml", ".yml", ".typed"}
+HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
+
+
+def run(*command, cwd):
+    """Standard output of a command that must succeed; nothing of this process's own import path reaches it."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    result = subprocess.run(
+        [str(part) for part in command],
+        cwd=cwd,
+        env=environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
+    return result.stdout
+
+
+def module_name(path):
+    """The name under which a folder of the checkout is imported."""
+    parts = path.relative_to(ROOT).parts
+    return ".".join(parts if parts[0] == "sb3_quad" else ("sb3_quad", *parts))
+
+
+def package_folders():
+    """Every folder of code in the checkout, by the name it is imported under."""
+    return {module_name(init.parent): init.parent for name in CODE for init in (ROOT / name).rglob("__init__.py")}
+
+
+@pytest.fixture(scope="module")
+def options():
+    parser = configparser.ConfigParser()
+    parser.read(ROOT / "setup.cfg")
+    return parser
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel made from a source distribution, made from a copy, so that nothing built earlier can slip in."""
+    folder = tmp_path_factory.mktemp("build")
+    source = folder / "source"
+    source.mkdir()
+    for path in ROOT.iterdir():
+        if path.is_file():
+            shutil.copy(path, source)
+    for name in (*CODE, "tests"):
+        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
+    run(sys.executable, "-c", f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})", cwd=source)
+    (archive,) = folder.glob("*.tar.gz")
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-deps", "--no-build-isolation")
+    run(*pip, "--wheel-dir", folder, archive, cwd=folder)
+    (built,) = folder.glob("*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """The folder of commands of a new environment that holds the wheel, and uses what it depends on from ours."""
+    folder = tmp_path_factory.mktemp("environment")
+    venv.create(folder, with_pip=False, symlinks=os.name != "nt")
+    paths = {name: Path(path) for name, path in sysconfig.get_paths("venv", {"base": folder}).items()}
+    # A line in a .pth file lends the packages there, but not the link to this checkout, which is a .pth file itself.
+    lent = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
+    (paths["purelib"] / "lent.pth").write_text("\n".join(lent))
+    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", paths["scripts"] / "python")
+    run(*pip, "install", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
+    return paths["scripts"]
+
+
+def test_every_package_is_listed(options):
+    assert set(options["options"]["packages"].split()) == set(package_folders())
+
+
+def test_every_code_folder_is_a_package():
+    """Without an ``__init__.py``, a folder works in a checkout and is missing from the wheel."""
+    folders = {path.parent for name in CODE for path in (ROOT / name).rglob("*.py")}
+    assert folders == set(package_folders().values())
+
+
+def test_package_dir_leads_to_the_package(options):
+    mapping = dict(line.split(" = ") for line in options["options"]["package_dir"].strip().splitlines())
+    for name, folder in package_folders().items():
+        prefix = max((key for key in mapping if f"{name}.".startswith(f"{key}.")), key=len)
+        assert (ROOT / mapping[prefix]).joinpath(*name.removeprefix(prefix).split(".")) == folder
+
+
+def test_pyproject_holds_only_the_build_system():
+    lines = (ROOT / "pyproject.toml").read_text().splitlines()
+    assert [line for line in lines if line.startswith("[")] == ["[build-system]"]
+
+
+def test_each_dependency_is_pinned(options):
+    pins = [line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    wanted = options["options"]["install_requires"] + options["options.extras_require"]["dev"]
+    names = {line.split(">=")[0].strip().lower() for line in wanted.splitlines() if line.strip()}
+    assert names <= set(pins)
+    assert len(pins) == len(set(pins))
+
+
+@pytest.mark.parametrize("module", ["sb3_quad", "sb3_quad.envs", "sb3_quad.cli", "sb3_quad.zoo_configs"])
+def test_importing_waits_for_nothing_heavy(module):
+    code = f"import sys, {module}; print(*sorted(set({HEAVY!r}) & set(sys.modules)))"
+    assert run(sys.executable, "-c", code, cwd=ROOT).split() == []
+
+
+def test_help_waits_for_nothing_heavy():
+    code = (
+        "import sys; from sb3_quad.cli import main; code = main(['train', '--help']);"
+        f"print(code, *sorted(set({HEAVY!r}) & set(sys.modules)))"
+    )
+    assert run(sys.executable, "-c", code, cwd=ROOT).splitlines()[-1] == "0"
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_all_code_and_data(wheel):
+    kept = {".py", *DATA}
+    expected = {
+        f"{name.replace('.', '/')}/{path.name}"
+        for name, folder in package_folders().items()
+        for path in folder.iterdir()
+        if path.suffix in kept or path.name == "py.typed"
+    }
+    held = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert held == expected
+
+
+@pytest.mark.slow
+def test_no_data_file_is_outside_a_package():
+    """Package data is listed by package: a YAML file in a folder that is none would be missing from the wheel."""
+    folders = set(package_folders().values())
+    for path in (path for name in CODE for path in (ROOT / name).rglob("*")):
+        assert path.suffix not in DATA or path.parent in folders, path
+
+
+@pytest.mark.slow
+def test_the_wheel_works_from_another_folder(installed, tmp_path):
+    code = """
+import importlib, importlib.resources, json, pkgutil, sys, sb3_quad
+names = [found.name for found in pkgutil.walk_packages(sb3_quad.__path__, "sb3_quad.") if "__main__" not in found.name]
+for name in names: importlib.import_module(name)
+configs = importlib.resources.files("sb3_quad.zoo_configs")
+print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs.joinpath("dagger.yml").read_text()]))
+"""
+    names, files, config = json.loads(run(installed / "python", "-c", code, cwd=tmp_path).splitlines()[-1])
+    assert {"sb3_quad.envs.quadcopter_env", "sb3_quad.callbacks", "sb3_quad.zoo_configs.thesis"} <= set(names)
+    assert not [file for file in files if not Path(file).is_relative_to(installed.parent)]
+    assert config == (ROOT / "zoo_configs" / "dagger.yml").read_text()
+    assert "train" in run(installed / "sb3-quad", "--help", cwd=tmp_path)
+    assert "--algo" in run(installed / "python", "-m", "sb3_quad.cli", "train", "--help", cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_installed_package_works_from_the_checkout(installed):
+    """There the checkout's sb3_quad/ comes first, whose envs/ and the like lie beside it."""
+    assert "train" in run(installed / "python", "-m", "sb3_quad.cli", "--help", cwd=ROOT)
+    code = "import sb3_quad.envs.registration as r, sb3_quad.callbacks, sb3_quad.zoo_configs.thesis; print(r.__file__)"
+    assert run(installed / "python", "-c", code, cwd=ROOT).strip() == str(ROOT / "envs" / "registration.py")
+    assert "train" in run(installed / "sb3-quad", "--help", cwd=ROOT)

@@ -1,0 +1,106 @@
+"""Pipelines: stages hand their agents on, interruptions go on where they were, and trimming cancels an offset."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import yaml
+from stable_baselines3 import PPO
+
+from sb3_quad.cli import main
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError, TrainingError
+from sb3_quad.training.pipeline import load_pipeline, make_jobs, run_pipeline, with_settings
+from sb3_quad.training.trim import hover_offset, shift_position, trim
+
+TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
+STAGES = [
+    {"name": "one", "algo": "dagger", "env": "QuadTargetTracking-v0", "pass_on": "last"},
+    {"name": "two", "algo": "ppo_bc", "env": "QuadStateRecovery-v0", "pass_on": "last", "settings": {"n_epochs": 1}},
+]
+
+
+def write(tmp_path, stages, **extra):
+    path = tmp_path / "stages.yml"
+    path.write_text(yaml.safe_dump({"stages": stages, **extra}), encoding="utf-8")
+    return path
+
+
+@pytest.fixture
+def job(tmp_path):
+    return {"log_folder": str(tmp_path / "logs"), "eval_episodes": 4, "eval_freq": 0}
+
+
+def policy(path):
+    return PPO.load(path).policy.state_dict()
+
+
+def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
+    stages = [STAGES[0], {**STAGES[1], "settings": {"learning_rate": 0.0, "n_epochs": 1}}]
+    pipeline = with_settings(load_pipeline(write(tmp_path, stages)), {**TINY, "policy_kwargs": {"net_arch": [8, 8]}})
+    result = run_pipeline(pipeline, make_jobs(pipeline, job), "stages", lambda line: None)
+    one, two = (policy(entry.agent) for entry in result.stages)
+    assert result.exit_code == 0 and all(np.array_equal(one[key], two[key]) for key in one if key != "log_std")
+    status = yaml.safe_load((result.folder / "pipeline.yml").read_text(encoding="utf-8"))
+    assert [entry["run"] for entry in status["done"]] == [str(entry.run.path) for entry in result.stages]
+
+
+def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
+    pipeline = with_settings(load_pipeline(write(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]])), TINY)
+    with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward 1.*logs/dagger"):
+        run_pipeline(pipeline, make_jobs(pipeline, job), "stages", lambda line: None)
+    assert not (tmp_path / "logs" / "ppo_bc").exists()
+
+
+@pytest.mark.parametrize(
+    ("stages", "message"),
+    [
+        ([{**STAGES[0], "algoo": "dagger"}], "did you mean 'algo'"),
+        ([{**STAGES[0], "algo": "daggr"}], "did you mean 'dagger'"),
+        ([{**STAGES[0], "settings": {"n_stepz": 3}}], "did you mean 'n_steps'"),
+        ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
+        ([], "at least 1"),
+    ],
+)
+def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, message, capsys):
+    code = main(["train", "--conf-file", str(write(tmp_path, stages)), "-f", str(tmp_path / "logs")])
+    error = capsys.readouterr().err
+    assert code == 2 and message in error and error.count("\n") == 1
+    assert not (tmp_path / "logs").exists()
+
+
+def test_flags_of_a_single_run_are_refused(tmp_path, capsys):
+    assert main(["train", "-n", "100"]) == 2 and "-n goes with a single run" in capsys.readouterr().err
+    assert main(["train", "--algo", "dagger", "--reference"]) == 2 and "--reference" in capsys.readouterr().err
+
+
+def test_shifting_the_position_is_seen_by_the_actor_as_a_move():
+    env = QuadcopterVecEnv(16, task="state_recovery", noise=0.0, seed=1)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    offset = np.array([0.3, -0.2, 0.5])
+    observations = env.reset()
+    before = model.predict(observations, deterministic=True)[0]
+    shift_position(model, offset, np.full(3, 10 / np.sqrt(3)))
+    moved = observations.copy()
+    moved[:, :3] -= (offset / (10 / np.sqrt(3))).astype(np.float32)
+    np.testing.assert_allclose(model.predict(moved, deterministic=True)[0], before, atol=1e-5)
+
+
+def test_an_agent_that_crashes_cannot_be_trimmed():
+    env = QuadcopterVecEnv(4, seed=1)
+    with pytest.raises(ConfigError, match="cannot be trimmed"):
+        hover_offset(PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"), n_flights=8)
+
+
+@pytest.mark.slow
+def test_trimming_cancels_the_offset_of_a_trained_agent():
+    from sb3_quad.dagger import DAgger
+    from sb3_quad.experts.pid import PIDExpert
+
+    env = QuadcopterVecEnv(120, seed=0)
+    model = DAgger("MlpPolicy", env, expert=PIDExpert(), n_steps=250, batch_size=2048, gradient_steps=60, n_epochs=1, seed=0)
+    model.learn(300_000)
+    shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
+    assert np.linalg.norm(hover_offset(model, 40)) > 0.4
+    sizes = trim(model)
+    assert sizes[-1] < 0.05

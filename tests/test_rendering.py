@@ -1,0 +1,158 @@
+"""Pictures: without a display, of the asked size, showing what is there, and without touching the flight."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from typing import Any
+
+import gymnasium
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs import meshes
+from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.urdf import frame_urdfs, rotor_urdf, vehicle_urdf
+from sb3_quad.errors import ConfigError
+
+HOVER = np.zeros(4, dtype=np.float32)
+Picture = npt.NDArray[np.uint8]
+
+
+@pytest.fixture
+def env() -> Any:
+    made = QuadcopterEnv(render_mode="rgb_array", noise=0.0, render_width=160, render_height=120)
+    yield made
+    made.close()
+
+
+def _greenest(picture: Picture) -> npt.NDArray[np.bool_]:
+    """Where the target marker's green is."""
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    return np.asarray((green > 70) & (green - red > 50) & (green - blue > 35))
+
+
+def _orange(picture: Picture) -> npt.NDArray[np.bool_]:
+    """Where the vehicle's front is."""
+    red, green, blue = picture.astype(int).transpose(2, 0, 1)
+    return np.asarray((red - green > 60) & (red - blue > 80))
+
+
+@pytest.mark.parametrize("size", [(64, 48), (161, 97)])
+def test_picture_of_the_asked_size(size: tuple[int, int]) -> None:
+    env = gymnasium.make("QuadTargetTracking-v0", render_mode="rgb_array", render_width=size[0], render_height=size[1])
+    env.reset(seed=0)
+    env.step(HOVER)
+    picture: Any = env.render()
+    assert picture.shape == (size[1], size[0], 3) and picture.dtype == np.uint8
+    assert env.metadata["render_modes"] == ["human", "rgb_array"] and env.metadata["render_fps"] == 100
+    env.close()
+
+
+@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (-0.6, 0.6, 0.5), (0, 0, 1), (0, 0, -1), (0.1, 0, 0.995)])
+def test_vehicle_and_target_are_in_the_picture(env: QuadcopterEnv, direction: tuple[float, float, float]) -> None:
+    env.reset(seed=0, options={"target": np.array([0, 0, 15.0]) + 8.0 * np.array(direction)})
+    picture = env.render()
+    assert picture is not None
+    assert _orange(picture).sum() > 20
+    assert _greenest(picture).sum() > 1
+
+
+def test_sky_above_ground_below(env: QuadcopterEnv) -> None:
+    env.reset(seed=0, options={"target": (8, 0, 15)})
+    picture = env.render()
+    assert picture is not None
+    (sky, ground) = picture[0].mean(axis=0), picture[-1].mean(axis=0)
+    assert sky[2] > sky[0] + 15 and ground[1] > ground[2] + 10
+    assert picture[-1].std() > 3  # squares
+
+
+def test_wrench_is_shown(env: QuadcopterEnv) -> None:
+    env.reset(seed=0)
+    env.set_wrench(force=(0, 3, 3))
+    with_force = env.render()
+    env.set_wrench()
+    without = env.render()
+    assert with_force is not None and without is not None
+
+    def red(picture: Picture) -> int:
+        r, g, b = picture.astype(int).transpose(2, 0, 1)
+        return int(((r > 100) & (g < 60) & (b < 70)).sum())
+
+    assert red(with_force) > red(without) + 10
+
+
+def test_rotors_turn(env: QuadcopterEnv) -> None:
+    env.reset(seed=0)
+    assert not np.array_equal(env.render(), env.render())  # type: ignore[arg-type]
+
+
+def test_pictures_do_not_touch_the_flight(env: QuadcopterEnv) -> None:
+    plain = QuadcopterEnv(noise=0.0)
+    actions = np.random.default_rng(0).uniform(-1, 1, (30, 4)).astype(np.float32)
+    for each in (env, plain):
+        each.reset(seed=4)
+        each.set_wrench(force=(1, 0, 0), torque=(0, 0.01, 0))
+    for action in actions:
+        assert all(np.array_equal(a, b) for a, b in zip(env.step(action), plain.step(action), strict=True))
+        env.render()
+    np.testing.assert_array_equal(env.true_state().array, plain.true_state().array)
+    plain.close()
+
+
+def test_human_mode_without_a_display_flies_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    env = QuadcopterEnv(render_mode="human")
+    assert "DISPLAY" in capsys.readouterr().err
+    env.reset(seed=0)
+    assert np.isfinite(env.step(HOVER)[0]).all() and env.render() is None
+    env.close()
+
+
+def test_render_without_a_mode_warns() -> None:
+    env = QuadcopterEnv()
+    env.reset(seed=0)
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert env.render() is None
+    env.close()
+
+
+@pytest.mark.parametrize("size", [0, -3, 5000, 64.0, "64", True])
+def test_bad_size_is_refused(size: Any) -> None:
+    with pytest.raises(ConfigError, match="render_width .*pixels"):
+        QuadcopterEnv(render_mode="rgb_array", render_width=size)
+
+
+def test_urdf_is_one_rigid_body_with_the_vehicle_numbers() -> None:
+    vehicle = load_vehicle("itm")
+    root = ElementTree.fromstring(vehicle_urdf(vehicle))
+    assert len(root.findall("link")) == 1 and not root.findall("joint")
+    assert float(root.find("link/inertial/mass").get("value")) == vehicle.mass  # type: ignore[union-attr, arg-type]
+    inertia = root.find("link/inertial/inertia")
+    assert inertia is not None
+    assert tuple(float(inertia.get(key, "nan")) for key in ("ixx", "iyy", "izz")) == vehicle.inertia
+    assert len(root.findall("link/visual")) >= 10
+    for urdf in (*frame_urdfs(vehicle), *(rotor_urdf(vehicle, rotor) for rotor in range(4))):
+        assert float(ElementTree.fromstring(urdf).find("link/inertial/mass").get("value")) == 0.0  # type: ignore[union-attr, arg-type]
+
+
+def test_urdf_survives_any_name() -> None:
+    vehicle = load_vehicle("itm").model_copy(update={"name": '<"&> ü'})
+    ElementTree.fromstring(vehicle_urdf(vehicle))
+    QuadcopterEnv(vehicle=vehicle).close()
+
+
+@pytest.mark.parametrize("mesh", [meshes.arrow(0.5, 0.01), meshes.ring(0.4, 0.02)], ids=["arrow", "ring"])
+def test_meshes_are_closed_and_face_outwards(mesh: Any) -> None:
+    """The volume by the divergence theorem is that of the solid, so that no triangle is missing or turned inside out."""
+    points, triangles = np.array(mesh["vertices"]), np.array(mesh["indices"]).reshape(-1, 3)
+    a, b, c = points[triangles].transpose(1, 0, 2)
+    volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
+    neck, head = 0.72 * 0.5, 0.28 * 0.5
+    arrow = np.pi * 0.01**2 * neck + np.pi * 0.024**2 * head / 3
+    ring = 2 * np.pi**2 * 0.4 * 0.02**2
+    expected = arrow if np.ptp(points[:, 2]) > 0.3 else ring
+    assert 0.85 * expected < volume < 1.01 * expected
+    np.testing.assert_allclose(np.linalg.norm(mesh["normals"], axis=1), 1.0, atol=1e-9)

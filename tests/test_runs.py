@@ -1,0 +1,89 @@
+"""Run folders: no two runs share one, files are whole or absent, and a run can be read again."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.files import write_bytes, write_text
+from sb3_quad.training.runs import claim_run, open_run
+
+ENV = "QuadTargetTracking-v0"
+
+
+def test_runs_are_numbered_and_never_reused(tmp_path):
+    first, second = (claim_run(tmp_path, "dagger", ENV) for _ in range(2))
+    assert [run.path.name for run in (first, second)] == [f"{ENV}_1", f"{ENV}_2"]
+    (tmp_path / "dagger" / f"{ENV}_7").mkdir()
+    (tmp_path / "dagger" / f"{ENV}_notes").mkdir()
+    assert claim_run(tmp_path, "dagger", ENV).path.name == f"{ENV}_8"
+    assert claim_run(tmp_path, "ppo", ENV).path.name == f"{ENV}_1"
+
+
+def test_a_uuid_keeps_the_number(tmp_path):
+    name = claim_run(tmp_path, "dagger", ENV, unique=True).path.name
+    assert name.startswith(f"{ENV}_1_")
+    assert len(name) == len(f"{ENV}_1_") + 36
+    assert claim_run(tmp_path, "dagger", ENV).path.name == f"{ENV}_2"
+
+
+def test_processes_and_threads_never_share_a_folder(tmp_path):
+    code = (
+        "import sys\nfrom sb3_quad.training.runs import claim_run\n"
+        f"for _ in range(40): print(claim_run(sys.argv[1], 'dagger', '{ENV}').path.name)"
+    )
+    processes = [
+        subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    with ThreadPoolExecutor(4) as pool:
+        claimed = [run.path.name for run in pool.map(lambda _: claim_run(tmp_path, "dagger", ENV), range(40))]
+    for process in processes:
+        claimed += process.communicate(timeout=60)[0].split()
+        assert process.returncode == 0
+    assert len(claimed) == len(set(claimed)) == 120
+
+
+def test_environment_ids_with_slashes_stay_in_their_folder(tmp_path):
+    run = claim_run(tmp_path, "ppo", "package:ALE/Pong-v5")
+    assert run.path.parent == tmp_path / "ppo"
+    assert run.model.parent == run.path
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="cannot be written.*-f"):
+        claim_run(tmp_path / "file", "dagger", ENV)
+
+
+def test_settings_and_arguments_come_back(tmp_path):
+    run = claim_run(tmp_path, "dagger", ENV)
+    run.write_yaml({"n_envs": 3}, {"seed": 7, "trained_agent": None})
+    assert open_run(run.path) == run
+    assert run.read_yaml() == ({"n_envs": 3}, {"seed": 7, "trained_agent": None})
+    run.arguments.write_text("- no mapping")
+    with pytest.raises(ConfigError, match=r"args\.yml"):
+        run.read_yaml()
+
+
+def test_folders_without_a_run_are_refused(tmp_path):
+    for folder in (tmp_path, tmp_path / "missing"):
+        with pytest.raises(ConfigError, match="run folder"):
+            open_run(folder)
+
+
+def test_files_are_replaced_whole(tmp_path, monkeypatch):
+    path = tmp_path / "file.txt"
+    write_text(path, "old")
+
+    def full(*args):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(ConfigError, match="No space left"):
+        write_bytes(path, b"new")
+    assert path.read_text() == "old"
+    assert [entry.name for entry in tmp_path.iterdir()] == ["file.txt"]

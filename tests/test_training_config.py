@@ -1,0 +1,204 @@
+"""Settings: what rl-zoo's YAML may hold arrives as the algorithm's arguments; everything else is one clear error."""
+
+from __future__ import annotations
+
+import pytest
+import torch.nn as nn
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.algorithms import ALGORITHMS
+from sb3_quad.training.config import build_config, check_environment, config_names, load_config, read_settings
+from sb3_quad.training.literals import parse_mapping, parse_number, parse_value
+from sb3_quad.training.values import qualified_classes
+
+ENV = "QuadTargetTracking-v0"
+MINIMAL = {"n_timesteps": 1000}
+
+
+def build(algo="dagger", env_id=ENV, **settings):
+    return build_config(algo, env_id, {**MINIMAL, **settings})
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False, min_value=1e-12, max_value=1e12))
+def test_numbers_may_be_strings(number):
+    text = f"{number:e}"
+    assert parse_number(text) == float(text)
+    assert parse_value(text) == float(text)
+    assert parse_number(number) == number
+
+
+@given(st.floats(min_value=1e-9, max_value=1.0))
+def test_linear_schedules_are_sb3s_own(start):
+    schedule = build(learning_rate=f"lin_{start:e}").hyperparams["learning_rate"]
+    assert type(schedule).__module__ == "stable_baselines3.common.utils"
+    assert schedule(1.0) == float(f"{start:e}")
+    assert schedule(0.5) == pytest.approx(start / 2, rel=1e-5)
+    assert schedule(0.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    "given_kwargs",
+    [
+        "dict(net_arch=[64, 64], activation_fn=nn.Tanh)",
+        {"net_arch": [64, 64], "activation_fn": "nn.Tanh"},
+        {"net_arch": [64, 64], "activation_fn": "torch.nn.Tanh"},
+        "{'net_arch': [64, 64], 'activation_fn': th.nn.Tanh}",
+    ],
+)
+def test_policy_kwargs_in_every_spelling(given_kwargs):
+    assert build(policy_kwargs=given_kwargs).policy_kwargs == {"net_arch": [64, 64], "activation_fn": nn.Tanh}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('true')",
+        "dict(a=open('/etc/passwd'))",
+        "[x for x in (1,)]",
+        "dict(**{'a': 1})",
+        "dict(a=os.environ)",
+        "(lambda: 1)()",
+        "dict(",
+        "nn.Tanh",
+        "3",
+        "(" * 5000,
+    ],
+)
+def test_nothing_is_evaluated(text):
+    with pytest.raises(ConfigError, match="policy_kwargs"):
+        parse_mapping(text, "policy_kwargs")
+
+
+@given(st.text(max_size=30))
+def test_any_text_on_the_command_line_is_a_value(text):
+    value = parse_value(text)
+    assert value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))
+
+
+@given(st.dictionaries(st.text(st.characters(categories=["Ll"]), min_size=1, max_size=8), st.integers() | st.booleans()))
+def test_mappings_survive(mapping):
+    assert parse_mapping(repr(mapping), "x") == mapping
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"n_setps": 100}, "did you mean 'n_steps'"),
+        ({"n_envs": 0}, "n_envs is 0, must be at least 1"),
+        ({"n_timesteps": "many"}, "must be a whole number"),
+        ({"n_steps": 2.5}, "n_steps is 2.5, must be a whole number"),
+        ({"n_steps": "lin_100"}, "takes no schedule"),
+        ({"learning_rate": "fast"}, "must be a number or lin_<number>"),
+        ({"learning_rate": "lin_fast"}, "must be lin_ and a number"),
+        ({"learning_rate": float("nan")}, "must be finite"),
+        ({"policy": "MlpPolciy"}, "did you mean 'MlpPolicy'"),
+        ({"vec_env": "bath"}, "did you mean 'batch'"),
+        ({"env_kwargs": {"nosie": 0}}, "did you mean 'noise'"),
+        ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "did you mean 'nn.Tanh'"),
+        ({"normalize": True}, "normalize is not supported"),
+        ({"callback": 3}, "package.module.Class"),
+    ],
+)
+def test_bad_settings_are_named(settings, message):
+    with pytest.raises(ConfigError, match=message) as error:
+        build(**settings)
+    assert "\n" not in str(error.value)
+
+
+@given(st.integers(max_value=0))
+def test_there_is_at_least_one_environment(n_envs):
+    with pytest.raises(ConfigError, match="at least 1"):
+        build(n_envs=n_envs)
+
+
+def test_unknown_names_come_with_the_nearest():
+    with pytest.raises(ConfigError, match="did you mean 'dagger'"):
+        load_config("dager", ENV)
+    with pytest.raises(ConfigError, match="did you mean 'QuadStateRecovery-v0'"):
+        check_environment("QuadStateRecovry-v0")
+    with pytest.raises(ConfigError, match=r"did you mean 'thesis/dagger.yml'"):
+        load_config("dagger", ENV, "thesis/dager.yml")
+    with pytest.raises(ConfigError, match="learns from no expert"):
+        build("ppo", expert="pid")
+
+
+def test_other_environments_have_no_batch():
+    assert build("ppo", "Pendulum-v1").vec_env == "dummy"
+    assert build("ppo", ENV).vec_env == "batch"
+    with pytest.raises(ConfigError, match="no batched form"):
+        build("ppo", "Pendulum-v1", vec_env="batch")
+
+
+def test_whole_numbers_may_be_written_as_powers():
+    config = build(n_timesteps="1e6", n_envs=4.0, n_steps="2_000")
+    assert (config.n_timesteps, config.n_envs, config.hyperparams["n_steps"]) == (1_000_000, 4, 2000)
+    assert isinstance(config.hyperparams["n_steps"], int)
+
+
+@pytest.mark.parametrize("content", ["a: [1", "- 1\n- 2", "", "\x00", "QuadTargetTracking-v0: 3", "Other-v0: {}"])
+def test_unreadable_files_are_one_error(tmp_path, content):
+    path = tmp_path / "broken.yml"
+    path.write_text(content)
+    with pytest.raises(ConfigError, match=r"broken\.yml") as error:
+        load_config("dagger", ENV, path)
+    assert "\n" not in str(error.value)
+
+
+def test_yaml_cannot_make_objects(tmp_path):
+    path = tmp_path / "evil.yml"
+    path.write_text(f"{ENV}: !!python/object/apply:os.system ['true']\n")
+    with pytest.raises(ConfigError, match="not valid YAML"):
+        load_config("dagger", ENV, path)
+
+
+def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
+    path = tmp_path / "mine.yml"
+    path.write_text(yaml.safe_dump({ENV: {"n_timesteps": 10, "gamma": 0.9, "env_kwargs": {"noise": 0.1, "vehicle": "itm"}}}))
+    config = load_config("ppo", ENV, path, {"gamma": 0.8, "env_kwargs": {"noise": 0}})
+    assert config.hyperparams == {"gamma": 0.8}
+    assert config.env_kwargs == {"noise": 0, "vehicle": "itm"}
+    with pytest.raises(ConfigError, match="command line: n_envs"):
+        load_config("ppo", ENV, path, {"n_envs": 0})
+
+
+def test_settings_can_be_written_and_read_again():
+    config = load_config("dagger", ENV, None, {"policy_kwargs": parse_value("dict(net_arch=(8, 8), activation_fn=nn.ReLU)")})
+    again = build_config("dagger", ENV, yaml.safe_load(yaml.safe_dump(config.settings)))
+    assert again.policy_kwargs["activation_fn"] is nn.ReLU
+    assert repr(sorted(again.hyperparams.items())) == repr(sorted(config.hyperparams.items()))
+
+
+@pytest.mark.parametrize("name", config_names())
+def test_packaged_files_hold_good_settings(name):
+    content, _ = read_settings(name)
+    if "stages" in content:
+        pytest.skip("a pipeline")
+    algo = name.removeprefix("thesis/").removesuffix(".yml")
+    assert algo in ALGORITHMS
+    for env_id in content:
+        assert load_config(algo, env_id, name).n_timesteps > 0
+
+
+def test_thesis_settings_are_table_a4():
+    config = load_config("dagger", ENV, "thesis/dagger.yml")
+    used = config.hyperparams
+    assert (config.n_envs, used["n_steps"], used["n_epochs"]) == (240, 1500, 12)
+    assert config.n_envs * used["n_steps"] / used["batch_size"] == 8
+    assert (used["learning_rate"], used["vf_coef"], used["ent_coef"], used["l2_coef"]) == (5e-5, 0.5, 5e-4, 1e-4)
+    assert (used["beta"], used["beta_decay"], used["beta_final"]) == (0.5, 0.001, 0.3)
+    assert used["bc_loss"] == "nll"
+    assert used["dataset_capacity"] == 0
+    assert config.n_timesteps == 550 * 240 * 1500
+
+
+def test_classes_in_every_form_of_rl_zoo():
+    forms = ["a.B", {"a.B": {"x": "1e-3"}}, ["a.B", {"c.D": None}]]
+    assert [qualified_classes(form, "callback") for form in forms] == [
+        [("a.B", {})],
+        [("a.B", {"x": 1e-3})],
+        [("a.B", {}), ("c.D", {})],
+    ]
+    assert qualified_classes(None, "callback") == []

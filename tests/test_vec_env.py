@@ -1,0 +1,416 @@
+"""QuadcopterVecEnv: the same flights as QuadcopterEnv, rows apart from each other, and Stable-Baselines3's interface."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import threading
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+from sb3_quad.experts.pid import PIDExpert
+
+TASKS = ("target_tracking", "state_recovery")
+MIXTURE = {"target_tracking": 1.0, "state_recovery": 2.0}
+
+
+def fly(env, steps, actions=None):
+    """Observations, rewards, dones and infos of ``steps`` steps with the same random actions for the same number of rows."""
+    rng = np.random.default_rng(0)
+    actions = rng.uniform(-1, 1, (steps, env.num_envs, 4)).astype(np.float32) if actions is None else actions
+    steps_taken = [env.step(action) for action in actions]
+    infos = [[dict(info) for info in step[3]] for step in steps_taken[-1:]]
+    return *(np.array([step[k] for step in steps_taken]) for k in range(3)), infos
+
+
+# --- whole episodes, compared with PyBullet
+
+
+def episode_of_one(env, seed, choose, limit):
+    observation, _ = env.reset(seed=seed)
+    rewards, terminated, info = [], False, {}
+    for _ in range(limit):
+        observation, reward, terminated, _, info = env.step(choose(env.true_state()))
+        rewards.append(reward)
+        if terminated:
+            break
+    return np.array(rewards), observation, terminated, info
+
+
+def first_episodes(env, choose, limit):
+    """Rewards up to the end, last info, of the first episode of each row."""
+    env.reset()
+    rewards, infos = [[] for _ in range(env.num_envs)], {}
+    for _ in range(limit):
+        _, reward, done, info = env.step(choose(env.true_state()))
+        for row in set(range(env.num_envs)) - set(infos):
+            rewards[row].append(reward[row])
+            if done[row]:
+                infos[row] = info[row]
+    return [np.array(each) for each in rewards], infos
+
+
+@pytest.mark.parametrize("controller", ["pid", "random"])
+@pytest.mark.parametrize("task", TASKS)
+def test_whole_episodes_are_pybullets(task, controller):
+    n, limit = 4, 700
+    batch = QuadcopterVecEnv(n, task=task, noise=0.0, seed=20, max_episode_steps=limit)
+    single = QuadcopterEnv(task=task, noise=0.0)
+    table = np.random.default_rng(1).uniform(-1, 1, (n, limit, 4)).astype(np.float32)
+    pid = PIDExpert()
+    counts = {"batch": 0}
+
+    def choose_all(state):
+        if controller == "pid":
+            return pid.actions(state)
+        counts["batch"] += 1
+        return table[:, counts["batch"] - 1]
+
+    rewards, infos = first_episodes(batch, choose_all, limit)
+    for row in range(n):
+        flown = iter(table[row])
+        choose = (lambda state: pid.actions(state)[0]) if controller == "pid" else (lambda state, flown=flown: next(flown))
+        expected, observation, terminated, info = episode_of_one(single, 20 + row, choose, limit)
+        assert len(expected) == len(rewards[row])
+        np.testing.assert_allclose(rewards[row], expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(infos[row]["terminal_observation"], observation, atol=2e-6)
+        assert infos[row]["is_success"] == (not terminated)
+        assert infos[row]["TimeLimit.truncated"] == (not terminated)
+        assert infos[row]["episode"]["l"] == len(expected)
+        assert infos[row]["episode"]["r"] == pytest.approx(expected.sum(), abs=1e-5)
+        assert infos[row]["distance"] == pytest.approx(info["distance"], abs=1e-8)
+        assert infos[row]["collision"] == info["collision"]
+        assert infos[row]["out_of_range"] == info["out_of_range"]
+    single.close()
+
+
+def test_noise_is_the_same_in_both():
+    batch, single = QuadcopterVecEnv(3, task="state_recovery", seed=7), QuadcopterEnv(task="state_recovery")
+    first = batch.reset()
+    for row in range(3):
+        np.testing.assert_allclose(single.reset(seed=7 + row)[0], first[row], atol=1e-6)
+    action = np.full(4, 0.1, dtype=np.float32)
+    np.testing.assert_allclose(single.step(action)[0], batch.step(np.tile(action, (3, 1)))[0][2], atol=1e-6)
+    single.close()
+
+
+# --- rows apart from each other
+
+
+@pytest.mark.parametrize("task", [*TASKS, MIXTURE])
+def test_a_row_is_what_its_seed_alone_is(task):
+    n, steps = 200, 300
+    env = QuadcopterVecEnv(n, task=task, seed=3, max_episode_steps=150)
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (steps, n, 4)).astype(np.float32)
+    observations, rewards, dones, _ = fly(env, steps, actions)
+    for row in (0, 1, 63, 64, 128, 199):
+        alone = QuadcopterVecEnv(1, task=task, seed=3 + row, max_episode_steps=150)
+        alone.reset()
+        observation, reward, done, _ = fly(alone, steps, actions[:, [row]])
+        np.testing.assert_array_equal(observation[:, 0], observations[:, row])
+        np.testing.assert_array_equal(reward[:, 0], rewards[:, row])
+        np.testing.assert_array_equal(done[:, 0], dones[:, row])
+
+
+@pytest.mark.parametrize("n", [64, 193, 700])
+def test_results_do_not_depend_on_the_number_of_threads(n):
+    flights = []
+    for threads in (1, 2, 5):
+        env = QuadcopterVecEnv(n, task=MIXTURE, seed=1, n_threads=threads, max_episode_steps=60)
+        flights.append([env.reset(), *fly(env, 150)[:3], env.true_state().array.copy()])
+    for flight in flights[1:]:
+        for got, expected in zip(flight, flights[0], strict=True):
+            np.testing.assert_array_equal(got, expected)
+
+
+def test_two_environments_may_fly_in_two_threads():
+    expected = {}
+    flown = {}
+
+    def job(seed, results):
+        env = QuadcopterVecEnv(400, seed=seed)
+        env.reset()
+        results[seed] = fly(env, 60)[0]
+
+    for seed in (1, 1000):
+        job(seed, expected)
+    threads = [threading.Thread(target=job, args=(seed, flown)) for seed in (1, 1000)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for seed in (1, 1000):
+        np.testing.assert_array_equal(flown[seed], expected[seed])
+
+
+def test_seed_gives_the_same_again_and_without_it_episodes_go_on():
+    env = QuadcopterVecEnv(5, seed=0)
+    first, second = env.reset(), env.reset()
+    assert not np.allclose(first, second)
+    assert env.seed(0) == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(env.reset(), first)
+    np.testing.assert_array_equal(env.reset(), second)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no fork")
+def test_a_forked_child_flies_too():
+    code = """
+import os, numpy as np
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+env = QuadcopterVecEnv(512, seed=0); env.reset()
+for _ in range(20): env.step(np.zeros((512, 4)))
+child = os.fork()
+for _ in range(20): observations = env.step(np.ones((512, 4)))[0]
+print(observations.sum(), flush=True)
+if child: assert os.waitpid(child, 0)[1] == 0
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=True)
+    sums = result.stdout.split()
+    assert len(sums) == 2 and sums[0] == sums[1]
+
+
+# --- ends of episodes
+
+
+def test_the_end_of_an_episode():
+    env = QuadcopterVecEnv(6, seed=0, noise=0.0, max_episode_steps=400)
+    env.reset()
+    falling = np.tile(np.float32([-1, -1, -1, -1]), (6, 1))
+    falling[3:] = 0.0  # hover: to the time limit
+    total, ends, length = np.zeros(6), {}, 0
+    while len(ends) < 6:
+        before = env.true_state().copy()
+        observations, rewards, dones, infos = env.step(falling)
+        length += 1
+        for row in set(range(6)) - set(ends):
+            total[row] += rewards[row]
+            assert bool(infos[row]) == bool(dones[row])
+            if dones[row]:
+                ends[row] = infos[row]
+                assert infos[row]["episode"]["l"] == length
+                assert infos[row]["episode"]["r"] == pytest.approx(total[row], abs=1e-4)
+                terminal = infos[row]["terminal_observation"]
+                position = before.position[row] - before.target[row] + 0.01 * before.velocity[row]
+                np.testing.assert_allclose(terminal[:3] * env.observation_std[row, :3], position, atol=0.01)
+                start = env.true_state()
+                np.testing.assert_array_equal(start.position[row], (0, 0, 15))
+                relative = start.position[row] - start.target[row]
+                np.testing.assert_allclose(observations[row, :3] * env.observation_std[row, :3], relative, atol=1e-5)
+    for row in range(3):
+        assert ends[row]["collision"] and not ends[row]["is_success"] and not ends[row]["TimeLimit.truncated"]
+        assert total[row] < -15.0
+    for row in range(3, 6):
+        assert ends[row]["is_success"] and ends[row]["TimeLimit.truncated"] and not ends[row]["collision"]
+        assert ends[row]["distance"] == pytest.approx(10.0)
+        assert ends[row]["episode"]["l"] == 400
+
+
+def test_terminal_observations_are_rows_own_and_stay():
+    env = QuadcopterVecEnv(130, seed=0, max_episode_steps=30)
+    env.reset()
+    for _ in range(29):
+        env.step(np.zeros((130, 4)))
+    infos = list(env.step(np.zeros((130, 4)))[3])
+    terminal = np.array([info["terminal_observation"] for info in infos])
+    assert len(np.unique(terminal.round(4), axis=0)) == 130
+    kept = terminal.copy()
+    infos_after = env.step(np.ones((130, 4)))[3]
+    assert not any(infos_after)
+    for _ in range(29):
+        env.step(np.ones((130, 4)))
+    np.testing.assert_array_equal(np.array([info["terminal_observation"] for info in infos]), kept)
+
+
+def test_out_of_range_ends():
+    env = QuadcopterVecEnv(2, noise=0.0, seed=0)
+    env.reset()
+    env.set_target((100.0, 0.0, 15.0), indices=[1])
+    _, rewards, dones, infos = env.step(np.zeros((2, 4)))
+    assert dones.tolist() == [False, True]
+    assert infos[1]["out_of_range"] and not infos[1]["is_success"] and not infos[1]["TimeLimit.truncated"]
+    assert rewards[1] == pytest.approx(-15.3, abs=0.01) and rewards[0] > -0.1
+
+
+def test_returned_arrays_are_fresh():
+    env = QuadcopterVecEnv(3, seed=0)
+    first = [env.reset(), *env.step(np.zeros((3, 4)))[:3]]
+    kept = [array.copy() for array in first]
+    env.step(np.ones((3, 4)))
+    for array, copy in zip(first, kept, strict=True):
+        np.testing.assert_array_equal(array, copy)
+    assert first[0].dtype == first[1].dtype == first[2].dtype == np.float32 and first[3].dtype == np.bool_
+
+
+# --- what users set
+
+
+def test_setters_reach_the_rows_they_name():
+    env = QuadcopterVecEnv(4, seed=0)
+    env.reset()
+    env.set_target((1, 2, 3))
+    np.testing.assert_array_equal(env.target, np.tile([1.0, 2, 3], (4, 1)))
+    env.env_method("set_target", (0, 0, 9), indices=[1, 3])
+    np.testing.assert_array_equal(env.get_attr("target", [0, 1]), [(1, 2, 3), (0, 0, 9)])
+    env.set_attr("target", np.arange(12.0).reshape(4, 3))
+    np.testing.assert_array_equal(env.target, np.arange(12.0).reshape(4, 3))
+    env.set_noise(0.0)
+    assert env.get_attr("noise") == [0.0] * 4
+    env.set_attr("noise", 0.1, indices=2)
+    assert env.get_attr("noise") == [0.0, 0.0, 0.1, 0.0]
+    env.set_observation_scaling(mean=np.ones(18), indices=[0])
+    env.env_method("set_observation_scaling", std=np.full((4, 18), 2.0))
+    assert env.observation_mean[:, 5].tolist() == [1, 0, 0, 0] and (env.observation_std == 2.0).all()
+    assert env.get_attr("vehicle")[3].name == env.vehicle.name == "itm"
+    assert [state.n for state in env.env_method("true_state")] == [1] * 4
+    assert env.get_attr("render_mode") == [None] * 4 and env.env_is_wrapped(VecMonitor) == [False] * 4
+
+
+def test_scaling_and_noise_of_one_row_act_on_that_row():
+    plain, changed = QuadcopterVecEnv(70, noise=0.0, seed=0), QuadcopterVecEnv(70, noise=0.0, seed=0)
+    changed.set_observation_scaling(mean=np.full(18, 0.5), std=np.full(18, 4.0), indices=[66])
+    changed.set_noise(0.2, indices=[1])
+    expected, got = plain.reset(), changed.reset()
+    others = [row for row in range(70) if row not in (1, 66)]
+    np.testing.assert_array_equal(got[others], expected[others])
+    np.testing.assert_allclose(got[66], (expected[66] * plain.observation_std[66] - 0.5) / 4.0, atol=1e-6)
+    assert not np.allclose(got[1], expected[1])
+
+
+def test_wrench_pushes_the_rows_it_names_until_set_anew():
+    env = QuadcopterVecEnv(3, noise=0.0, seed=0)
+    env.reset()
+    env.set_wrench(force=(5.0, 0.0, 0.0), indices=[1])
+    env.set_wrench(torque=(0.0, 0.0, 0.01), torque_frame="world", indices=[2])
+    for _ in range(10):
+        env.step(np.zeros((3, 4)))
+    state = env.true_state()
+    assert state.velocity[:, 0] == pytest.approx([0.0, 0.1 * 5.0 / env.vehicle.mass, 0.0])
+    assert state.body_rates[:, 2] == pytest.approx([0.0, 0.0, 0.1 * 0.01 / env.vehicle.inertia[2]])
+    speed = state.velocity[1, 0]
+    env.set_wrench()
+    env.step(np.zeros((3, 4)))
+    assert env.true_state().velocity[1, 0] == pytest.approx(speed)
+
+
+def test_task_changes_with_the_next_episode():
+    env = QuadcopterVecEnv(100, noise=0.0, seed=0, max_episode_steps=10)
+    env.reset()
+    for _ in range(5):
+        env.step(np.zeros((100, 4)))
+    env.set_task("state_recovery", {"position_cost": 1.0})
+    rewards = env.step(np.zeros((100, 4)))[1]
+    np.testing.assert_allclose(rewards, -0.03, atol=1e-4)  # the episode under way is still target tracking
+    for _ in range(4):
+        env.step(np.zeros((100, 4)))
+    state = env.true_state()
+    np.testing.assert_array_equal(state.target, state.position)
+    assert state.velocity.std() == pytest.approx(2.0, rel=0.2)
+    rewards = env.step(np.zeros((100, 4)))[1]
+    assert (rewards < -0.001 * np.linalg.norm(state.velocity, axis=1)).all()
+
+
+def test_vehicles_by_row():
+    light, heavy = load_vehicle("itm"), load_vehicle("itm").model_copy(update={"mass": 3.0})
+    env = QuadcopterVecEnv(3, vehicle=[light, heavy, light], noise=0.0, seed=0)
+    env.reset()
+    assert [vehicle.mass for vehicle in env.get_attr("vehicle")] == [light.mass, 3.0, light.mass]
+    env.set_wrench(force=(3.0, 0.0, 0.0))
+    env.step(np.zeros((3, 4)))
+    assert env.true_state().velocity[:, 0] == pytest.approx(0.03 / np.array([light.mass, 3.0, light.mass]))
+    np.testing.assert_allclose(env.true_state().velocity[:, 2], 0.0, atol=1e-12)
+
+
+# --- refusals
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ({"n_envs": 0}, "n_envs 0"),
+        ({"n_envs": 2.5}, "n_envs 2.5"),
+        ({"n_envs": 2, "task": "target_trackin"}, "did you mean 'target_tracking'"),
+        ({"n_envs": 2, "task_kwargs": {"distance": 3}}, "unknown field 'distance'"),
+        ({"n_envs": 2, "noise": -0.1}, "noise -0.1"),
+        ({"n_envs": 2, "noise": float("nan")}, "finite"),
+        ({"n_envs": 2, "observation_std": np.zeros(18)}, "observation_std"),
+        ({"n_envs": 2, "observation_mean": np.zeros(17)}, r"observation_mean of shape \(17,\)"),
+        ({"n_envs": 2, "max_episode_steps": 0}, "max_episode_steps 0"),
+        ({"n_envs": 2, "vehicle": ["itm"]}, "1 vehicles for 2"),
+        ({"n_envs": 2, "vehicle": "itn"}, "did you mean 'itm'"),
+    ],
+)
+def test_bad_arguments_are_refused(arguments, says):
+    with pytest.raises(ConfigError, match=says):
+        QuadcopterVecEnv(**arguments)
+
+
+def test_bad_actions_are_refused_and_change_nothing():
+    env = QuadcopterVecEnv(70, seed=0)
+    env.reset()
+    before = env.true_state().copy()
+    for wrong in (np.zeros((70, 3)), np.zeros(4), np.zeros((69, 4))):
+        with pytest.raises(ValueError, match=r"must be \(70, 4\)"):
+            env.step(wrong)
+    for value in (np.nan, np.inf, -np.inf):
+        actions = np.zeros((70, 4))
+        actions[68, 2] = value
+        with pytest.raises(ValueError, match="row 68"):
+            env.step(actions)
+    np.testing.assert_array_equal(env.true_state().array, before.array)
+
+
+@pytest.mark.parametrize(
+    ("method", "arguments", "says"),
+    [
+        ("set_target", [(1, 2)], r"target of shape \(2,\)"),
+        ("set_target", [(1, 2, np.nan)], "finite"),
+        ("set_wrench", [(1, 2, 3, 4)], "force of shape"),
+        ("set_wrench", [(1, 2, 3), (0, 0, 0), "earth"], "force_frame 'earth'"),
+        ("set_noise", ["much"], "noise 'much'"),
+        ("set_observation_scaling", [None, np.zeros(18)], "positive"),
+        ("set_task", ["nothing"], "unknown task"),
+    ],
+)
+def test_bad_settings_are_refused(method, arguments, says):
+    with pytest.raises(ConfigError, match=says):
+        getattr(QuadcopterVecEnv(2), method)(*arguments)
+
+
+def test_unknown_rows_methods_and_attributes_are_refused():
+    env = QuadcopterVecEnv(2)
+    with pytest.raises(ConfigError, match="0 to 1"):
+        env.set_target((0, 0, 1), indices=[2])
+    with pytest.raises(AttributeError):
+        env.env_method("fly_home")
+    with pytest.raises(AttributeError):
+        env.set_attr("colour", 1)
+    with pytest.raises(AttributeError):
+        env.get_attr("colour")
+
+
+# --- Stable-Baselines3
+
+
+def test_ppo_learns_on_it():
+    env = QuadcopterVecEnv(64, seed=0, max_episode_steps=40)
+    model = PPO("MlpPolicy", env, n_steps=32, batch_size=512, n_epochs=1, device="cpu").learn(64 * 32 * 2)
+    assert len(model.ep_info_buffer) > 0 and model.ep_info_buffer[0]["l"] == 40
+
+
+def test_sb3_wrappers_work_on_it():
+    env = VecNormalize(VecMonitor(QuadcopterVecEnv(8, seed=0, max_episode_steps=20)))
+    env.reset()
+    for _ in range(20):
+        observations, rewards, dones, infos = env.step(np.zeros((8, 4)))
+    assert dones.all() and np.isfinite(observations).all() and np.isfinite(rewards).all()
+    assert all(info["episode"]["l"] == 20 for info in infos)
+    env.close()
+    env.close()

@@ -1,0 +1,192 @@
+"""Vehicles: derived values, thrust and actions, and files that are wrong in every way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from sb3_quad.dynamics.vehicle import PARAMETER_NAMES, Vehicle, load_vehicle, vehicle_names
+from sb3_quad.errors import ConfigError
+
+ITM = load_vehicle("itm")
+finite = st.floats(-2.0, 2.0)
+
+
+def vehicles() -> st.SearchStrategy[Vehicle]:
+    """Vehicles unlike the default one: other sizes, masses, limits and rotor order."""
+
+    def build(scale: float, mass: float, low: float, high: float, wide: float, long: float, mirrored: bool) -> Vehicle:
+        sign = -1 if mirrored else 1
+        return ITM.model_copy(
+            update={
+                "mass": mass,
+                "thrust_limits": (low, high),
+                "rotor_positions": ((long, wide), (long, -wide), (-long, -wide), (-long, wide)),
+                "rotor_directions": tuple(sign * each for each in ITM.rotor_directions),
+                "inertia": tuple(scale * each for each in ITM.inertia),
+            }
+        )
+
+    arm = st.floats(0.05, 1.0)
+    return st.builds(
+        build, st.floats(0.1, 10), st.floats(0.05, 20), st.floats(0, 0.9), st.floats(1.1, 5), arm, arm, st.booleans()
+    )
+
+
+def write(path: Path, **changes: Any) -> Path:
+    data = yaml.safe_load(yaml.safe_dump(ITM.model_dump(mode="json")))
+    data.update(changes)
+    path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not ...}))
+    return path
+
+
+def test_default_vehicle_is_the_specified_one() -> None:
+    assert vehicle_names() == ["itm"]
+    assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (1.727, (0.006687, 0.0101, 0.00996), 0.016)
+    assert (ITM.thrust_coefficient, ITM.motor_gain, ITM.gravity) == (8.54858e-6, 20.0, 9.81)
+    assert (ITM.physics_step, ITM.control_step, ITM.substeps, ITM.delay) == (0.0025, 0.01, 4, 1)
+    d, c = 0.17104913036744201, 0.016
+    mixer = [[1, 1, 1, 1], [d, -d, -d, d], [-d, -d, d, d], [c, -c, c, -c]]
+    np.testing.assert_array_equal(ITM.mixer, mixer)
+    np.testing.assert_allclose(ITM.hover_thrust, 1.727 * 9.81 / 4)
+    np.testing.assert_allclose(ITM.thrust_range, (0.5 * ITM.hover_thrust, 1.5 * ITM.hover_thrust))
+
+
+@given(vehicles(), st.tuples(finite, finite, finite, finite))
+def test_mixer_inverse(vehicle: Vehicle, wrench: tuple[float, ...]) -> None:
+    thrusts = vehicle.mixer_inverse @ np.array(wrench)
+    np.testing.assert_allclose(vehicle.mixer @ thrusts, wrench, atol=1e-9)
+
+
+@given(vehicles())
+def test_hover_carries_the_weight_and_nothing_else(vehicle: Vehicle) -> None:
+    wrench = vehicle.mixer @ np.full(4, vehicle.hover_thrust)
+    np.testing.assert_allclose(wrench, [vehicle.mass * vehicle.gravity, 0, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(vehicle.thrust_coefficient * vehicle.hover_rotor_speed**2, vehicle.hover_thrust)
+    low, high = vehicle.rotor_speed_range
+    assert low < vehicle.hover_rotor_speed < high
+
+
+@given(vehicles(), st.lists(st.floats(-1, 1), min_size=1, max_size=8))
+def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -> None:
+    action = np.array(actions)
+    thrust = vehicle.action_to_thrust(action)
+    low, high = vehicle.thrust_range
+    assert (thrust >= low - 1e-9).all() and (thrust <= high + 1e-9).all()
+    np.testing.assert_allclose(vehicle.thrust_to_action(thrust), action, atol=1e-9)
+    np.testing.assert_array_equal(vehicle.action_to_thrust(np.array([-7.0, 7.0])), vehicle.action_to_thrust(np.array([-1.0, 1.0])))
+
+
+def test_zero_action_is_hover_for_the_default_vehicle() -> None:
+    np.testing.assert_allclose(ITM.action_to_thrust(np.zeros(4)), ITM.hover_thrust, rtol=1e-15)
+
+
+@given(vehicles())
+def test_kernel_parameters_are_in_their_order(vehicle: Vehicle) -> None:
+    values = dict(zip(PARAMETER_NAMES, vehicle.parameters(), strict=True))
+    low, high = vehicle.thrust_range
+    assert values["mass"] == vehicle.mass and values["izz"] == vehicle.inertia[2]
+    assert values["roll_arm_2"] == vehicle.mixer[1, 2] and values["yaw_arm_3"] == vehicle.mixer[3, 3]
+    ends = [values["thrust_middle"] - values["thrust_half_range"], values["thrust_middle"] + values["thrust_half_range"]]
+    np.testing.assert_allclose([*ends, values["hover_thrust"]], [low, high, vehicle.hover_thrust], atol=1e-12)
+    assert ends[0] >= 0.0  # its square root is a rotor speed
+
+
+def test_frozen_and_copies_are_validated() -> None:
+    with pytest.raises(ValidationError):
+        ITM.mass = 2.0  # type: ignore[misc]
+    heavier = ITM.model_copy(update={"mass": 2.0})
+    assert heavier.mass == 2.0 and ITM.mass == 1.727
+    assert heavier.hover_thrust > ITM.hover_thrust
+    with pytest.raises(ValidationError, match="mass"):
+        ITM.model_copy(update={"mass": -2.0})
+
+
+def test_copy_of_a_used_vehicle_has_its_own_mixer() -> None:
+    """Cached derived values do not follow into a copy with other parameters."""
+    assert ITM.mixer[3, 0] == 0.016
+    other = ITM.model_copy(update={"moment_thrust_ratio": 0.03})
+    assert other.mixer[3, 0] == 0.03
+    np.testing.assert_allclose(other.mixer @ other.mixer_inverse, np.eye(4), atol=1e-12)
+
+
+def test_file_round_trip(tmp_path: Path) -> None:
+    assert load_vehicle(write(tmp_path / "same.yaml")) == ITM
+    assert load_vehicle(str(write(tmp_path / "other.yml", mass=2.5))).mass == 2.5
+    assert load_vehicle(ITM) is ITM
+
+
+def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
+    """`8e-6` is a string to PyYAML; it is meant as a number."""
+    path = tmp_path / "v.yaml"
+    path.write_text(write(tmp_path / "w.yaml").read_text().replace("8.54858e-06", "8e-6"))
+    assert load_vehicle(path).thrust_coefficient == 8e-6
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mas": 1.0}, "'mas': did you mean 'mass'"),
+        ({"thrust_limit": [0.5, 1.5]}, "did you mean 'thrust_limits'"),
+        ({"mass": ...}, "mass: Field required"),
+        ({"mass": -1}, "mass: .*greater than 0.*kg"),
+        ({"mass": float("nan")}, "mass: "),
+        ({"mass": float("inf")}, "mass: .*finite"),
+        ({"mass": "heavy"}, "mass: .*number"),
+        ({"inertia": [0.1, 0.2]}, "inertia"),
+        ({"inertia": [0.1, 0.1, 0.5]}, "inertia .*no rigid body"),
+        ({"rotor_positions": [[1, 1], [1, -1], [-1, -1], [-1, 0.5]]}, "rotor_positions: equal thrusts"),
+        ({"rotor_positions": [[1, 0], [1, 0], [-1, 0], [-1, 0]]}, "rotor_positions: these rotors cannot"),
+        ({"rotor_directions": [1, 1, 1, -1]}, "rotor_directions .*two of 1"),
+        ({"thrust_limits": [1.1, 1.5]}, "thrust_limits .*hover"),
+        ({"thrust_limits": [1.5, 0.5]}, "thrust_limits .*hover"),
+        ({"control_step": 0.011}, "control_step .*whole multiple"),
+        ({"motor_gain": 500}, "motor_gain"),
+        ({"delay": -1}, "delay"),
+        ({"delay": 1.5}, "delay"),
+        ({"collision_radius": 0}, "collision_radius"),
+        ({"name": ""}, "name"),
+    ],
+)
+def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    path = write(tmp_path / "bad.yaml", **changes)
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_vehicle(path)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("content", ["", "- 1\n- 2\n", "just text", "mass: [1, 2", "\t- :", "mass: 1.0\nmass: *nothing"])
+def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "bad.yaml"
+    path.write_text(content)
+    with pytest.raises(ConfigError, match="bad.yaml") as caught:
+        load_vehicle(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_unreadable_files(tmp_path: Path) -> None:
+    binary = tmp_path / "binary.yaml"
+    binary.write_bytes(b"\xff\xfe\x00\x01")
+    for path in (tmp_path / "missing.yaml", tmp_path / "folder.yaml", binary):
+        if path.stem == "folder":
+            path.mkdir()
+        with pytest.raises(ConfigError, match=path.name):
+            load_vehicle(path)
+
+
+def test_unknown_name_gives_the_nearest() -> None:
+    with pytest.raises(ConfigError, match="'imt': did you mean 'itm'.*path of a .yaml"):
+        load_vehicle("imt")
+
+
+@pytest.mark.parametrize("source", [None, 3, ["itm"]])
+def test_what_is_no_vehicle_at_all(source: Any) -> None:
+    with pytest.raises(ConfigError, match="vehicle"):
+        load_vehicle(source)
