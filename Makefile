@@ -5,6 +5,7 @@ VENV ?= .venv
 ARGS ?=
 
 PY := $(VENV)/bin/python
+INSTALL := $(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 INSTALLED := $(VENV)/.installed
 LINKS := build/type/sb3_quad
 
@@ -58,5 +59,6 @@ $(PY):
 
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 	@echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."
-	@$(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@$(INSTALL) setuptools
+	@$(INSTALL) --no-build-isolation --editable '.[dev]'
 	@touch $@

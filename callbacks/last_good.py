@@ -39,7 +39,7 @@ class LastGoodModel(BaseCallback):
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
                 raise TrainingError(
-                    f"after {self.num_timesteps:,} transitions {name} is no longer finite; lower learning_rate or max_grad_norm"
+                    f"after {self.num_timesteps:,} transitions {name} is no longer finite; lower learning_rate"
                 )
         state = random_state()
         state |= {f"{ENVIRONMENT}{name}": array for name, array in environment_state(self.training_env).items()}
@@ -51,7 +51,7 @@ class LastGoodModel(BaseCallback):
 
 def random_state() -> Arrays:
     """The states of torch's, NumPy's and Python's global random number generators."""
-    _, keys, position, has_normal, normal = np.random.get_state(legacy=True)
+    _, keys, position, has_normal, normal = np.random.get_state(legacy=True)  # noqa: NPY002 - SB3 draws from it
     version, words, gauss = random.getstate()
     return {
         "torch": th.get_rng_state().numpy().copy(),
@@ -66,7 +66,8 @@ def set_random_state(state: Arrays) -> None:
     """Undo what has happened to the random numbers since ``random_state``."""
     th.set_rng_state(th.from_numpy(np.array(state["torch"], dtype=np.uint8)))
     position, has_normal, normal = (float(value) for value in state["numpy.rest"])
-    np.random.set_state(("MT19937", np.array(state["numpy.keys"], dtype=np.uint32), int(position), int(has_normal), normal))
+    legacy = ("MT19937", np.array(state["numpy.keys"], dtype=np.uint32), int(position), int(has_normal), normal)
+    np.random.set_state(legacy)  # noqa: NPY002
     version, *words = (int(word) for word in state["python.words"])
     gauss = float(state["python.gauss"][0])
     random.setstate((version, tuple(words), None if np.isnan(gauss) else gauss))

@@ -155,11 +155,11 @@ def run_block(job, block, scratch, fresh):
 @compiled
 def _finite(actions):
     # By their bits: code compiled with fastmath may take it that no NaN exists.
-    bits = actions.view(np.int32)
+    count = 4 * actions.shape[0]
+    bits = carray(pointer(actions.ctypes.data), (count,), np.int32)
     wrong = 0
-    for i in range(bits.shape[0]):
-        for k in range(4):
-            wrong += (bits[i, k] & 0x7F800000) == 0x7F800000
+    for i in range(count):
+        wrong += (bits[i] & 0x7F800000) == 0x7F800000
     return wrong == 0
 
 

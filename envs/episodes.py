@@ -55,29 +55,29 @@ def start_episode(i, state, queue, streams, task_index, vehicles, task_parameter
     while k < task_weights.shape[0] - 1 and choice >= task_weights[k]:
         k += 1
     task_index[i] = k
-    task = task_parameters[k]
-    vehicle = vehicles[:, min(i, vehicles.shape[1] - 1)]
+    column = min(i, vehicles.shape[1] - 1)
+    position = task_parameters[k, START], task_parameters[k, START + 1], task_parameters[k, START + 2]
 
-    distance = task[TARGET_DISTANCE]
+    distance = task_parameters[k, TARGET_DISTANCE]
     # A uniform direction has a uniform height (Archimedes): cut it where the target would lie below ground.
-    lowest = min(max(-1.0, (vehicle[P_RADIUS] - task[START + 2]) / distance), 1.0) if distance > 0.0 else -1.0
+    lowest = min(max(-1.0, (vehicles[P_RADIUS, column] - position[2]) / distance), 1.0) if distance > 0.0 else -1.0
     up = lowest + (1.0 - lowest) * height
     across = math.sqrt(max(0.0, 1.0 - up * up))
-    state[PX, i], state[PY, i], state[PZ, i] = task[START], task[START + 1], task[START + 2]
-    state[TX, i] = task[START] + distance * across * math.cos(azimuth)
-    state[TY, i] = task[START + 1] + distance * across * math.sin(azimuth)
-    state[TZ, i] = task[START + 2] + distance * up
+    state[PX, i], state[PY, i], state[PZ, i] = position
+    state[TX, i] = position[0] + distance * across * math.cos(azimuth)
+    state[TY, i] = position[1] + distance * across * math.sin(azimuth)
+    state[TZ, i] = position[2] + distance * up
 
     state[QW, i], state[QX, i], state[QY, i], state[QZ, i] = 1.0, 0.0, 0.0, 0.0
-    if task[RANDOM_ATTITUDE] != 0.0:  # uniform on SO(3) (Shoemake)
+    if task_parameters[k, RANDOM_ATTITUDE] != 0.0:  # uniform on SO(3) (Shoemake)
         a, b, alpha, beta = math.sqrt(1.0 - u[3]), math.sqrt(u[3]), TURN * u[4], TURN * u[5]
         state[QW, i], state[QX, i] = b * math.cos(beta), a * math.sin(alpha)
         state[QY, i], state[QZ, i] = a * math.cos(alpha), b * math.sin(beta)
     for axis in range(3):  # two normals from two uniforms (Box-Muller)
         radius, angle = math.sqrt(-2.0 * math.log(u[6 + 2 * axis])), TURN * u[7 + 2 * axis]
-        state[VX + axis, i] = task[VELOCITY_STD] * radius * math.cos(angle)
-        state[WX + axis, i] = task[BODY_RATES_STD] * radius * math.sin(angle)
-    hover = math.sqrt(vehicle[P_HOVER] / vehicle[P_LIFT])
+        state[VX + axis, i] = task_parameters[k, VELOCITY_STD] * radius * math.cos(angle)
+        state[WX + axis, i] = task_parameters[k, BODY_RATES_STD] * radius * math.sin(angle)
+    hover = math.sqrt(vehicles[P_HOVER, column] / vehicles[P_LIFT, column])
     for rotor in range(4):
         state[S0 + rotor, i] = hover
         for late in range(queue.shape[0]):

@@ -40,7 +40,7 @@ def revolve(profile: npt.NDArray[np.float64], segments: int) -> Mesh:
     def sweep(points: npt.NDArray[np.float64]) -> list[list[float]]:
         around = points[:, None, :1] * direction[None]
         height = np.broadcast_to(points[:, None, 1:], (len(points), segments, 1))
-        return np.concatenate([around, height], axis=2).reshape(-1, 3).tolist()  # type: ignore[no-any-return]
+        return np.concatenate([around, height], axis=2).reshape(-1, 3).tolist()
 
     row, column = np.meshgrid(np.arange(len(profile) - 1), np.arange(segments), indexing="ij")
     a, b = row * segments + column, row * segments + (column + 1) % segments

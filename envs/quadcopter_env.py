@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -12,19 +12,19 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_quad.dynamics.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.dynamics.state import STATE_SIZE, TARGET, QuadcopterState
 from sb3_quad.dynamics.streams import STEP, new_streams, stream_key
 from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
 from sb3_quad.envs.bullet import BulletBody
+from sb3_quad.envs.checks import check_options, check_size, vector
 from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE, observe
-from sb3_quad.envs.rendering import RENDER_MODES, Renderer, check_size
+from sb3_quad.envs.rendering import RENDER_MODES, Renderer
 from sb3_quad.envs.tasks import TaskSpec, reset_rows, resolve_tasks, score
 from sb3_quad.errors import ConfigError, unknown
 
 FloatArray = npt.NDArray[np.float64]
 Observation = npt.NDArray[np.float32]
 _ROW = np.zeros(1, dtype=np.int64)
-_START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
 
 
 class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
@@ -83,7 +83,14 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     | Key | Meaning |
     |-----|---------|
     | `target` | r_T, (3,), world frame, m |
-    | `state` | any of `position` (m), `quaternion` (w, x, y, z; body to world; normalised), `velocity` (world frame, m/s), `body_rates` (body frame, rad/s); what is left out is drawn as ever |
+    | `state` | any of the four below; what is left out is drawn as ever |
+
+    | Key of `state` | Meaning |
+    |----------------|---------|
+    | `position` | (3,), world frame, m; above the ground |
+    | `quaternion` | (w, x, y, z), body to world; is normalised |
+    | `velocity` | (3,), world frame, m/s |
+    | `body_rates` | (3,), body frame, rad/s |
 
     The same seed and the same actions give the same episode, bit for bit.
 
@@ -97,7 +104,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     | Key | Meaning |
     |-----|---------|
     | `is_success` | not terminated so far; at the end of the episode, the thesis's success |
-    | `distance` | \\|r - r_T\\|, m |
+    | `distance` | from the target, m |
     | `collision` | the ground was touched |
     | `out_of_range` | too far from the target |
 
@@ -117,14 +124,21 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.dynamics.vehicle.Vehicle` |
     | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
-    | `render_mode` | `None` | `"human"` (a window, in real time; one per process), `"rgb_array"` (pictures, without a display) |
+    | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |
     | `render_width`, `render_height` | 640, 480 | size of pictures and window, pixels |
 
     ## While Flying
 
-    On `env.unwrapped`; all hold until set anew, `set_target` until the next reset:
-    `set_target(position)`, `set_wrench(force, torque, force_frame, torque_frame)` (external, at the centre of mass),
-    `set_noise(level)`, `set_observation_scaling(mean, std)`, `set_task(task, task_kwargs)` (from the next reset);
+    On `env.unwrapped`; what is set holds until it is set anew, a target until the next reset.
+
+    | Method | Sets |
+    |--------|------|
+    | `set_target(position)` | r_T, (3,), world frame, m |
+    | `set_wrench(force, torque, force_frame, torque_frame)` | an external force (N) and torque (N m) at the centre of mass |
+    | `set_noise(level)` | the relative standard deviation of the observation noise |
+    | `set_observation_scaling(mean, std)` | mean and std of Eq. 3.16, (18,) each; `None` leaves one as it is |
+    | `set_task(task, task_kwargs)` | the task from the next reset on |
+
     `true_state()`, `target`, `noise`, `observation_mean`, `observation_std` and `vehicle` tell what holds.
 
     ## Version History
@@ -132,7 +146,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     - v0: first version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": list(RENDER_MODES), "render_fps": 100}  # type: ignore[misc]
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 100}
 
     def __init__(
         self,
@@ -182,9 +196,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         if self._body.has_window or self.render_mode == "rgb_array":
             self._renderer = Renderer(self._vehicle, self._body, *self._size)
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode; after :meth:`close`, in a new simulation.
 
         :param seed: begins a new stream of random numbers; None: the next episode of the present one.
@@ -192,7 +204,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         :raises ConfigError: an unknown option, or a value that is no start.
         """
         super().reset(seed=seed)
-        fixed = _check_options(options, self._vehicle)
+        fixed = check_options(options, self._vehicle)
         if seed is not None or not self._seeded:
             self._streams[:] = new_streams(np.array([stream_key(self.np_random)], dtype=np.uint64))
             self._seeded = True
@@ -209,8 +221,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._collided[:] = self._out_of_range[:] = False  # only the end of a control step is judged
         if self._renderer is not None:
             self._renderer.reset(state)
-            if self.render_mode == "human":
-                self.render()
+            self._show()
         return self._observe(), self._info()
 
     def step(self, action: npt.NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
@@ -237,17 +248,21 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         collided, out_of_range, tasks = self._collided, self._out_of_range, self._tasks.parameters
         score(state, parameters, self._task_index, tasks, self._reward, collided, out_of_range, self._distance)
         if self.render_mode == "human":
-            self.render()
+            self._show()
         info = self._info()
         return self._observe(), float(self._reward[0]), not info["is_success"], False, info
 
-    def render(self) -> npt.NDArray[np.uint8] | None:  # type: ignore[override]
-        """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, which draws into its window."""
+    def render(self) -> npt.NDArray[np.uint8] | None:
+        """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() does nothing without a render_mode; pass render_mode='rgb_array' to make()")
-        if self._renderer is None:
+        if self._renderer is None or self.render_mode == "human":
             return None
         return self._renderer.render(self._state, self._wrench)
+
+    def _show(self) -> None:
+        if self._renderer is not None and self.render_mode == "human":
+            self._renderer.render(self._state, self._wrench)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
@@ -285,7 +300,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     def set_target(self, position: npt.ArrayLike) -> None:
         """Move the target, (3,), world frame, m; until the next reset."""
-        self._state[TARGET, 0] = _vector("target", position, 3)
+        self._state[TARGET, 0] = vector("target", position, 3)
 
     def set_wrench(
         self,
@@ -302,20 +317,20 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         for number, (name, value, frame) in enumerate((("force", force, force_frame), ("torque", torque, torque_frame))):
             if frame not in ("world", "body"):
                 raise ConfigError(f"{name}_frame {frame!r}: must be 'world' or 'body'")
-            wrench[2 * number + (frame == "body")] = _vector(name, value, 3)
+            wrench[2 * number + (frame == "body")] = vector(name, value, 3)
         self._wrench[:, 0] = wrench.ravel()
 
     def set_noise(self, level: float) -> None:
         """Set the relative standard deviation of the observation noise; 0: none."""
-        value = _vector("noise", np.atleast_1d(np.asarray(level)), 1)
+        value = vector("noise", np.atleast_1d(np.asarray(level)), 1)
         if value[0] < 0:
             raise ConfigError(f"noise {level!r}: must not be negative")
         self._noise[:] = value
 
     def set_observation_scaling(self, mean: npt.ArrayLike | None = None, std: npt.ArrayLike | None = None) -> None:
         """Set μ and σ of Eq. 3.16, (18,) each; None leaves one as it is."""
-        new_mean = self.observation_mean if mean is None else _vector("observation_mean", mean, OBSERVATION_SIZE)
-        new_std = self.observation_std if std is None else _vector("observation_std", std, OBSERVATION_SIZE)
+        new_mean = self.observation_mean if mean is None else vector("observation_mean", mean, OBSERVATION_SIZE)
+        new_std = self.observation_std if std is None else vector("observation_std", std, OBSERVATION_SIZE)
         if (new_std <= 0).any():
             raise ConfigError("observation_std: every value must be positive")
         self._mean[:, 0], self._std[:, 0] = new_mean, new_std
@@ -325,9 +340,9 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._next_tasks = resolve_tasks(task, task_kwargs)
 
     def _observe(self) -> Observation:
-        out = np.empty((1, OBSERVATION_SIZE), dtype=np.float32)
-        observe(self._state, self._streams, self._mean, self._std, self._noise, out)
-        return out[0]
+        observation = np.empty(OBSERVATION_SIZE, dtype=np.float32)
+        observe(self._state, self._streams, self._mean, self._std, self._noise, observation[None])
+        return observation
 
     def _info(self) -> dict[str, Any]:
         collision, out_of_range = bool(self._collided[0]), bool(self._out_of_range[0])
@@ -337,41 +352,3 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             "collision": collision,
             "out_of_range": out_of_range,
         }
-
-
-def _check_options(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
-    """The rows of the state that ``options`` of reset fix, and their values."""
-    options = options or {}
-    for key in options:
-        if key not in ("target", "state"):
-            raise ConfigError(f"options: {unknown('key', key, ('target', 'state'))}")
-    start = options.get("state") or {}
-    if not isinstance(start, Mapping):
-        raise ConfigError(f"options: state must map names to values (valid names: {', '.join(_START)})")
-    fixed = [(TARGET, _vector("target", options["target"], 3))] if options.get("target") is not None else []
-    for key, value in start.items():
-        if key not in _START:
-            raise ConfigError(f"options: {unknown('state key', key, _START)}")
-        values = _vector(key, value, 4 if key == "quaternion" else 3)
-        if key == "quaternion":
-            norm = np.linalg.norm(values)
-            if norm < 1e-6:
-                raise ConfigError("quaternion: must not be zero")
-            values = values / norm
-        if key == "position" and values[2] <= vehicle.collision_radius:
-            raise ConfigError(f"position {values.tolist()}: touches the ground; z must exceed {vehicle.collision_radius} m")
-        fixed.append((_START[key], values))
-    return fixed
-
-
-def _vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
-    """``value`` as finite numbers of shape (size,)."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{name} {value!r}: must be {size} numbers") from None
-    if array.shape != (size,):
-        raise ConfigError(f"{name} of shape {array.shape}: must be ({size},)")
-    if not np.isfinite(array).all():
-        raise ConfigError(f"{name} {array.tolist()}: every number must be finite")
-    return array

@@ -16,7 +16,6 @@ from sb3_quad.envs import meshes
 from sb3_quad.envs.backdrop import Camera, compose
 from sb3_quad.envs.bullet import BulletBody, load_urdf_text
 from sb3_quad.envs.urdf import FRONT, WHITE, Colour, arm_length, frame_urdfs, rotor_height, rotor_radius, rotor_urdf
-from sb3_quad.errors import ConfigError
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -26,7 +25,6 @@ ELEVATIONS = math.radians(-45.0), math.radians(52.0)
 ELEVATION_AT_TARGET = math.radians(-8.0)
 NEAR, FAR = 0.05, 120.0
 SUPERSAMPLING = 2  # PyBullet's software renderer draws hard edges
-MAX_SIZE = 2048
 WINDOW_FPS = 25.0  # frames a second; PyBullet's window lets the simulation wait for each
 RING = 0.42  # radius of the rings around the target, m
 MARKER: Colour = (0.10, 0.72, 0.28, 1.0)
@@ -92,7 +90,9 @@ class Renderer:
         attitude = _xyzw(state)
         rotation = QuadcopterState(state[:, :1]).rotation[0]
         for body, centre, angle in zip(self.rotors, self._rotor_centres(position, rotation), self.rotor_angles, strict=True):
-            _, turned = p.multiplyTransforms(_NOWHERE, attitude, _NOWHERE, (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2)))
+            _, turned = p.multiplyTransforms(
+                _NOWHERE, attitude, _NOWHERE, (0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))
+            )
             self._move(body, centre.tolist(), turned)
         for body in self.frame:
             self._move(body, position.tolist(), attitude)
@@ -232,16 +232,6 @@ class Renderer:
             self._move(arrow, _NOWHERE, _LEVEL)
         else:
             self._move(arrow, position.tolist(), _from_z_to(direction / np.linalg.norm(direction)))
-
-
-def check_size(width: int, height: int) -> None:
-    """Refuse what is no size of a picture.
-
-    :raises ConfigError: names the argument.
-    """
-    for name, value in (("render_width", width), ("render_height", height)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 16 <= value <= MAX_SIZE:
-            raise ConfigError(f"{name} {value!r}: must be a whole number of 16 to {MAX_SIZE} pixels")
 
 
 def _unit(vector: FloatArray, otherwise: FloatArray) -> FloatArray:

@@ -24,6 +24,7 @@ from sb3_quad.envs.observation import OBSERVATION_SIZE
 
 PATIENCE = 20_000  # looks for work before a helper sleeps: some 30 microseconds
 WORTHWHILE = 3  # blocks; fewer are done before a helper has woken
+REST = 100  # jobs done without helpers after one kept a job waiting: its core is busy with something else
 
 
 def available_cpus() -> int:
@@ -47,6 +48,7 @@ class Helpers:
     def __init__(self) -> None:
         self.lock = threading.Lock()
         self.control = np.zeros(AWAKE + 16 * max(available_cpus(), 64), dtype=np.int64)
+        self.resting = 0
         self._signals: list[threading.Semaphore] = []
 
     def wake(self, count: int) -> None:
@@ -89,12 +91,16 @@ def run(job: npt.NDArray[np.int64], n: int, threads: int, arrays: tuple[npt.NDAr
     helpers = _helpers
     blocks = -(-n // LANES)
     count = min(threads, blocks, 64) - 1 if blocks >= WORTHWHILE else 0
+    if count > 0 and helpers.resting > 0:
+        helpers.resting -= 1
+        count = 0
     if count < 1 or not helpers.lock.acquire(blocking=False):
         return bool(work(_alone(), -1, PATIENCE, job, *arrays) >= 0)
     try:
         helpers.wake(count)
         outcome = work(helpers.control, -1, PATIENCE, job, *arrays)
         if outcome == 0:
+            helpers.resting = REST
             while helpers.control[DONE] < blocks:
                 time.sleep(0)
         return bool(outcome >= 0)

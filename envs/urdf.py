@@ -52,7 +52,7 @@ def vehicle_urdf(vehicle: Vehicle) -> str:
     <collision>
       <geometry><sphere radius="{vehicle.collision_radius!r}"/></geometry>
     </collision>
-    {''.join(visual for _, visual in _frame(vehicle))}
+    {"".join(visual for _, visual in _frame(vehicle))}
   </link>
 </robot>
 """
@@ -105,7 +105,9 @@ def _frame(vehicle: Vehicle) -> list[Part]:
     return parts
 
 
-def _box(size: tuple[float, float, float], at: tuple[float, float, float], rpy: tuple[float, float, float], colour: Colour) -> Part:
+def _box(
+    size: tuple[float, float, float], at: tuple[float, float, float], rpy: tuple[float, float, float], colour: Colour
+) -> Part:
     return _visual(f'<box size="{_numbers(size)}"/>', at, rpy, colour)
 
 

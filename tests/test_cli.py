@@ -146,7 +146,8 @@ def damaged_zip(tmp_path, kind):
 )
 def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, settings_file):
     path = damaged_zip(tmp_path, kind)
-    assert main(["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "-i", str(path)]) == 2
+    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "-i", str(path)]
+    assert main(arguments) == 2
     assert message in one_line_of_error(capsys)
     assert not (tmp_path / "logs").exists()
 
@@ -184,7 +185,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
         assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
 
 
-@pytest.mark.parametrize("vec_env", ["dummy", "subproc"])
+@pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])
 def test_pybullet_gives_the_same_run_as_the_batch(tmp_path, vec_env):
     changes = {"n_timesteps": 200, "n_envs": 2, "env_kwargs": {"noise": 0, "max_episode_steps": 60}}
     models = [train(job(tmp_path, vec_env=kind, **changes), report=lambda line: None).model for kind in ("batch", vec_env)]
@@ -200,9 +201,8 @@ def test_other_environments_train_too(tmp_path):
     assert result.run.best_model.is_file()
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signals_save_the_model_and_say_where(tmp_path, number, code, settings_file):
-    """In a process of its own, as a shell would send them."""
+def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
+    """In a process of its own, as a shell would send it; SIGTERM is sent by the tests of resumption."""
     arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path), "-n", "1e9"]
     process = subprocess.Popen(
         [sys.executable, "-m", "sb3_quad.cli", *arguments, "--eval-episodes", "0"],
@@ -210,15 +210,16 @@ def test_signals_save_the_model_and_say_where(tmp_path, number, code, settings_f
         stderr=subprocess.PIPE,
         text=True,
         cwd=Path(__file__).parent.parent,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     log = tmp_path / "dagger" / f"{ENV}_1" / "0.monitor.csv"
     end = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < end and (not log.is_file() or log.read_text().count("\n") < 20):
+    while process.poll() is None and time.monotonic() < end and (not log.is_file() or log.read_text().count("\n") < 10):
         time.sleep(0.05)
-    process.send_signal(number)
+    process.send_signal(signal.SIGINT)
     output, errors = process.communicate(timeout=60)
-    assert process.returncode == code, errors
-    assert signal.Signals(number).name in output
+    assert process.returncode == 130, errors
+    assert "SIGINT" in output
     assert "Traceback" not in errors
     saved = log.parent / f"{ENV}.zip"
     assert f"model saved to {saved}" in output
@@ -297,7 +298,8 @@ def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
 @pytest.mark.slow
 def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
     output = tmp_path / "benchmark.json"
-    assert main(["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training", "--output", str(output)]) == 0
+    arguments = ["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training"]
+    assert main([*arguments, "--output", str(output)]) == 0
     content = json.loads(output.read_text())
     assert {"processor", "cores", "versions", "threads"} <= content["machine"].keys()
     assert [entry["n_envs"] for entry in content["results"]] == [1, 2, 2, 64]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 
 import numpy as np
 import pytest
@@ -46,7 +47,8 @@ def test_pybullet_gives_the_same_flights(task):
 def test_rows_do_not_depend_on_their_number(seed, n):
     alone = fly(PIDExpert(), "state_recovery", 1, seed + n - 1, max_steps=150)
     among = fly(PIDExpert(), "state_recovery", n, seed, max_steps=150)
-    same(alone, Flights(**{k: v[-1:] if k != "time_to" else {t: x[-1:] for t, x in v.items()} for k, v in vars(among).items()}))
+    last = {name: values[-1:] for name, values in vars(among).items() if name != "time_to"}
+    same(alone, Flights(**last, time_to={tolerance: times[-1:] for tolerance, times in among.time_to.items()}))
 
 
 def test_figures_are_those_of_the_environment():
@@ -101,7 +103,7 @@ def test_the_conventions_give_the_specified_figures():
 def test_times_fall_with_the_tolerance():
     flights = fly(PIDExpert(), "target_tracking", 20, seed=5, max_steps=900)
     times = [np.nan_to_num(flights.time_to[tolerance], nan=np.inf) for tolerance in TOLERANCES]
-    assert all((tight >= loose).all() for tight, loose in zip(times, times[1:], strict=False))
+    assert all((tight >= loose).all() for tight, loose in itertools.pairwise(times))
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, TrainingError
 from sb3_quad.training.pipeline import load_pipeline, make_jobs, run_pipeline, with_settings
-from sb3_quad.training.trim import hover_offset, shift_position, trim
+from sb3_quad.training.trim import hover_offset, scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
 STAGES = [
@@ -102,5 +102,16 @@ def test_trimming_cancels_the_offset_of_a_trained_agent():
     model.learn(300_000)
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
-    sizes = trim(model)
-    assert sizes[-1] < 0.05
+    result = trim(model)
+    assert result.offset_before > 0.4 and result.offset_after < 0.05 and result.scale <= 1.0
+
+
+def test_scaling_the_position_is_seen_by_the_actor_as_a_longer_way():
+    env = QuadcopterVecEnv(16, noise=0.0, seed=1)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    observations = env.reset()
+    longer = observations.copy()
+    longer[:, :3] /= 0.8
+    expected = model.predict(longer, deterministic=True)[0]
+    scale_position(model, 0.8)
+    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, atol=1e-5)

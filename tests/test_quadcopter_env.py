@@ -255,7 +255,9 @@ def test_fixed_start(env: QuadcopterEnv) -> None:
     np.testing.assert_array_equal(state.position[0], [1, 2, 3])
     np.testing.assert_array_equal(state.quaternion[0], [0, -1, 0, 0])
     np.testing.assert_array_equal(state.body_rates[0], [4, 4, 4])
-    np.testing.assert_allclose(observation * env.observation_std, [0, 0, -1, 1, 0, 0, 0, -1, 0, 0, 0, -1, 2, -2, 0, 4, 4, 4], atol=1e-6)
+    np.testing.assert_allclose(
+        observation * env.observation_std, [0, 0, -1, 1, 0, 0, 0, -1, 0, 0, 0, -1, 2, -2, 0, 4, 4, 4], atol=1e-6
+    )
     assert info["distance"] == 1.0
 
 

@@ -55,7 +55,7 @@ def test_environment_ids_with_slashes_stay_in_their_folder(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match="cannot be written.*-f"):
+    with pytest.raises(ConfigError, match=r"cannot be written.*-f"):
         claim_run(tmp_path / "file", "dagger", ENV)
 
 

@@ -81,7 +81,9 @@ def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -
     low, high = vehicle.thrust_range
     assert (thrust >= low - 1e-9).all() and (thrust <= high + 1e-9).all()
     np.testing.assert_allclose(vehicle.thrust_to_action(thrust), action, atol=1e-9)
-    np.testing.assert_array_equal(vehicle.action_to_thrust(np.array([-7.0, 7.0])), vehicle.action_to_thrust(np.array([-1.0, 1.0])))
+    np.testing.assert_array_equal(
+        vehicle.action_to_thrust(np.array([-7.0, 7.0])), vehicle.action_to_thrust(np.array([-1.0, 1.0]))
+    )
 
 
 def test_zero_action_is_hover_for_the_default_vehicle() -> None:
@@ -166,7 +168,7 @@ def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message
 def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(content)
-    with pytest.raises(ConfigError, match="bad.yaml") as caught:
+    with pytest.raises(ConfigError, match=r"bad\.yaml") as caught:
         load_vehicle(path)
     assert "\n" not in str(caught.value)
 
@@ -182,7 +184,7 @@ def test_unreadable_files(tmp_path: Path) -> None:
 
 
 def test_unknown_name_gives_the_nearest() -> None:
-    with pytest.raises(ConfigError, match="'imt': did you mean 'itm'.*path of a .yaml"):
+    with pytest.raises(ConfigError, match=r"'imt': did you mean 'itm'.*path of a .yaml"):
         load_vehicle("imt")
 
 

@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.command is None:
             parser.print_help()
             return 0
-        return COMMANDS[options.command].run(options)
+        return int(COMMANDS[options.command].run(options))
     except SB3QuadError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

@@ -14,9 +14,7 @@ class Parser(argparse.ArgumentParser):
     """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(
-            **{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs}  # type: ignore[arg-type]
-        )
+        super().__init__(**{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs})
 
     def error(self, message: str) -> NoReturn:
         """:raises ConfigError: always."""

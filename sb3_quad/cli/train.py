@@ -169,9 +169,10 @@ def _compare(result: TrainingResult) -> Any:
     from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
 
     config = for_evaluation(result.job)
-    keywords = {key: config.env_kwargs[key] for key in ("vehicle", "noise", "task_kwargs") if key in config.env_kwargs}
-    if "max_episode_steps" in config.env_kwargs:
-        keywords["max_steps"] = config.env_kwargs["max_episode_steps"]
+    given = config.env_kwargs
+    keywords: dict[str, Any] = {key: given[key] for key in ("vehicle", "noise", "task_kwargs") if key in given}
+    if "max_episode_steps" in given:
+        keywords["max_steps"] = given["max_episode_steps"]
     expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
     columns = {
         name: summarise(fly(pilot, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords))

@@ -138,13 +138,20 @@ def load_commands(scratch, actions, queue, first, count):
 def load_scaling(scratch, mean, std, noise_level, first, count):
     """μ, 1/σ and the noise level of a block, in float32."""
     b = float32_rows(scratch)
-    last = noise_level.shape[0] - 1
-    for lane in range(LANES):
-        b[LEVEL, lane] = noise_level[min(first + min(lane, count - 1), last)]
-    for k in range(std.shape[0]):
+    if noise_level.shape[0] == 1:
         for lane in range(LANES):
-            i = min(first + min(lane, count - 1), last)
-            b[MEAN + k, lane] = mean[k, i]
-            b[INVERSE_STD + k, lane] = std[k, i]
+            b[LEVEL, lane] = noise_level[0]
+        for k in range(std.shape[0]):
+            for lane in range(LANES):
+                b[MEAN + k, lane] = mean[k, 0]
+                b[INVERSE_STD + k, lane] = std[k, 0]
+    else:
+        for lane in range(LANES):
+            i = first + min(lane, count - 1)
+            b[LEVEL, lane] = noise_level[i]
+            for k in range(std.shape[0]):
+                b[MEAN + k, lane] = mean[k, i]
+                b[INVERSE_STD + k, lane] = std[k, i]
+    for k in range(std.shape[0]):
         for lane in range(LANES):
             b[INVERSE_STD + k, lane] = np.float32(1.0) / b[INVERSE_STD + k, lane]

@@ -29,7 +29,7 @@ Finite = Annotated[float, AfterValidator(_finite)]
 Positive = Annotated[Finite, Field(gt=0)]
 PerRotor = tuple[tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite]]
 
-# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); one row of an array (n_parameters, n) each.
+# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
 PARAMETER_NAMES = (
     *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain", "gravity"),
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
@@ -85,7 +85,9 @@ class Vehicle(BaseModel):
         except np.linalg.LinAlgError:
             raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently") from None
         if not np.allclose(self.mixer[1:].sum(axis=1), 0.0, atol=1e-9):
-            raise ValueError("rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)")
+            raise ValueError(
+                "rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)"
+            )
         return self
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Vehicle:

@@ -101,9 +101,7 @@ class PyBulletFleet(Fleet):
 
         if n > MAX_CLIENTS:
             raise ConfigError(f"n_episodes {n}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts")
-        self._envs = [
-            QuadcopterEnv(task=task, task_kwargs=task_kwargs, vehicle=vehicle, noise=noise) for _ in range(n)
-        ]
+        self._envs = [QuadcopterEnv(task=task, task_kwargs=task_kwargs, vehicle=vehicle, noise=noise) for _ in range(n)]
         self.n = n
         self._seed = seed
         self.control_step = load_vehicle(vehicle).control_step

@@ -46,9 +46,7 @@ def rows(summary: Summary) -> dict[str, str]:
     return cells
 
 
-def comparison(
-    title: str, columns: Mapping[str, Summary], thesis: Mapping[str, Mapping[str, str]] | None = None
-) -> Table:
+def comparison(title: str, columns: Mapping[str, Summary], thesis: Mapping[str, Mapping[str, str]] | None = None) -> Table:
     """A table of pilots side by side.
 
     :param columns: from the name of each pilot to its figures.

@@ -27,7 +27,7 @@ from sb3_quad.ppo_bc.gradients import gradient_norms
 SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
 BC_LOSSES = ("nll", "mse")
 BC_FILTERS = ("none", "negative_advantage", "agreement")
-AGREEMENT = 0.5  # root mean squared difference of actions (half of the range is 1) up to which "agreement" clones
+AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
 
 
 class PPOBC(PPO):
@@ -47,8 +47,10 @@ class PPOBC(PPO):
         ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a mean over the action's
         dimensions; or ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone.
-    :param bc_filter: ``"negative_advantage"`` clones only where the flown action did worse than the critic expected;
-        ``"none"`` clones everywhere.
+    :param bc_filter: where to clone: ``"none"``, everywhere; ``"negative_advantage"``, where the flown action did worse than
+        the critic expected; ``"agreement"``, where expert and policy differ by less than 0.3 (root mean square over the
+        action): an expert for small angles, such as the PID, then holds the agent on its way to the target and has no say
+        where the agent has learnt to recover and the expert would crash.
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std`` are left out.
     :param max_clipped_value: the value loss of Eq. 3.8, the larger of the clipped and the unclipped error, where
         ``clip_range_vf`` is given; False for stock PPO's clipped error.

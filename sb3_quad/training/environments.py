@@ -60,9 +60,7 @@ def _separate(config: TrainingConfig, n_envs: int) -> VecEnv:
     return SubprocVecEnv(makers)
 
 
-def _make_one(
-    env_id: str, kwargs: dict[str, Any], wrappers: list[tuple[str, dict[str, Any]]]
-) -> gymnasium.Env[Any, Any]:
+def _make_one(env_id: str, kwargs: dict[str, Any], wrappers: list[tuple[str, dict[str, Any]]]) -> gymnasium.Env[Any, Any]:
     import gymnasium
     from stable_baselines3.common.monitor import Monitor
 

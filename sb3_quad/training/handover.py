@@ -23,7 +23,7 @@ def hand_over(path: str | Path, model: OnPolicyAlgorithm) -> None:
     """
     theirs = read_policy(path)
     ours = model.policy.state_dict()
-    for layer in ours:
+    for layer in sorted(ours, key=lambda name: name == "log_std"):  # the network's own layers say more
         if layer not in theirs:
             raise ConfigError(f"{path}: has no layer {layer}, which this {type(model).__name__} needs (policy_kwargs differ)")
         if theirs[layer].shape != ours[layer].shape:

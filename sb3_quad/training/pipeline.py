@@ -20,7 +20,7 @@ algo, env  as for a single run
 conf_file  settings file; ``<algo>.yml`` of the package without it
 settings   changes to these settings, such as ``n_timesteps: 5_000_000``
 pass_on    ``best`` (default): the best evaluation, by success, then by reward; or ``last``
-trim       cancel the agent's steady offset from the target (:mod:`sb3_quad.training.trim`) before passing it on
+trim       fold offset and scale of the position into the agent (:mod:`sb3_quad.training.trim`) before passing it on
 require    ``success_rate``, ``mean_reward``: what the best evaluation must reach, or the pipeline stops here
 eval_freq  transitions between evaluations, ``eval_episodes`` in each, for this stage
 =========  ================================================================================================
@@ -262,11 +262,14 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
 def _trimmed(agent: Path, job: TrainingJob, report: Callable[[str], None]) -> Path:
     """Trim the agent in a zip; the trimmed one lies beside it."""
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
-    keywords = {key: value for key, value in job.config.env_kwargs.items() if key not in ("task", "max_episode_steps")}
-    sizes = trim(model, job.seed + TRIM_SEED, **keywords)
+    kept = ("vehicle", "noise", "observation_std")
+    result = trim(model, job.seed + TRIM_SEED, **{key: job.config.env_kwargs[key] for key in kept if key in job.config.env_kwargs})
     trimmed = agent.with_name("trimmed_model.zip")
     save_model(model, trimmed)
-    report(f"trimmed: steady offset {sizes[0]:.3f} m, now {sizes[-1]:.3f} m: {trimmed}")
+    report(
+        f"trimmed: steady offset {result.offset_before:.3f} m, now {result.offset_after:.3f} m; position scale "
+        f"{result.scale:g}: {trimmed}"
+    )
     return trimmed
 
 

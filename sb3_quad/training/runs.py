@@ -126,7 +126,8 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
             except FileExistsError:
                 number += 1
     except OSError as error:
-        raise ConfigError(f"log folder {parent}: cannot be written ({error.strerror or error}); give another with -f") from None
+        reason = error.strerror or error
+        raise ConfigError(f"log folder {parent}: cannot be written ({reason}); give another with -f") from None
 
 
 def latest_run(parent: Path, name: str) -> int:

@@ -51,9 +51,7 @@ class TrainingResult:
     exit_code: int = 0
 
 
-def train(
-    job: TrainingJob, report: Report = print, started: Callable[[RunFolder], None] = lambda run: None
-) -> TrainingResult:
+def train(job: TrainingJob, report: Report = print, started: Callable[[RunFolder], None] = lambda run: None) -> TrainingResult:
     """Train as ``job`` says, in a run folder of its own.
 
     :param report: told of each event in one line.

@@ -59,7 +59,7 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]
     """
     if value is None or value == []:
         return []
-    found = []
+    found: list[tuple[str, dict[str, Any]]] = []
     for entry in value if isinstance(value, list) else [value]:
         if isinstance(entry, str):
             found.append((entry, {}))
@@ -99,6 +99,6 @@ def _kinds(parameter: inspect.Parameter) -> set[str]:
     annotation = parameter.annotation
     if annotation is inspect.Parameter.empty:
         return {"Any"}
-    text = annotation if isinstance(annotation, str) else annotation.__name__ if isinstance(annotation, type) else str(annotation)
+    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
     kinds = set(re.findall(r"\w+", text))
     return kinds | {"Schedule"} if kinds & {"Callable", "FloatSchedule"} else kinds

@@ -1,0 +1,110 @@
+"""The Gymnasium vector environment: the same flights, with Gymnasium's autoreset."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+import sb3_quad  # noqa: F401  (registers the environments)
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+
+
+def make(num_envs=8, **kwargs):
+    return gymnasium.make_vec("QuadTargetTracking-v0", num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+
+
+def test_it_is_made_by_gymnasium():
+    env = make(3, noise=0.0)
+    assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
+    assert env.unwrapped.batch.max_episode_steps == env.spec.max_episode_steps == 1500
+    observations, infos = env.reset(seed=1)
+    assert observations in env.observation_space and infos == {}
+    assert env.observation_space.shape == (3, 18) and env.action_space.shape == (3, 4)
+    observations, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
+    assert observations in env.observation_space and rewards.shape == terminated.shape == truncated.shape == (3,)
+    assert infos == {}
+    env.close()
+    recovery = gymnasium.make_vec("QuadStateRecovery-v0", num_envs=2, vectorization_mode="vector_entry_point")
+    recovery.reset(seed=0)
+    assert recovery.unwrapped.true_state().velocity.any()
+
+
+def test_flights_are_those_of_the_other_environments():
+    env, batch = make(4), QuadcopterVecEnv(4, seed=9, max_episode_steps=1500)
+    single = gymnasium.make("QuadTargetTracking-v0")
+    first, expected = env.reset(seed=9)[0], batch.reset()
+    np.testing.assert_array_equal(first, expected)
+    np.testing.assert_allclose(single.reset(seed=11)[0], first[2], atol=1e-6)
+    actions = np.random.default_rng(0).uniform(-1, 1, (300, 4, 4)).astype(np.float32)
+    for action in actions:
+        observations, rewards, terminated, truncated, infos = env.step(action)
+        expected, expected_rewards, dones, batch_infos = batch.step(action)
+        np.testing.assert_array_equal(observations, expected)
+        np.testing.assert_array_equal(rewards, expected_rewards)
+        np.testing.assert_array_equal(terminated | truncated, dones)
+        for row in np.flatnonzero(dones):
+            np.testing.assert_array_equal(infos["final_obs"][row], batch_infos[row]["terminal_observation"])
+            for key in ("is_success", "distance", "collision", "out_of_range"):
+                assert infos["final_info"][key][row] == batch_infos[row][key]
+                assert infos["final_info"]["_" + key].tolist() == dones.tolist()
+    single.close()
+
+
+def test_truncation():
+    env = make(5, max_episode_steps=3)
+    env.reset(seed=0)
+    env.unwrapped.batch.set_target((100.0, 0.0, 15.0), [2])
+    _, _, terminated, truncated, infos = env.step(np.zeros((5, 4)))
+    assert terminated.tolist() == [False, False, True, False, False] and not truncated.any()
+    assert infos["_final_obs"].tolist() == terminated.tolist()
+    assert infos["final_info"]["out_of_range"].tolist() == terminated.tolist()
+    env.step(np.zeros((5, 4)))
+    _, _, terminated, truncated, infos = env.step(np.zeros((5, 4)))
+    assert truncated.tolist() == [True, True, False, True, True] and not terminated.any()
+    assert infos["final_info"]["is_success"].tolist() == truncated.tolist()
+
+
+def test_seeds_and_masks():
+    env = make(3, noise=0.0)
+    first, _ = env.reset(seed=5)
+    second, _ = env.reset()
+    assert not np.allclose(first, second)
+    np.testing.assert_array_equal(env.reset(seed=[5, 6, 7])[0], first)
+    env.step(np.ones((3, 4)))
+    mask = np.array([False, True, False])
+    partial, _ = env.reset(options={"reset_mask": mask})
+    np.testing.assert_array_equal(partial[1], second[1])
+    assert not np.allclose(partial[0], second[0])
+    np.testing.assert_array_equal(env.reset(seed=[None, 6, None], options={"reset_mask": mask})[0][1], first[1])
+
+
+def test_gymnasiums_wrappers_work_on_it():
+    env = RecordEpisodeStatistics(make(4, max_episode_steps=10))
+    env.reset(seed=0)
+    for _ in range(10):
+        *_, truncated, infos = env.step(np.zeros((4, 4)))
+    assert truncated.all() and "episode" in infos or "episode" in infos["final_info"]
+
+
+@pytest.mark.parametrize(
+    ("call", "says"),
+    [
+        (lambda env: env.reset(seed=[1, 2]), "2 numbers for 3"),
+        (lambda env: env.reset(options={"target": (0, 0, 1)}), "reset option 'target'"),
+        (lambda env: env.reset(options={"reset_mask": np.ones(2, dtype=bool)}), "reset_mask"),
+    ],
+)
+def test_bad_resets_are_refused(call, says):
+    with pytest.raises(ConfigError, match=says):
+        call(make(3))
+
+
+def test_bad_arguments_are_refused():
+    with pytest.raises(ConfigError, match="n_envs 0"):
+        make(0)
+    with pytest.raises(ConfigError, match="render_mode"):
+        make(2, render_mode="human")

@@ -1,0 +1,293 @@
+"""Tasks, observations and random numbers: what the compiled array functions must be, worked out again in numpy."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sb3_quad.dynamics.state import QUATERNION, ROTOR_SPEEDS, STATE_SIZE, QuadcopterState
+from sb3_quad.dynamics.streams import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE, observe
+from sb3_quad.envs.tasks import TASK_PARAMETERS, TASKS, Task, reset_rows, resolve_tasks, score
+from sb3_quad.errors import ConfigError
+
+ITM = load_vehicle("itm")
+
+
+def start(n, task, seed=0, delay=1, **task_kwargs):
+    """All arrays of n rows at the start of their first episode."""
+    tasks = resolve_tasks(task, task_kwargs)
+    rows = SimpleNamespace(
+        n=n,
+        tasks=tasks,
+        state=np.zeros((STATE_SIZE, n)),
+        queue=np.zeros((delay, 4, n)),
+        streams=new_streams(np.arange(seed, seed + n, dtype=np.uint64)),
+        task_index=np.zeros(n, dtype=np.int64),
+        vehicles=np.repeat(ITM.parameters()[:, None], n, axis=1),
+    )
+    again(rows, np.arange(n))
+    return rows
+
+
+def again(rows, which):
+    tasks = rows.tasks
+    reset_rows(
+        which, rows.state, rows.queue, rows.streams, rows.task_index, rows.vehicles, tasks.parameters, tasks.weights
+    )
+
+
+def observations(rows, noise):
+    mean, std = (np.repeat(values[:, None], rows.n, axis=1) for values in (DEFAULT_MEAN, DEFAULT_STD))
+    out = np.empty((rows.n, OBSERVATION_SIZE), dtype=np.float32)
+    observe(rows.state, rows.streams, mean, std, np.full(rows.n, noise), out)
+    return out
+
+
+def scores(rows):
+    result = SimpleNamespace(
+        reward=np.zeros(rows.n),
+        collided=np.zeros(rows.n, dtype=np.bool_),
+        out_of_range=np.zeros(rows.n, dtype=np.bool_),
+        distance=np.zeros(rows.n),
+    )
+    score(
+        rows.state,
+        rows.vehicles,
+        rows.task_index,
+        rows.tasks.parameters,
+        result.reward,
+        result.collided,
+        result.out_of_range,
+        result.distance,
+    )
+    return result
+
+
+# --- random numbers
+
+
+@pytest.mark.parametrize(
+    ("word", "expected"),
+    [
+        (0x00000000, (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+        (0xFFFFFFFF, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    ],
+)
+def test_philox_gives_the_published_numbers(word, expected):
+    assert philox(*[np.uint32(word)] * 6) == expected
+
+
+def test_streams_hold_key_episode_and_step():
+    streams = new_streams(np.array([1 + (2 << 32), 2**64 - 1], dtype=np.uint64))
+    assert streams[KEY_LO].tolist() == [1, 2**32 - 1] and streams[KEY_HI].tolist() == [2, 2**32 - 1]
+    assert not streams[[EPISODE, STEP]].any()
+    assert stream_key(np.random.default_rng(0)) == stream_key(np.random.default_rng(0)) < 2**64
+
+
+def noise_of(n, steps, task="state_recovery"):
+    """Standard normals as they come out of observations, (steps, n, 15)."""
+    rows = start(n, task)
+    clean = observations(rows, 0.0)[:, 3:].astype(np.float64)  # the first three are zero in state recovery
+    normals = []
+    for _ in range(steps):
+        rows.streams[STEP] += 1
+        normals.append(observations(rows, 1.0)[:, 3:] / clean - 1.0)
+    return np.array(normals)
+
+
+def test_noise_is_standard_normal_and_independent():
+    normals = noise_of(500, 400)
+    flat = normals.ravel()
+    count = flat.size  # 3,000,000: five standard errors below
+    assert abs(flat.mean()) < 5 / math.sqrt(count)
+    assert abs(flat.std() - 1.0) < 5 / math.sqrt(2 * count)
+    assert abs((flat**3).mean()) < 5 * math.sqrt(15 / count)
+    assert abs((flat**4).mean() - 3.0) < 5 * math.sqrt(96 / count)
+    assert 4.5 < np.abs(flat).max() < 6.6
+    quantiles = {0.5: 0.0, 0.8413447: 1.0, 0.9772499: 2.0, 0.9986501: 3.0}
+    for probability, expected in quantiles.items():
+        assert np.quantile(flat, probability) == pytest.approx(expected, abs=0.02)
+    by_feature = np.corrcoef(normals.reshape(-1, 15).T)
+    by_row = np.corrcoef(normals.transpose(1, 0, 2).reshape(500, -1))
+    by_step = np.corrcoef(normals.reshape(400, -1))
+    for correlations, samples in ((by_feature, 200_000), (by_row, 6_000), (by_step, 7_500)):
+        assert np.abs(correlations - np.eye(len(correlations))).max() < 6 / math.sqrt(samples)
+
+
+def test_noise_belongs_to_key_episode_and_step():
+    rows = start(3, "state_recovery")
+    first = observations(rows, 0.05)
+    np.testing.assert_array_equal(observations(rows, 0.05), first)
+    rows.streams[STEP, 1] += 1
+    second = observations(rows, 0.05)
+    assert (first[1, 3:] != second[1, 3:]).all()
+    np.testing.assert_array_equal(first[[0, 2]], second[[0, 2]])
+
+
+# --- observation
+
+
+def test_features_in_their_order():
+    rows = start(200, "state_recovery", seed=5)
+    rows.state[17:20] += np.random.default_rng(0).normal(size=(3, 200))
+    state = QuadcopterState(rows.state)
+    body_to_world = state.rotation
+    expected = np.concatenate(
+        [
+            state.position - state.target,
+            body_to_world.transpose(0, 2, 1).reshape(-1, 9),
+            np.einsum("nji,nj->ni", body_to_world, state.velocity),
+            state.body_rates,
+        ],
+        axis=1,
+    )
+    np.testing.assert_allclose(observations(rows, 0.0), expected / DEFAULT_STD, atol=1e-6)
+    assert len(FEATURE_NAMES) == OBSERVATION_SIZE == 18
+
+
+def test_noise_is_relative_to_the_feature():
+    rows = start(1000, "state_recovery")
+    clean, noisy = observations(rows, 0.0), observations(rows, 0.05)
+    relative = (noisy - clean)[:, 3:] / clean[:, 3:]
+    assert relative.std() == pytest.approx(0.05, rel=0.03)
+    np.testing.assert_array_equal(noisy[:, :3], 0.0)
+
+
+# --- starts
+
+
+def test_target_tracking_starts():
+    rows = start(20_000, "target_tracking")
+    state = QuadcopterState(rows.state)
+    np.testing.assert_array_equal(state.position, np.tile([0.0, 0.0, 15.0], (20_000, 1)))
+    np.testing.assert_array_equal(state.quaternion, np.tile([1.0, 0, 0, 0], (20_000, 1)))
+    assert not state.velocity.any() and not state.body_rates.any()
+    np.testing.assert_allclose(rows.state[ROTOR_SPEEDS], ITM.hover_rotor_speed)
+    np.testing.assert_allclose(rows.queue, ITM.hover_rotor_speed)
+    direction = (state.target - state.position) / 10.0
+    np.testing.assert_allclose(np.linalg.norm(direction, axis=1), 1.0)
+    np.testing.assert_allclose(direction.mean(axis=0), 0.0, atol=5 * math.sqrt(1 / 3 / 20_000))
+    np.testing.assert_allclose(direction.T @ direction / 20_000, np.eye(3) / 3, atol=0.015)
+
+
+def test_state_recovery_starts():
+    rows = start(20_000, "state_recovery")
+    state = QuadcopterState(rows.state)
+    np.testing.assert_array_equal(state.target, state.position)
+    np.testing.assert_allclose(np.linalg.norm(rows.state[QUATERNION], axis=0), 1.0)
+    rotation = state.rotation
+    np.testing.assert_allclose(rotation.mean(axis=0), 0.0, atol=5 * math.sqrt(1 / 3 / 20_000))
+    angle = np.arccos(np.clip((np.trace(rotation, axis1=1, axis2=2) - 1) / 2, -1, 1))
+    for theta in (0.5, 1.0, 2.0, 3.0):  # uniform on SO(3): P(angle < θ) = (θ - sin θ) / π
+        assert (angle < theta).mean() == pytest.approx((theta - math.sin(theta)) / math.pi, abs=0.02)
+    for values, std in ((state.velocity, 2.0), (state.body_rates, 4.0)):
+        np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=5 * std / math.sqrt(20_000))
+        np.testing.assert_allclose(values.std(axis=0), std, rtol=5 / math.sqrt(2 * 20_000))
+    together = np.corrcoef(np.concatenate([rows.state[QUATERNION], rows.state[7:13]]))
+    assert np.abs(together - np.eye(10)).max() < 0.04
+
+
+@pytest.mark.parametrize("distance", [15.0, 20.0, 40.0])
+def test_targets_are_never_below_ground(distance):
+    rows = start(5_000, "target_tracking", target_distance=distance, max_distance=60.0)
+    state = QuadcopterState(rows.state)
+    np.testing.assert_allclose(state.distance, distance)
+    height = state.target[:, 2]
+    assert height.min() >= ITM.collision_radius - 1e-9
+    upper = 15.0 + distance
+    assert height.mean() == pytest.approx((max(15.0 - distance, ITM.collision_radius) + upper) / 2, rel=0.03)
+
+
+def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():
+    rows = start(5, "state_recovery")
+    before, streams = rows.state.copy(), rows.streams.copy()
+    rows.streams[STEP] = 9
+    again(rows, np.array([1, 3]))
+    np.testing.assert_array_equal(rows.state[:, [0, 2, 4]], before[:, [0, 2, 4]])
+    assert (rows.state[3:13, [1, 3]] != before[3:13, [1, 3]]).all()
+    assert rows.streams[EPISODE].tolist() == [1, 2, 1, 2, 1] and rows.streams[STEP].tolist() == [9, 0, 9, 0, 9]
+    np.testing.assert_array_equal(rows.streams[:2], streams[:2])
+
+
+def test_a_mixture_draws_tasks_by_their_weights():
+    rows = start(20_000, {"target_tracking": 3.0, "state_recovery": 1.0})
+    recovery = rows.task_index == 1
+    assert recovery.mean() == pytest.approx(0.25, abs=0.02)
+    state = QuadcopterState(rows.state)
+    np.testing.assert_allclose(state.distance, np.where(recovery, 0.0, 10.0))
+    assert (np.linalg.norm(state.velocity, axis=1) > 0).tolist() == recovery.tolist()
+    never = start(1000, {"target_tracking": 0.0, "state_recovery": 1.0})
+    assert (never.task_index == 1).all()
+
+
+# --- reward and ends
+
+
+def test_reward_and_ends_of_each_task():
+    rows = start(300, {"target_tracking": 1.0, "state_recovery": 1.0})
+    rng = np.random.default_rng(0)
+    rows.state[:3] += rng.normal(size=(3, 300)) * 12
+    rows.tasks.parameters[1, TASK_PARAMETERS.index("tilt_cost")] = 0.5
+    got, state = scores(rows), QuadcopterState(rows.state)
+    tilt_cost = np.where(rows.task_index == 1, 0.5, 0.002)
+    collided, away = state.position[:, 2] <= 0.135, state.distance > 30.0
+    assert 3 < collided.sum() < 100 and 3 < away.sum() < 100
+    expected = -0.003 * state.distance - tilt_cost * np.arccos(np.clip(state.rotation[:, 2, 2], -1, 1))
+    expected -= 0.0005 * np.linalg.norm(state.body_rates, axis=1) + 15.0 * collided + 15.0 * away
+    np.testing.assert_allclose(got.reward, expected, atol=1e-12)
+    np.testing.assert_allclose(got.distance, state.distance)
+    np.testing.assert_array_equal(got.collided, collided)
+    np.testing.assert_array_equal(got.out_of_range, away)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.7, math.pi / 2, 2.5, math.pi - 1e-6, math.pi])
+def test_tilt_is_exact_at_every_angle(angle):
+    rows = start(1, "target_tracking", tilt_cost=1.0, position_cost=0.0, body_rates_cost=0.0)
+    rows.state[QUATERNION, 0] = math.cos(angle / 2), 0.6 * math.sin(angle / 2), 0.8 * math.sin(angle / 2), 0.0
+    assert scores(rows).reward[0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
+
+
+# --- tasks as data
+
+
+def test_tasks_of_the_thesis():
+    tracking, recovery = TASKS["target_tracking"], TASKS["state_recovery"]
+    assert tracking.target_distance == 10.0 and not tracking.random_attitude
+    assert recovery.target_distance == 0.0 and recovery.random_attitude
+    assert (recovery.velocity_std, recovery.body_rates_std) == (2.0, 4.0)
+    assert len(tracking.parameters()) == len(TASK_PARAMETERS)
+
+
+def test_task_specifications():
+    own = Task(name="own", target_distance=3.0)
+    assert resolve_tasks(own).tasks == (own,)
+    table = resolve_tasks({"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50})
+    assert table.weights.tolist() == [0.25, 1.0]
+    assert [task.max_distance for task in table.tasks] == [50.0, 50.0]
+    assert table.parameters.shape == (2, len(TASK_PARAMETERS))
+
+
+@pytest.mark.parametrize(
+    ("task", "kwargs", "says"),
+    [
+        ("hover", {}, "unknown task 'hover'"),
+        ({}, {}, "names no task"),
+        ({"target_tracking": -1.0}, {}, "weights"),
+        ({"target_tracking": "much"}, {}, "weights"),
+        ({"target_tracking": 0.0}, {}, "weights"),
+        ("target_tracking", {"target_distanc": 1}, "did you mean 'target_distance'"),
+        ("target_tracking", {"target_distance": -1}, "target_distance"),
+        ("target_tracking", {"velocity_std": float("nan")}, "finite"),
+        ("target_tracking", {"max_distance": 0}, "max_distance"),
+        ("target_tracking", {"start_position": (0, 0, -1)}, "above the ground"),
+        (3, {}, "unknown task '3'"),
+    ],
+)
+def test_bad_tasks_are_refused(task, kwargs, says):
+    with pytest.raises(ConfigError, match=says):
+        resolve_tasks(task, kwargs)
