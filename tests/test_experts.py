@@ -65,9 +65,7 @@ def test_pid_recovery_figure():
     assert 100 * flights.success.mean() == pytest.approx(31.9, abs=2.0)
 
 
-@pytest.mark.parametrize(
-    ("sign", "times", "length"), [(1, (7.23, 6.45, 4.54), 10.19), (-1, (8.18, 7.26, 5.31), 11.05)]
-)
+@pytest.mark.parametrize(("sign", "times", "length"), [(1, (7.23, 6.45, 4.54), 10.19), (-1, (8.18, 7.26, 5.31), 11.05)])
 def test_pid_fixed_targets(sign, times, length):
     distances, path, _ = fly_one(PIDExpert(), TO_R0 + sign * 10 / np.sqrt(3))
     for tolerance, seconds in zip((0.1, 0.2, 1.0), times, strict=True):

@@ -32,7 +32,9 @@ def run_stages(
 
     for flag, given in (("-n", options.n_timesteps), ("-i", options.trained_agent)):
         if given is not None:
-            raise ConfigError(f"{flag} goes with a single run (--algo, --env); a pipeline's stages have their own in {conf_file}")
+            raise ConfigError(
+                f"{flag} goes with a single run (--algo, --env); a pipeline's stages have their own in {conf_file}"
+            )
     pipeline = with_settings(load_pipeline(conf_file), overrides)
     jobs = make_jobs(pipeline, job)
     start = time.perf_counter()
@@ -40,9 +42,7 @@ def run_stages(
     return finish(result, options.reference, time.perf_counter() - start, jobs[0], say)
 
 
-def finish(
-    result: PipelineResult, reference: bool, seconds: float, first: TrainingJob, say: Callable[[str], None]
-) -> int:
+def finish(result: PipelineResult, reference: bool, seconds: float, first: TrainingJob, say: Callable[[str], None]) -> int:
     """Train the reference agent if it is wanted, and print both tasks' tables."""
     if result.exit_code != 0:
         return result.exit_code

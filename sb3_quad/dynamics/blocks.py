@@ -65,16 +65,22 @@ def load_state(scratch, state, first, count):
 def store_state(scratch, state, first, count):
     """Back to the array of all rows; the target stays as it is."""
     b = float64_rows(scratch)
-    for k in range(TX):
+    rows = state.shape[0] - 3  # not a constant: that would have the compiler write out every row
+    if count == LANES:
+        for k in range(rows):
+            for lane in range(LANES):
+                state[k, first + lane] = b[k, lane]
+    else:
         for lane in range(count):
-            state[k, first + lane] = b[k, lane]
+            for k in range(rows):
+                state[k, first + lane] = b[k, lane]
 
 
 @compiled
 def load_streams(scratch, streams, first, count):
     """The keys and counters of a block."""
     w = uint32_rows(scratch)
-    for k in range(4):
+    for k in range(streams.shape[0]):
         for lane in range(LANES):
             w[KEY_ROW + k, lane] = streams[k, first + min(lane, count - 1)]
 
@@ -116,42 +122,38 @@ def command_rotors(scratch):
 def load_commands(scratch, actions, queue, first, count):
     """Actions into the delay's end, and what leaves it into the rows of wanted rotor speeds."""
     b = float64_rows(scratch)
+    delay, rotors = queue.shape[0], queue.shape[1]
     for lane in range(LANES):
         i = first + min(lane, count - 1)
-        for k in range(4):
+        for k in range(rotors):
             b[COMMAND + k, lane] = actions[i, k]
     command_rotors(scratch)
-    delay = queue.shape[0]
-    for lane in range(LANES):
-        i = first + min(lane, count - 1)
-        for k in range(4):
-            b[WANTED + k, lane] = queue[0, k, i] if delay > 0 else b[COMMAND + k, lane]
-    if delay > 0:
+    if delay == 0:
+        for k in range(rotors):
+            for lane in range(LANES):
+                b[WANTED + k, lane] = b[COMMAND + k, lane]
+        return
+    for k in range(rotors):
+        for lane in range(LANES):
+            b[WANTED + k, lane] = queue[0, k, first + min(lane, count - 1)]
+        for late in range(delay - 1):
+            for lane in range(count):
+                queue[late, k, first + lane] = queue[late + 1, k, first + lane]
         for lane in range(count):
-            for k in range(4):
-                for late in range(delay - 1):
-                    queue[late, k, first + lane] = queue[late + 1, k, first + lane]
-                queue[delay - 1, k, first + lane] = b[COMMAND + k, lane]
+            queue[delay - 1, k, first + lane] = b[COMMAND + k, lane]
 
 
 @compiled
 def load_scaling(scratch, mean, std, noise_level, first, count):
     """μ, 1/σ and the noise level of a block, in float32."""
     b = float32_rows(scratch)
-    if noise_level.shape[0] == 1:
-        for lane in range(LANES):
-            b[LEVEL, lane] = noise_level[0]
+    step = 0 if noise_level.shape[0] == 1 else 1
+    for lane in range(LANES):
+        i = step * (first + min(lane, count - 1))
+        b[LEVEL, lane] = noise_level[i]
         for k in range(std.shape[0]):
-            for lane in range(LANES):
-                b[MEAN + k, lane] = mean[k, 0]
-                b[INVERSE_STD + k, lane] = std[k, 0]
-    else:
-        for lane in range(LANES):
-            i = first + min(lane, count - 1)
-            b[LEVEL, lane] = noise_level[i]
-            for k in range(std.shape[0]):
-                b[MEAN + k, lane] = mean[k, i]
-                b[INVERSE_STD + k, lane] = std[k, i]
+            b[MEAN + k, lane] = mean[k, i]
+            b[INVERSE_STD + k, lane] = std[k, i]
     for k in range(std.shape[0]):
         for lane in range(LANES):
             b[INVERSE_STD + k, lane] = np.float32(1.0) / b[INVERSE_STD + k, lane]

@@ -56,9 +56,7 @@ def read_curve(run: str | Path) -> Curve:
         raise ConfigError(f"{path}: cannot be read ({error})") from None
 
 
-def plot_curves(
-    groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple[float, float]], title: str = ""
-) -> Figure:
+def plot_curves(groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple[float, float]], title: str = "") -> Figure:
     """Four panels: success and reward, each over transitions and over wall-clock time.
 
     :param groups: from the name of an agent to the curves of its seeds; the mean is drawn, with the seeds' range around it.
@@ -95,5 +93,7 @@ def _draw(
     ends = [getattr(curve, axis)[-1] for curve in curves]
     grid = np.linspace(max(getattr(curve, axis)[0] for curve in curves), min(ends), 200)
     rows = np.stack([np.interp(grid, getattr(curve, axis), getattr(curve, value)) for curve in curves]) * factor
-    panel.plot(grid / scale, rows.mean(axis=0), color=color, label=f"{label} ({len(curves)} seeds)" if len(curves) > 1 else label)
+    panel.plot(
+        grid / scale, rows.mean(axis=0), color=color, label=f"{label} ({len(curves)} seeds)" if len(curves) > 1 else label
+    )
     panel.fill_between(grid / scale, rows.min(axis=0), rows.max(axis=0), color=color, alpha=0.2, linewidth=0)

@@ -121,6 +121,8 @@ def _geometric(x, gains, body, mixer_inverse, thrust_range, actions):  # type: i
             largest = max(largest, abs(difference[k]))
             least, most = min(least, difference[k]), max(most, difference[k])
         scale = half / largest if largest > half else 1.0  # the moments come first: all differences by one factor ...
-        common = min(high - scale * most, max(low - scale * least, min(high, max(low, common))))  # ... then the thrust gives way
+        common = min(
+            high - scale * most, max(low - scale * least, min(high, max(low, common)))
+        )  # ... then the thrust gives way
         for k in range(4):
             actions[i, k] = min(1.0, max(-1.0, (common + scale * difference[k] - middle) / half))

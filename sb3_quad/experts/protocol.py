@@ -10,8 +10,8 @@ import numpy.typing as npt
 from sb3_quad.dynamics.rotation import nearest_rotation, quaternion_from_rotation
 from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
 from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.errors import ExpertError
 from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD
+from sb3_quad.errors import ExpertError
 
 Actions = npt.NDArray[np.float32]
 

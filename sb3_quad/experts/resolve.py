@@ -17,8 +17,8 @@ EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.exper
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm") -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where ``factory(vehicle)``
-        returns an expert; or an expert itself, returned as it is.
+    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where
+        ``factory(vehicle)`` returns an expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for.
     :raises ConfigError: an unknown name, a missing or unreadable file.
     :raises ExpertError: a factory that fails.

@@ -18,7 +18,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
 from sb3_quad.common.labels import ExpertLabeller
-from sb3_quad.common.losses import gaussian_nll, l2_loss, value_loss as max_clipped_value_loss
+from sb3_quad.common.losses import gaussian_nll, l2_loss
+from sb3_quad.common.losses import value_loss as max_clipped_value_loss
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
 from sb3_quad.ppo_bc.forward import evaluate
@@ -167,7 +168,9 @@ class PPOBC(PPO):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self.expert is None and any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0)):  # type: ignore[arg-type]
-            raise ExpertError("PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0")
+            raise ExpertError(
+                "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
+            )
         result = super()._setup_learn(*args, **kwargs)
         if self.expert is not None:
             assert self.env is not None

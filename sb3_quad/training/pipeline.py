@@ -38,8 +38,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sb3_quad.errors import ConfigError, TrainingError, unknown
-from sb3_quad.training.config import load_config, read_settings
 from sb3_quad.training.algorithms import get_algorithm
+from sb3_quad.training.config import load_config, read_settings
 from sb3_quad.training.files import save_model, write_text
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
@@ -253,8 +253,8 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
         success, reward = max(scores) if stage.pass_on == "best" else scores[-1]
         if success < stage.require.success_rate or reward < stage.require.mean_reward:
             raise TrainingError(
-                f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires (success_rate "
-                f"{stage.require.success_rate:g}, mean_reward {stage.require.mean_reward:g}); its run is {run.path}"
+                f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires "
+                f"(success_rate {stage.require.success_rate:g}, mean_reward {stage.require.mean_reward:g}); its run is {run.path}"
             )
     return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
 
@@ -263,7 +263,9 @@ def _trimmed(agent: Path, job: TrainingJob, report: Callable[[str], None]) -> Pa
     """Trim the agent in a zip; the trimmed one lies beside it."""
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
     kept = ("vehicle", "noise", "observation_std")
-    result = trim(model, job.seed + TRIM_SEED, **{key: job.config.env_kwargs[key] for key in kept if key in job.config.env_kwargs})
+    result = trim(
+        model, job.seed + TRIM_SEED, **{key: job.config.env_kwargs[key] for key in kept if key in job.config.env_kwargs}
+    )
     trimmed = agent.with_name("trimmed_model.zip")
     save_model(model, trimmed)
     report(

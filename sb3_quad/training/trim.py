@@ -98,7 +98,9 @@ def hover_offset(
         flying &= ~dones
     state = env.true_state()
     if flying.mean() < 0.5:
-        raise ConfigError(f"the agent cannot be trimmed: {100 * (1 - flying.mean()):.0f} % of its flights to targets end early")
+        raise ConfigError(
+            f"the agent cannot be trimmed: {100 * (1 - flying.mean()):.0f} % of its flights to targets end early"
+        )
     return np.asarray((state.position - state.target)[flying].mean(axis=0))
 
 
