@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -19,7 +19,7 @@ from sb3_quad.envs.threads import available_cpus, compilation_notice, run
 from sb3_quad.errors import ConfigError
 
 FloatArray = npt.NDArray[np.float64]
-Rows: TypeAlias = "None | int | slice | Sequence[int] | npt.NDArray[Any]"
+Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 
 
 class QuadcopterBatch:
@@ -52,11 +52,12 @@ class QuadcopterBatch:
     ) -> None:
         n = self.n = _whole_number("n_envs", n_envs)
         self.max_episode_steps = _whole_number("max_episode_steps", max_episode_steps)
-        self.vehicle_list = _vehicles(vehicle, n)
+        one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
+        self.vehicle_list = _vehicles(vehicle if one_each else [vehicle] * n, n)
         first = self.vehicle_list[0]
         self.substeps = first.substeps
-        parameters = [each.parameters() for each in self.vehicle_list]
-        self.vehicles = np.stack(parameters if isinstance(vehicle, Sequence) and not isinstance(vehicle, str) else parameters[:1], 1)
+        columns = self.vehicle_list if one_each else self.vehicle_list[:1]
+        self.vehicles = np.stack([each.parameters() for each in columns], axis=1)
         self.threads = available_cpus() if n_threads is None else _whole_number("n_threads", n_threads)
         self.physics_step = np.array([first.physics_step])
         self.state = np.zeros((STATE_SIZE, n))
@@ -138,8 +139,10 @@ class QuadcopterBatch:
     def rows(self, rows: Rows) -> npt.NDArray[np.int64]:
         """Row numbers from None (all), a number, a slice or a sequence."""
         everything = np.arange(self.n, dtype=np.int64)
+        if rows is None:
+            return everything
         try:
-            return everything if rows is None else np.atleast_1d(everything[rows])
+            return np.atleast_1d(everything[rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)])
         except (IndexError, TypeError):
             raise ConfigError(f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}") from None
 
@@ -243,13 +246,11 @@ def _whole_number(name: str, value: Any) -> int:
     return int(value)
 
 
-def _vehicles(vehicle: Any, n: int) -> list[Vehicle]:
-    if isinstance(vehicle, Sequence) and not isinstance(vehicle, str):
-        if len(vehicle) != n:
-            raise ConfigError(f"vehicle: {len(vehicle)} vehicles for {n} environments; give one, or one for each")
-        vehicles = [load_vehicle(each) for each in vehicle]
-    else:
-        vehicles = [load_vehicle(vehicle)] * n
+def _vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
+    if len(given) != n:
+        raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give one, or one for each")
+    loaded = {id(each): load_vehicle(each) for each in given}
+    vehicles = [loaded[id(each)] for each in given]
     first = vehicles[0]
     for row, each in enumerate(vehicles):
         if (each.delay, each.physics_step, each.substeps) != (first.delay, first.physics_step, first.substeps):

@@ -29,8 +29,6 @@ from sb3_quad.dynamics.blocks import (
     TY,
     TZ,
     VX,
-    VY,
-    VZ,
     WX,
     WY,
     WZ,

@@ -93,9 +93,7 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
             self.batch.seed([seeds[row] for row in seeded], seeded)
         return self.batch.reset(mask), {}
 
-    def step(
-        self, actions: npt.NDArray[Any]
-    ) -> tuple[Observations, npt.NDArray[Any], BoolArray, BoolArray, dict[str, Any]]:
+    def step(self, actions: npt.NDArray[Any]) -> tuple[Observations, npt.NDArray[Any], BoolArray, BoolArray, dict[str, Any]]:
         """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos."""
         batch = self.batch
         observations, rewards, done = batch.step(actions)
@@ -105,13 +103,13 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
             final = np.full(self.num_envs, None, dtype=object)
             for row in np.flatnonzero(done):
                 final[row] = batch.final_observation[row].copy()
-            columns = {
-                "is_success": truncated,
+            info: dict[str, Any] = {
+                "is_success": truncated.copy(),
                 "distance": np.where(done, batch.distance, 0.0),
                 "collision": done & batch.collided,
                 "out_of_range": done & batch.out_of_range,
             }
-            info = {name: column for key, value in columns.items() for name, column in ((key, value), (f"_{key}", done.copy()))}
+            info |= {f"_{key}": done.copy() for key in info}
             infos = {"final_obs": final, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}
         return observations, rewards, done & ~truncated, truncated, infos
 

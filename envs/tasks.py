@@ -121,5 +121,8 @@ def _resolve(entry: Any, overrides: dict[str, Any]) -> Task:
     try:
         return Task.model_validate({**task.model_dump(), **overrides})
     except ValidationError as error:
-        problems = (f"{'.'.join(map(str, item['loc']))}: {item['msg'].removeprefix('Value error, ')}" for item in error.errors())
-        raise ConfigError(f"task_kwargs: {'; '.join(problems)}") from None
+        raise ConfigError(f"task_kwargs: {'; '.join(_explain(item) for item in error.errors())}") from None
+
+
+def _explain(item: Any) -> str:
+    return f"{'.'.join(map(str, item['loc']))}: {item['msg'].removeprefix('Value error, ')}"

@@ -20,7 +20,7 @@ from sb3_quad.envs.tasks import TaskSpec
 from sb3_quad.errors import ConfigError
 
 _SETTERS = ("target", "noise", "observation_mean", "observation_std", "max_episode_steps")
-_METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling")
+_METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
 
 
 class QuadcopterVecEnv(VecEnv):
@@ -184,7 +184,9 @@ class QuadcopterVecEnv(VecEnv):
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: VecEnvIndices = None) -> None:
         """The task of all episodes that begin from now on, in every row."""
         if indices is not None and set(self._get_indices(indices)) != set(range(self.num_envs)):
-            raise ConfigError("set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}")
+            raise ConfigError(
+                "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
+            )
         self.batch.set_task(task, task_kwargs)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
@@ -211,17 +213,17 @@ class QuadcopterVecEnv(VecEnv):
         else:
             raise AttributeError(f"{attr_name!r} cannot be set; these can: {', '.join(_SETTERS)}")
 
-    def env_method(self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any) -> list[Any]:
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
         """Call a method for the given rows; one result per row."""
         rows = self.batch.rows(indices)
         if method_name == "true_state":
             return [QuadcopterState(self.batch.state[:, row : row + 1]) for row in rows]
-        if method_name == "set_task":
-            self.set_task(*method_args, indices=indices, **method_kwargs)
-        elif method_name in _METHODS:
+        if method_name in _METHODS:
             getattr(self, method_name)(*method_args, indices=indices, **method_kwargs)
         else:
-            raise AttributeError(f"no method {method_name!r} of rows; there are: true_state, set_task, {', '.join(_METHODS)}")
+            raise AttributeError(f"no method {method_name!r} of rows; there are: true_state, {', '.join(_METHODS)}")
         return [None] * rows.size
 
     def env_is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None) -> list[bool]:

@@ -47,9 +47,10 @@ class BulletReference:
         for _ in range(vehicle.substeps):
             self.speeds = self.speeds + vehicle.motor_gain * (wanted - self.speeds) * vehicle.physics_step
             lift, *moments = vehicle.mixer @ (vehicle.thrust_coefficient * self.speeds**2)
+            force = wrench[3:6] + np.array([0.0, 0.0, lift])
             centre, _ = pybullet.getBasePositionAndOrientation(body, **client)
             pybullet.applyExternalForce(body, -1, wrench[:3], centre, pybullet.WORLD_FRAME, **client)
-            pybullet.applyExternalForce(body, -1, wrench[3:6] + [0, 0, lift], (0, 0, 0), pybullet.LINK_FRAME, **client)
+            pybullet.applyExternalForce(body, -1, force, (0, 0, 0), pybullet.LINK_FRAME, **client)
             pybullet.applyExternalTorque(body, -1, wrench[6:9], pybullet.WORLD_FRAME, **client)
             pybullet.applyExternalTorque(body, -1, wrench[9:] + moments, pybullet.LINK_FRAME, **client)
             pybullet.stepSimulation(**client)

@@ -36,9 +36,7 @@ def start(n, task, seed=0, delay=1, **task_kwargs):
 
 def again(rows, which):
     tasks = rows.tasks
-    reset_rows(
-        which, rows.state, rows.queue, rows.streams, rows.task_index, rows.vehicles, tasks.parameters, tasks.weights
-    )
+    reset_rows(which, rows.state, rows.queue, rows.streams, rows.task_index, rows.vehicles, tasks.parameters, tasks.weights)
 
 
 def observations(rows, noise):

@@ -67,8 +67,8 @@ def _table(measurements: list[Measurement]) -> Table:
     from rich.table import Table
 
     table = Table(title="control steps per second (median of 5)", title_justify="left")
-    table.add_column("")
-    for name in ("environments", "steps/s", "of one PyBullet environment"):
+    table.add_column("", no_wrap=True)
+    for name in ("rows", "steps/s", "to the first line"):
         table.add_column(name, justify="right")
     reference = measurements[0].rate
     for each in measurements:

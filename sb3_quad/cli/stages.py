@@ -94,7 +94,9 @@ def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:
     """PPO alone on as many transitions as all stages had together."""
     from sb3_quad.training.config import load_config
 
-    kept = {key: first.config.settings[key] for key in ("vec_env", "env_kwargs") if key in first.config.settings}
+    kept: dict[str, Any] = {
+        key: first.config.settings[key] for key in ("vec_env", "env_kwargs") if key in first.config.settings
+    }
     config = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, {**kept, "n_timesteps": n_timesteps})
     return replace(first, config=config, trained_agent=None)
 

@@ -72,10 +72,8 @@ def draw_normals(scratch):
             t = float32(int32(uint32(word - (uint32(quadrant) << uint32(30))))) * _TO_ANGLE
             t2 = t * t
             sine = t + t * t2 * (float32(-1.6666654611e-1) + t2 * (float32(8.3321608736e-3) + t2 * float32(-1.9515295891e-4)))
-            cosine = float32(1.0) - float32(0.5) * t2 + t2 * t2 * (
-                float32(4.166664568298827e-2)
-                + t2 * (float32(-1.388731625493765e-3) + t2 * float32(2.443315711809948e-5))
-            )
+            p = float32(4.166664568298827e-2) + t2 * (float32(-1.388731625493765e-3) + t2 * float32(2.443315711809948e-5))
+            cosine = float32(1.0) - float32(0.5) * t2 + t2 * t2 * p
             odd = (quadrant & 1) != 0
             first = sine if odd else cosine
             second = cosine if odd else sine

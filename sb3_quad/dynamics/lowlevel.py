@@ -6,6 +6,7 @@ distance between two rows, needs no test for overlap, and vectorises the loops o
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -30,10 +31,8 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     if function is None:
         return lambda inner: compiled(inner, **options)
     dispatcher = numba.njit(cache=True, error_model="numpy", nogil=True, **options)(function)
-    try:
+    with contextlib.suppress(AttributeError):  # another version of numba: its own rule then holds
         dispatcher._cache._cache_file._source_stamp = _source_stamp()
-    except AttributeError:  # another version of numba: its own rule then holds
-        pass
     return dispatcher
 
 

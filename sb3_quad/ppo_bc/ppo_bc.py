@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch as th
@@ -21,7 +21,7 @@ from sb3_quad.common.labels import ExpertLabeller
 from sb3_quad.common.losses import gaussian_nll, l2_loss
 from sb3_quad.common.losses import value_loss as max_clipped_value_loss
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
+from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer, ExpertRolloutBufferSamples
 from sb3_quad.ppo_bc.forward import evaluate
 from sb3_quad.ppo_bc.gradients import gradient_norms
 
@@ -167,7 +167,7 @@ class PPOBC(PPO):
         return float(self.bc_coef(self._current_progress_remaining))  # type: ignore[operator]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.expert is None and any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0)):  # type: ignore[arg-type]
+        if self.expert is None and any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0)):
             raise ExpertError(
                 "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
             )
@@ -181,7 +181,8 @@ class PPOBC(PPO):
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
         if self._labelling and self._labeller is not None and self._labeller.needs_state:
-            self._labels = self._labeller.labels(self._last_obs)  # the first step's state, before it
+            observation: Any = self._last_obs
+            self._labels = self._labeller.labels(observation)  # the first step's state, before it
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     @property
@@ -198,11 +199,12 @@ class PPOBC(PPO):
         if not self._labelling:
             return
         assert self._labeller is not None and isinstance(self.rollout_buffer, ExpertRolloutBuffer)
+        observation: Any = self._last_obs
         if self._labeller.needs_state:
             self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labels
-            self._labels = self._labeller.labels(self._last_obs)
+            self._labels = self._labeller.labels(observation)
         else:
-            self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labeller.labels(self._last_obs)
+            self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labeller.labels(observation)
 
     def train(self) -> None:
         """One update on the current rollout: ``PPO.train`` with the added terms (each marked "PPO+BC")."""
@@ -268,7 +270,8 @@ class PPOBC(PPO):
                 # PPO+BC: the terms that Eq. 4.4 adds
                 terms = {"policy": policy_loss, "value": self.vf_coef * value_loss}
                 if bc_coef != 0.0:
-                    bc_loss = self._bc_loss(distribution, rollout_data.expert_actions, raw_advantages)
+                    expert_actions = cast(ExpertRolloutBufferSamples, rollout_data).expert_actions
+                    bc_loss = self._bc_loss(distribution, expert_actions, raw_advantages)
                     bc_losses.append(bc_loss.item())
                     terms["bc"] = bc_coef * bc_loss
                     loss = loss + terms["bc"]
@@ -298,7 +301,7 @@ class PPOBC(PPO):
                     break
 
                 self.policy.optimizer.zero_grad()
-                loss.backward()
+                loss.backward()  # type: ignore[no-untyped-call]
                 th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
                 self.policy.optimizer.step()
 
