@@ -42,9 +42,7 @@ class ExpertLabeller:
 
     def __init__(self, expert: Any, env: VecEnv) -> None:
         if expert is None:
-            raise ExpertError(
-                "no expert: give expert=... when building or loading the model, or call set_expert(expert)"
-            )
+            raise ExpertError("no expert: give expert=... when building or loading the model, or call set_expert(expert)")
         if isinstance(expert, type):
             raise ExpertError(f"expert {expert.__name__}: is a class; give an instance, such as {expert.__name__}()")
         if not isinstance(env.action_space, spaces.Box):
@@ -75,8 +73,7 @@ class ExpertLabeller:
         n = len(observation)
         if raw.shape not in ((n, *self._space.shape), (n, self._action_dim)):
             raise ExpertError(
-                f"expert {self.name}: gave labels of shape {raw.shape}, "
-                f"expected {(n, *self._space.shape)} (row, action)"
+                f"expert {self.name}: gave labels of shape {raw.shape}, expected {(n, *self._space.shape)} (row, action)"
             )
         labels = raw.reshape(n, self._action_dim).astype(np.float32)
         if not np.isfinite(labels).all():
@@ -108,8 +105,7 @@ class ExpertLabeller:
         if hasattr(expert, "actions"):
             raise ExpertError(f"expert {self.name}: needs the true state, and this environment has no true_state()")
         raise ExpertError(
-            f"expert {expert!r}: has neither actions(state) nor predict(observation), and is no function of "
-            "observations"
+            f"expert {expert!r}: has neither actions(state) nor predict(observation), and is no function of observations"
         )
 
 

@@ -190,9 +190,7 @@ class DAgger(OnPolicyAlgorithm):
         check_arguments(self)
         super()._setup_model()
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
-            raise ConfigError(
-                f"policy_kwargs {self.policy_kwargs}: DAgger needs a diagonal Gaussian policy (no use_sde)"
-            )
+            raise ConfigError(f"policy_kwargs {self.policy_kwargs}: DAgger needs a diagonal Gaussian policy (no use_sde)")
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.observation_space.dtype
@@ -339,9 +337,7 @@ class DAgger(OnPolicyAlgorithm):
 
             index = th.from_numpy(rows)
             values = self.policy.predict_values(flown[index].to(self.device)).flatten()
-            v_loss = value_loss(
-                values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf
-            )
+            v_loss = value_loss(values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf)
 
             loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
             terms[i] = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()
@@ -368,9 +364,7 @@ class DAgger(OnPolicyAlgorithm):
         self.logger.record("train/entropy_loss", float(averages[3]))
         self.logger.record("train/l2_loss", float(averages[4]))
         self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-        self.logger.record(
-            "train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten())
-        )
+        self.logger.record("train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)

@@ -254,7 +254,8 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
         if success < stage.require.success_rate or reward < stage.require.mean_reward:
             raise TrainingError(
                 f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires "
-                f"(success_rate {stage.require.success_rate:g}, mean_reward {stage.require.mean_reward:g}); its run is {run.path}"
+                f"(success_rate {stage.require.success_rate:g}, mean_reward {stage.require.mean_reward:g}); "
+                f"its run is {run.path}"
             )
     return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
 
