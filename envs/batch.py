@@ -249,7 +249,7 @@ def _whole_number(name: str, value: Any) -> int:
 def _vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
     if len(given) != n:
         raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give one, or one for each")
-    loaded = {id(each): load_vehicle(each) for each in given}
+    loaded = {key: load_vehicle(each) for key, each in {id(each): each for each in given}.items()}  # each file once
     vehicles = [loaded[id(each)] for each in given]
     first = vehicles[0]
     for row, each in enumerate(vehicles):

@@ -76,8 +76,11 @@ class QuadcopterVecEnv(VecEnv):
         """Begin a new episode in every row; observations float32 (n, 18)."""
         if any(seed is not None for seed in self._seeds):
             self.batch.seed(self._seeds)
+        given = any(self._options)
         self._reset_seeds()
         self._reset_options()
+        if given:
+            raise ConfigError("reset options: the batched environment takes none; call set_target and its like after reset()")
         self.reset_infos = [{} for _ in range(self.num_envs)]
         return self.batch.reset()
 

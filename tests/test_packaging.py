@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import configparser
 import json
 import os
@@ -116,6 +117,19 @@ def test_each_dependency_is_pinned(options):
     names = {line.split(">=")[0].strip().lower() for line in wanted.splitlines() if line.strip()}
     assert names <= set(pins)
     assert len(pins) == len(set(pins))
+
+
+def test_what_the_code_imports_is_declared(options):
+    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3"}
+    brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
+    wanted = options["options"]["install_requires"]
+    declared = {line.split(">=")[0].strip().lower() for line in wanted.splitlines() if line.strip()}
+    for path in (path for name in CODE for path in (ROOT / name).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            for name in {name.split(".")[0] for name in names} - {"sb3_quad"} - set(sys.stdlib_module_names):
+                assert brought.get(name, distributions.get(name, name)) in declared, f"{path} imports {name}"
 
 
 @pytest.mark.parametrize("module", ["sb3_quad", "sb3_quad.envs", "sb3_quad.cli", "sb3_quad.zoo_configs"])

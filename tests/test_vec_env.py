@@ -394,6 +394,10 @@ def test_unknown_rows_methods_and_attributes_are_refused():
         env.set_attr("colour", 1)
     with pytest.raises(AttributeError):
         env.get_attr("colour")
+    env.set_options({"target": (0, 0, 1)})
+    with pytest.raises(ConfigError, match="reset options"):
+        env.reset()
+    env.reset()
 
 
 # --- Stable-Baselines3

@@ -7,6 +7,7 @@ import json
 from typing import TYPE_CHECKING
 
 from sb3_quad.cli.arguments import whole
+from sb3_quad.cli.output import console
 from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -38,25 +39,23 @@ def run(options: argparse.Namespace) -> int:
     """Measure, print, write. Returns the exit code."""
     if min(options.sizes) < 1 or options.n_envs < 1 or options.seconds <= 0:
         raise ConfigError("--sizes and --n-envs must be at least 1, --seconds above 0")
-    from rich.console import Console
-
     from sb3_quad.evaluation.benchmark import ENV_ID, as_dict, single, training_loop, vectorised
     from sb3_quad.training.config import load_config
     from sb3_quad.training.files import write_text
 
-    console = Console()
+    screen = console()
     config = load_config(options.algo, ENV_ID) if options.training else None
     measurements = []
-    with console.status("one PyBullet environment"):
+    with screen.status("one PyBullet environment"):
         measurements.append(single(options.seconds))
     kinds = [("dummy", options.n_envs), ("subproc", options.n_envs), *(("batch", size) for size in options.sizes)]
     for kind, n_envs in kinds:
-        with console.status(f"{kind}, {n_envs}"):
+        with screen.status(f"{kind}, {n_envs}"):
             measurements.append(vectorised(kind, n_envs, options.seconds))
     if config is not None:
-        with console.status(f"training loop of {config.algo}"):
+        with screen.status(f"training loop of {config.algo}"):
             measurements.extend(training_loop(config))
-    console.print(_table(measurements))
+    screen.print(_table(measurements))
     if options.output is not None:
         write_text(options.output, json.dumps(as_dict(measurements), indent=2) + "\n")
         print(f"written to {options.output}")

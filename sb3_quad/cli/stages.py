@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.cli.output import console
 from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -72,8 +73,6 @@ def finish(result: PipelineResult, reference: bool, seconds: float, first: Train
 
 def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
     """Both tasks, all pilots on the same fresh episodes, the thesis's figures beside."""
-    from rich.console import Console
-
     from sb3_quad.envs.registration import ENVIRONMENTS
     from sb3_quad.evaluation.flights import fly
     from sb3_quad.evaluation.summary import summarise
@@ -87,7 +86,7 @@ def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
             for name, pilot in pilots.items()
         }
         thesis = {name: THESIS[task][name] for name in THESIS_PILOTS if name in THESIS[task]}
-        Console().print(comparison(f"{task}: {FRESH_EPISODES} fresh episodes, the same for all", columns, thesis))
+        console().print(comparison(f"{task}: {FRESH_EPISODES} fresh episodes, the same for all", columns, thesis))
 
 
 def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_quad.cli.arguments import pairs, whole
+from sb3_quad.cli.output import console
 from sb3_quad.cli.stages import is_pipeline_run, resume_stages, run_stages
 from sb3_quad.errors import ConfigError
 
@@ -147,13 +148,11 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
 
 
 def _finish(result: TrainingResult) -> None:
-    from rich.console import Console
-
     config = result.job.config
     if config.task is not None:
         start = time.perf_counter()
         table = _compare(result)
-        Console().print(table)
+        console().print(table)
         _say(f"trained in {result.seconds:.1f} s, flown for this table in {time.perf_counter() - start:.1f} s")
     else:
         _say(f"trained in {result.seconds:.1f} s")
