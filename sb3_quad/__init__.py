@@ -16,14 +16,18 @@ from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:
     from sb3_quad.dagger.dagger import DAgger
+    from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
+    from sb3_quad.ppo_bc.ppo_bc import PPOBC
 
 __version__ = "0.1.0"
-__all__ = ["DAgger", "PIDExpert", "__version__"]
+__all__ = ["PPOBC", "DAgger", "GeometricExpert", "PIDExpert", "__version__"]
 
 _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
     "DAgger": "sb3_quad.dagger.dagger",
+    "GeometricExpert": "sb3_quad.experts.geometric",
     "PIDExpert": "sb3_quad.experts.pid",
+    "PPOBC": "sb3_quad.ppo_bc.ppo_bc",
 }
 
 register_environments()
