@@ -1,0 +1,60 @@
+"""Learning curves: what a run's evaluations hold is what is drawn, and bad input is one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sb3_quad.cli import main
+from sb3_quad.evaluation.curves import plot_curves, read_curve
+
+
+@pytest.fixture
+def runs(tmp_path):
+    for number in (1, 2):
+        folder = tmp_path / f"Env_{number}"
+        folder.mkdir()
+        np.savez(
+            folder / "evaluations.npz",
+            timesteps=np.array([100, 200]),
+            seconds=np.array([60.0, 120.0]) * number,
+            successes=np.array([[0.0, 1.0], [1.0, 1.0]]),
+            results=np.array([[-4.0, -2.0], [-1.0, -1.0]]) * number,
+        )
+    return tmp_path
+
+
+def test_a_curve_holds_the_means_of_the_evaluations(runs):
+    curve = read_curve(runs / "Env_2")
+    np.testing.assert_array_equal(curve.success, [0.5, 1.0])
+    np.testing.assert_array_equal(curve.reward, [-6.0, -2.0])
+    np.testing.assert_array_equal(curve.seconds, [120.0, 240.0])
+
+
+def test_seeds_are_drawn_as_mean_and_range(runs):
+    figure = plot_curves({"agent": [read_curve(runs / "Env_1"), read_curve(runs / "Env_2")]}, {"expert": (0.3, -5.0)})
+    reward = figure.axes[2].lines[0]
+    assert reward.get_ydata()[0] == pytest.approx(-4.5) and reward.get_ydata()[-1] == pytest.approx(-1.5)
+    np.testing.assert_array_equal(figure.axes[0].lines[1].get_ydata(), [30.0, 30.0])
+
+
+def test_the_command_writes_a_picture(runs, capsys):
+    picture = runs / "curves.svg"
+    assert main(["plot", f"agent={runs}/Env_*", "--line", "expert:30:-5", "-o", str(picture)]) == 0
+    assert picture.read_text(encoding="utf-8").count("<svg") == 1 and "curves.svg" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["agent=nowhere/*"], "no folder fits"),
+        (["agent"], "give NAME=PATTERN"),
+        (["agent={runs}/Env_1", "-o", "curves.gif"], "must end in"),
+        (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
+        (["agent={runs}"], "no such file"),
+    ],
+)
+def test_bad_input_is_one_line(runs, arguments, message, capsys):
+    assert main(["plot", *(argument.format(runs=runs) for argument in arguments)]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
