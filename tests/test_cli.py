@@ -226,7 +226,7 @@ def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
     assert PPO.load(saved).num_timesteps > 0
 
 
-@pytest.mark.parametrize("algo", ["dagger", "ppo"])
+@pytest.mark.parametrize("algo", ["dagger", "ppo", "ppo_bc"])
 @pytest.mark.parametrize("after", [8, 900, 1000])
 def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after):
     interruption = {"test_cli.Interrupt": {"after": after}}
