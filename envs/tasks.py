@@ -5,14 +5,14 @@ A task is data, one row of a table; the functions that read the table are in env
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
+from sb3_quad.dynamics.vehicle import Finite
 from sb3_quad.envs.episodes import reset_rows, score
 from sb3_quad.errors import ConfigError, unknown
 
@@ -21,13 +21,6 @@ __all__ = ["TASKS", "TASK_PARAMETERS", "Task", "TaskSpec", "TaskTable", "reset_r
 FloatArray = npt.NDArray[np.float64]
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-Finite = Annotated[float, AfterValidator(_finite)]
 NotNegative = Annotated[Finite, Field(ge=0)]
 
 
