@@ -74,17 +74,13 @@ def finish(result: PipelineResult, reference: bool, seconds: float, first: Train
 def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
     """Both tasks, all pilots on the same fresh episodes, the thesis's figures beside."""
     from sb3_quad.envs.registration import ENVIRONMENTS
-    from sb3_quad.evaluation.flights import fly
-    from sb3_quad.evaluation.summary import summarise
+    from sb3_quad.evaluation.summary import fly_all
     from sb3_quad.evaluation.tables import THESIS, comparison
     from sb3_quad.training.trainer import FRESH_SEED
 
     keywords = {key: job.config.env_kwargs[key] for key in ("vehicle", "noise") if key in job.config.env_kwargs}
     for task in ENVIRONMENTS.values():
-        columns = {
-            name: summarise(fly(pilot, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords))
-            for name, pilot in pilots.items()
-        }
+        columns = fly_all(pilots, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
         thesis = {name: THESIS[task][name] for name in THESIS_PILOTS if name in THESIS[task]}
         console().print(comparison(f"{task}: {FRESH_EPISODES} fresh episodes, the same for all", columns, thesis))
 

@@ -161,8 +161,7 @@ def _finish(result: TrainingResult) -> None:
 
 def _compare(result: TrainingResult) -> Any:
     """The table of agent and expert over the same fresh episodes."""
-    from sb3_quad.evaluation.flights import fly
-    from sb3_quad.evaluation.summary import summarise
+    from sb3_quad.evaluation.summary import fly_all
     from sb3_quad.evaluation.tables import THESIS, comparison
     from sb3_quad.experts.resolve import resolve_expert
     from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
@@ -173,10 +172,8 @@ def _compare(result: TrainingResult) -> Any:
     if "max_episode_steps" in given:
         keywords["max_steps"] = given["max_episode_steps"]
     expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
-    columns = {
-        name: summarise(fly(pilot, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords))
-        for name, pilot in (("agent", result.model), ("expert", expert))
-    }
+    pilots = {"agent": result.model, "expert": expert}
+    columns = fly_all(pilots, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords)
     agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
     figures = THESIS[str(config.task)]
     thesis = {name: figures[name] for name in (agent, "expert") if name in figures}

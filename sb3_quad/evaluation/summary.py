@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from sb3_quad.evaluation.flights import Flights
+from sb3_quad.evaluation.flights import Flights, fly
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,14 @@ def summarise(flights: Flights) -> Summary:
         median_final_error=float(np.median(error)) if some else float("nan"),
         max_final_error=float(error.max()) if some else float("nan"),
     )
+
+
+def fly_all(pilots: Mapping[str, Any], task: Any, n_episodes: int, seed: int, **keywords: Any) -> dict[str, Summary]:
+    """The figures of several controllers on the same episodes, by name.
+
+    :param keywords: further arguments of :func:`~sb3_quad.evaluation.flights.fly`, such as ``vehicle``.
+    """
+    return {name: summarise(fly(pilot, task, n_episodes, seed, **keywords)) for name, pilot in pilots.items()}
 
 
 def _time(times: np.ndarray[tuple[int], np.dtype[np.float64]]) -> tuple[float, float]:
