@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 
-from sb3_quad.dynamics.vehicle import Finite
+from sb3_quad.dynamics.quantities import Finite
 from sb3_quad.envs.episodes import reset_rows, score
 from sb3_quad.errors import ConfigError, unknown
 

@@ -15,10 +15,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.dynamics.rotation import nearest_rotation, quaternion_from_rotation
 from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, ExpertError
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.experts.geometric import GeometricExpert, derived_gains
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.experts.resolve import resolve_expert
 
@@ -108,6 +109,18 @@ def test_geometric_expert_recovers_and_arrives():
     assert recovery.success.mean() > 0.95
     assert tracking.success.all() and np.isfinite(tracking.time_to[0.1]).all()
     assert tracking.time_to[0.1].mean() < 7.7  # faster than the PID
+
+
+def test_geometric_gains_come_from_the_vehicle_or_its_authority():
+    itm = load_vehicle("itm")
+    assert GeometricExpert().gains == itm.geometric_gains
+    assert GeometricExpert(gains=derived_gains(itm)).gains.measured is None
+    slow = itm.model_copy(update={"motor_gain": 10.0, "inertia": tuple(3 * each for each in itm.inertia)})
+    gains = GeometricExpert(slow).gains
+    assert gains.attitude < itm.geometric_gains.attitude  # a vehicle that turns more slowly is asked for less
+    assert gains.braking == pytest.approx(derived_gains(itm).braking / 3)
+    tracking = fly(GeometricExpert(slow), "target_tracking", 48, 3, vehicle=slow)
+    assert tracking.success.all() and np.isfinite(tracking.time_to[0.1]).all()
 
 
 @pytest.mark.parametrize("expert", [PIDExpert(), GeometricExpert()], ids=["pid", "geometric"])

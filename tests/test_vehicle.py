@@ -16,6 +16,7 @@ from sb3_quad.dynamics.vehicle import PARAMETER_NAMES, Vehicle, load_vehicle, ve
 from sb3_quad.errors import ConfigError
 
 ITM = load_vehicle("itm")
+GAINS = ITM.model_dump(mode="json")["geometric_gains"]
 finite = st.floats(-2.0, 2.0)
 
 
@@ -111,6 +112,14 @@ def test_frozen_and_copies_are_validated() -> None:
         ITM.model_copy(update={"mass": -2.0})
 
 
+def test_gains_stay_with_the_vehicle_they_were_found_for() -> None:
+    assert ITM.geometric_gains is not None and ITM.geometric_gains.measured is not None
+    assert ITM.model_copy(update={"name": "other"}).geometric_gains == ITM.geometric_gains
+    assert ITM.model_copy(update={"mass": 2.0}).geometric_gains is None
+    given = {"mass": 2.0, "geometric_gains": ITM.geometric_gains}
+    assert ITM.model_copy(update=given).geometric_gains == ITM.geometric_gains
+
+
 def test_copy_of_a_used_vehicle_has_its_own_mixer() -> None:
     """Cached derived values do not follow into a copy with other parameters."""
     assert ITM.mixer[3, 0] == 0.016
@@ -155,6 +164,10 @@ def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
         ({"delay": 1.5}, "delay"),
         ({"collision_radius": 0}, "collision_radius"),
         ({"name": ""}, "name"),
+        ({"geometric_gains": {"postion": 1.0}}, "geometric_gains: unknown key 'postion': did you mean 'position'"),
+        ({"geometric_gains": {**GAINS, "velocity": -1}}, "geometric_gains.velocity: .*greater than 0.*1/s"),
+        ({"geometric_gains": {**GAINS, "measured": {"sucess": 1}}}, "measured: unknown key 'sucess'"),
+        ({"geometric_gains": 3}, "geometric_gains: "),
     ],
 )
 def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -12,21 +12,15 @@ from typing import Annotated, Any
 import numpy as np
 import numpy.typing as npt
 import yaml
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from sb3_quad.dynamics.gains import GeometricFigures, GeometricGains
+from sb3_quad.dynamics.quantities import Finite, Positive
 from sb3_quad.errors import ConfigError, unknown
 
 FloatArray = npt.NDArray[np.float64]
 
 
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-Finite = Annotated[float, AfterValidator(_finite)]
-Positive = Annotated[Finite, Field(gt=0)]
 PerRotor = tuple[tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite]]
 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
@@ -64,6 +58,9 @@ class Vehicle(BaseModel):
     control_step: Positive = Field(default=0.01, description="s; a whole number of physics steps")
     delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
     collision_radius: Positive = Field(description="radius of the collision sphere at the centre of mass, m")
+    geometric_gains: GeometricGains | None = Field(
+        default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> Vehicle:
@@ -91,8 +88,15 @@ class Vehicle(BaseModel):
         return self
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Vehicle:
-        """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated."""
-        return Vehicle.model_validate({**self.model_dump(), **(update or {})})
+        """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated.
+
+        ``geometric_gains`` were found for this vehicle: one that differs in more than its name has none, unless ``update``
+        brings some.
+        """
+        changes = dict(update or {})
+        if changes.keys() - {"name"}:
+            changes = {"geometric_gains": None, **changes}
+        return Vehicle.model_validate({**self.model_dump(), **changes})
 
     @property
     def mixer(self) -> FloatArray:
@@ -205,9 +209,21 @@ def _parse_vehicle(content: str, where: str) -> Vehicle:
 
 def _explain(item: Any) -> str:
     key = ".".join(str(part) for part in item["loc"])
+    *blocks, name = item["loc"] or ("",)
+    where, fields = _fields_at(tuple(blocks))
     if item["type"] == "extra_forbidden":
-        return unknown("key", key, Vehicle.model_fields)
+        return where + unknown("key", name, fields)
     message = item["msg"].removeprefix("Value error, ")
-    field = Vehicle.model_fields.get(key.split(".")[0])
+    field = fields.get(str(name)) or Vehicle.model_fields.get(key.split(".")[0])
     meaning = f" ({field.description})" if field and field.description else ""
     return f"{key}: {message}{meaning}" if key else message
+
+
+def _fields_at(blocks: tuple[Any, ...]) -> tuple[str, dict[str, Any]]:
+    """Where in the file some nested blocks lead (as the beginning of a message), and the fields that block has."""
+    known: dict[tuple[Any, ...], type[BaseModel]] = {
+        ("geometric_gains",): GeometricGains,
+        ("geometric_gains", "measured"): GeometricFigures,
+    }
+    model = known.get(blocks)
+    return (f"{'.'.join(blocks)}: ", model.model_fields) if model else ("", Vehicle.model_fields)

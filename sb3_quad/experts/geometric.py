@@ -7,31 +7,40 @@ import math
 import numba
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 
+from sb3_quad.dynamics.gains import GeometricGains
 from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import Finite, Positive, Vehicle
+from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.experts.protocol import Actions, Expert
 
 
-class GeometricGains(BaseModel):
-    """The named gains of :class:`GeometricExpert`; the defaults are ITM's before any search over them."""
+def derived_gains(vehicle: Vehicle) -> GeometricGains:
+    """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    position: Positive = Field(default=1.0, description="kp, 1/s²")
-    velocity: Positive = Field(default=2.0, description="kv, 1/s")
-    horizontal_acceleration: Positive = Field(default=6.0, description="limit of the desired horizontal acceleration, m/s²")
-    fall_speed: Positive = Field(default=2.0, description="falling faster than this, stopping the fall comes first, m/s")
-    fall_tilt: Positive = Field(default=0.25, description="tangent of the desired tilt while stopping a fall")
-    tilt: Positive = Field(default=0.8, description="tangent of the largest desired tilt otherwise")
-    attitude: Positive = Field(default=8.0, description="k_a, desired body rate per angle of thrust direction error, 1/s")
-    braking: Positive = Field(default=52.0, description="a_ω, angular deceleration that the rate profile plans with, rad/s²")
-    body_rates: Positive = Field(default=15.0, description="k_w, angular acceleration per body rate error, 1/s")
-    thrust_cone: Finite = Field(default=0.3, description="c_c: below this cosine of the direction error, least thrust")
-    long_way: Finite = Field(default=0.0, ge=0, description="f_b: how far from upside-down a spin is used at 8 rad/s, rad")
-    yaw_rate: Positive = Field(default=2.0, description="yaw damping, 1/s")
-    yaw_moment: Positive = Field(default=0.37, le=1, description="largest yaw moment, in the greatest that the rotors give")
+    The units are the lag from a command to its thrust, τ = 1/k_m + (delay + ½) Δt (rates 1/τ); the greatest angular
+    acceleration about the weaker of roll and pitch; and the greatest accelerations upwards, g (c - 1), and sideways at
+    constant height, g √(c² - 1), with c the greatest thrust in hover thrusts.
+    """
+    low, high = vehicle.thrust_range
+    moments = np.abs(vehicle.mixer[1:3]).sum(axis=1) * (high - low) / 2
+    turn = float(np.min(moments / np.asarray(vehicle.inertia[:2])))
+    lag = 1.0 / vehicle.motor_gain + (vehicle.delay + 0.5) * vehicle.control_step
+    up = vehicle.gravity * (vehicle.thrust_limits[1] - 1.0)
+    tangent = math.sqrt(vehicle.thrust_limits[1] ** 2 - 1.0)
+    attitude = 0.249 / lag
+    return GeometricGains(
+        position=0.0762 * attitude**2,
+        velocity=0.384 * attitude,
+        horizontal_acceleration=0.547 * tangent * vehicle.gravity,
+        fall_speed=0.673 * up,  # of 1 s
+        fall_tilt=0.084,
+        tilt=0.716 * tangent,
+        attitude=attitude,
+        braking=0.318 * turn,
+        body_rates=0.975 / lag,
+        thrust_cone=0.3,
+        long_way=1.29,
+    )
 
 
 class GeometricExpert(Expert):
@@ -44,8 +53,8 @@ class GeometricExpert(Expert):
     the long way round where its spin makes that quicker, and stops a fall before it travels.
 
     :param vehicle: name, YAML path or Vehicle it is designed for.
-    :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or the
-        defaults where it has none.
+    :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
+        :func:`derived_gains` where it has none.
     """
 
     def __init__(
@@ -57,8 +66,8 @@ class GeometricExpert(Expert):
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
         v = self.vehicle
-        self.gains = gains or GeometricGains()
-        self._gains = np.array([getattr(self.gains, name) for name in GeometricGains.model_fields])
+        self.gains = gains or v.geometric_gains or derived_gains(v)
+        self._gains = self.gains.values()
         self._body = np.array([v.mass, v.gravity, *v.inertia, 4 * v.moment_thrust_ratio * np.diff(v.thrust_range)[0] / 2])
         self._thrust_range = np.array(v.thrust_range)
 
