@@ -118,7 +118,7 @@ def test_geometric_gains_come_from_the_vehicle_or_its_authority():
     slow = itm.model_copy(update={"motor_gain": 10.0, "inertia": tuple(3 * each for each in itm.inertia)})
     gains = GeometricExpert(slow).gains
     assert gains.attitude < itm.geometric_gains.attitude  # a vehicle that turns more slowly is asked for less
-    assert gains.braking == pytest.approx(derived_gains(itm).braking / 3)
+    assert gains.angular_deceleration == pytest.approx(derived_gains(itm).angular_deceleration / 3)
     tracking = fly(GeometricExpert(slow), "target_tracking", 48, 3, vehicle=slow)
     assert tracking.success.all() and np.isfinite(tracking.time_to[0.1]).all()
 

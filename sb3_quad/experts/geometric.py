@@ -17,40 +17,50 @@ from sb3_quad.experts.protocol import Actions, Expert
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
 
-    The units are the lag from a command to its thrust, τ = 1/k_m + (delay + ½) Δt (rates 1/τ); the greatest angular
-    acceleration about the weaker of roll and pitch; and the greatest accelerations upwards, g (c - 1), and sideways at
-    constant height, g √(c² - 1), with c the greatest thrust in hover thrusts.
+    The units are the lag τ from a command to its thrust (:func:`command_lag`); the greatest angular acceleration a_φ about
+    the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1), sideways
+    at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust limits in hover thrusts.
     """
+    least, most = vehicle.thrust_limits
     low, high = vehicle.thrust_range
     moments = np.abs(vehicle.mixer[1:3]).sum(axis=1) * (high - low) / 2
     turn = float(np.min(moments / np.asarray(vehicle.inertia[:2])))
-    lag = 1.0 / vehicle.motor_gain + (vehicle.delay + 0.5) * vehicle.control_step
-    up = vehicle.gravity * (vehicle.thrust_limits[1] - 1.0)
-    tangent = math.sqrt(vehicle.thrust_limits[1] ** 2 - 1.0)
-    attitude = 0.249 / lag
+    lag = command_lag(vehicle)
+    rate = 1.0 / (lag + 1.0 / math.sqrt(turn))
+    sideways = math.sqrt(most**2 - 1.0)
     return GeometricGains(
-        position=0.0762 * attitude**2,
-        velocity=0.384 * attitude,
-        horizontal_acceleration=0.547 * tangent * vehicle.gravity,
-        fall_speed=0.673 * up,  # of 1 s
-        fall_tilt=0.084,
-        tilt=0.716 * tangent,
-        attitude=attitude,
-        braking=0.318 * turn,
-        body_rates=0.975 / lag,
-        thrust_cone=0.3,
-        long_way=1.29,
+        position=0.271 * rate,
+        velocity=0.458 * rate,
+        height_position=0.446 * rate,
+        height_velocity=0.748 * rate,
+        deceleration=0.571 * vehicle.gravity * sideways,
+        height_deceleration=0.822 * vehicle.gravity * (most - 1.0),
+        descent=vehicle.gravity * min(0.9, 1.56 * (1.0 - least)),
+        tilt=0.979 * sideways,
+        attitude=1.19 * rate,
+        angular_deceleration=1.81 * turn,
+        body_rates=0.685 / lag,
+        thrust_cone=0.157,
+        yaw_rate=0.110 / lag,
     )
 
 
+def command_lag(vehicle: Vehicle) -> float:
+    """τ, s, from a command to its thrust: the delay, half of the control step it is held for, and the motors (Eq. 4.1)."""
+    return (vehicle.delay + 0.5) * vehicle.control_step + 1.0 / vehicle.motor_gain
+
+
 class GeometricExpert(Expert):
-    """Position and attitude control on S² for large angles, with braking profile and prioritised mixing.
+    """Position and attitude control on S² for large angles; docs/experts.md has its law in formulas.
 
     After Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (CDC 2010), with reduced
-    attitude (the thrust direction only; yaw is damped, as in Brescianini and D'Andrea, "Tilt-prioritized quadrocopter
-    attitude control", 2018), since no task here asks for a heading. What recovery needs beyond it: a vehicle that points
-    away from the desired force gives its least thrust, turns by a rate profile that it can brake from, goes on turning
-    the long way round where its spin makes that quicker, and stops a fall before it travels.
+    attitude (Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control", IEEE Control Systems 31(3), 2011): the
+    thrust direction only, before the yaw, as in Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control"
+    (IEEE Trans. Control Systems Technology 28(2), 2020), since no task here asks for a heading. What it adds to them:
+    velocities and body rates that the vehicle can brake from, the turn as it will be when the command acts, the long way
+    round where the spin makes that quicker, and the least thrust while the thrust points away from where it should.
+
+    The actions are a function of what the 18 observed features hold; nothing is remembered.
 
     :param vehicle: name, YAML path or Vehicle it is designed for.
     :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
@@ -68,7 +78,7 @@ class GeometricExpert(Expert):
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
         self._gains = self.gains.values()
-        self._body = np.array([v.mass, v.gravity, *v.inertia, 4 * v.moment_thrust_ratio * np.diff(v.thrust_range)[0] / 2])
+        self._body = np.array([v.mass, v.gravity, *v.inertia, command_lag(v)])
         self._thrust_range = np.array(v.thrust_range)
 
     def actions(self, state: QuadcopterState) -> Actions:
@@ -78,60 +88,96 @@ class GeometricExpert(Expert):
         return actions
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
+def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-def]
+    """Speed towards a target from which it can be braked: gain · distance near it, √(2 deceleration distance) far away."""
+    return deceleration / gain * (math.sqrt(1.0 + 2.0 * gain * gain * distance / deceleration) - 1.0)
+
+
+@numba.njit(cache=True, error_model="numpy")
 def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped-def]
-    """Desired force per mass in the world frame, m/s²: to the target, but out of a fall first."""
-    kp, kv, a_max, fall_speed, fall_tilt, tilt = gains[0], gains[1], gains[2], gains[3], gains[4], gains[5]
-    ax, ay = kp * ex - kv * vx, kp * ey - kv * vy
-    horizontal = math.sqrt(ax * ax + ay * ay)
-    fz = max(1.0, g + min(30.0, max(-4.0, kp * ez - kv * vz)))
-    limit = min(a_max, fz * (fall_tilt if vz < -fall_speed else tilt))
+    """Desired force per mass in the world frame, m/s²."""
+    distance = math.sqrt(ex * ex + ey * ey)
+    speed = _braking_profile(distance, gains[0], gains[4]) / distance if distance > 0.0 else gains[0]
+    fx, fy = gains[1] * (speed * ex - vx), gains[1] * (speed * ey - vy)
+    rise = math.copysign(_braking_profile(abs(ez), gains[2], gains[5]), ez)
+    fz = max(0.1 * g, g + max(-gains[6], gains[3] * (rise - vz)))  # upwards, so that a tilt can be told
+    horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[7] * fz
     scale = limit / horizontal if horizontal > limit else 1.0
-    return scale * ax, scale * ay, fz
+    return scale * fx, scale * fy, fz
 
 
-@numba.njit(cache=True)
-def _moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-def]
-    """Body moments that turn the thrust to the direction (b1, b2, b3), body frame, N m."""
-    k_a, a_w, k_w, long_way, k_yaw, yaw_limit = gains[6], gains[7], gains[8], gains[10], gains[11], gains[12] * body[5]
+@numba.njit(cache=True, error_model="numpy")
+def _rotated(b1, b2, b3, p, q, r, time):  # type: ignore[no-untyped-def]
+    """A direction fixed in the world as the body sees it after turning with its present rates for some time."""
+    rate = math.sqrt(p * p + q * q + r * r)
+    if rate < 1e-9:
+        return b1, b2, b3
+    n1, n2, n3 = p / rate, q / rate, r / rate
+    cosine, sine = math.cos(rate * time), -math.sin(rate * time)
+    along = (n1 * b1 + n2 * b2 + n3 * b3) * (1.0 - cosine)
+    return (
+        cosine * b1 + sine * (n2 * b3 - n3 * b2) + along * n1,
+        cosine * b2 + sine * (n3 * b1 - n1 * b3) + along * n2,
+        cosine * b3 + sine * (n1 * b2 - n2 * b1) + along * n3,
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-def]
+    """Roll and pitch moments that turn the thrust to the direction (b1, b2, b3), body frame, N m."""
+    k_a, a_w, k_w = gains[8], gains[9], gains[10]
     sine = math.sqrt(b1 * b1 + b2 * b2)
     angle = math.atan2(sine, b3)
     nx, ny = (-b2 / sine, b1 / sine) if sine > 1e-9 else (1.0, 0.0)
     along = p * nx + q * ny
-    if along < 0.0 and math.pi - angle < long_way * min(1.0, -along / 8.0):
-        nx, ny, angle = -nx, -ny, 2 * math.pi - angle
-    rate = min(k_a * angle, math.sqrt(2 * a_w * angle))
-    mx = body[2] * k_w * (rate * nx - p)
-    my = body[3] * k_w * (rate * ny - q)
-    mz = min(yaw_limit, max(-yaw_limit, -k_yaw * body[4] * r))
-    return mx, my, mz
+    short = -along + 2.0 * math.sqrt(0.5 * along * along + a_w * angle)
+    long = along + 2.0 * math.sqrt(0.5 * along * along + a_w * (2.0 * math.pi - angle))
+    if long < short:
+        nx, ny, angle = -nx, -ny, 2.0 * math.pi - angle
+    rate = _braking_profile(angle, k_a, a_w)
+    # The wanted rates stay in the world while the body yaws; then Euler's gyroscopic moments.
+    mx = body[2] * (k_w * (rate * nx - p) + r * rate * ny) + (body[4] - body[3]) * q * r
+    my = body[3] * (k_w * (rate * ny - q) - r * rate * nx) + (body[2] - body[4]) * r * p
+    return mx, my
 
 
-@numba.njit(cache=True)
-def _geometric(x, gains, body, mixer_inverse, thrust_range, actions):  # type: ignore[no-untyped-def]
-    mass, g = body[0], body[1]
-    low, high = thrust_range
+@numba.njit(cache=True, error_model="numpy")
+def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: ignore[no-untyped-def]
+    """Actions of one vehicle: roll and pitch before thrust, thrust before yaw, all within every rotor's limits."""
     middle, half = (high + low) / 2, (high - low) / 2
-    difference = np.empty(4)
+    least, most, largest = 0.0, 0.0, 0.0
+    for k in range(4):
+        difference = mixer_inverse[k, 1] * mx + mixer_inverse[k, 2] * my
+        least, most, largest = min(least, difference), max(most, difference), max(largest, abs(difference))
+    scale = half / largest if largest > half else 1.0
+    common = min(high - scale * most, max(low - scale * least, min(high, max(low, thrust / 4))))
+    share = 1.0  # of the yaw moment, as far as there is room
+    for k in range(4):
+        each = common + scale * (mixer_inverse[k, 1] * mx + mixer_inverse[k, 2] * my)
+        yaw = mixer_inverse[k, 3] * mz
+        room = high - each if yaw > 0.0 else each - low
+        if abs(yaw) * share > room:
+            share = max(0.0, room / abs(yaw))
+    for k in range(4):
+        each = common + scale * (mixer_inverse[k, 1] * mx + mixer_inverse[k, 2] * my) + share * mixer_inverse[k, 3] * mz
+        actions[k] = min(1.0, max(-1.0, (each - middle) / half))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _geometric(x, gains, body, mixer_inverse, thrust_range, actions):  # type: ignore[no-untyped-def]
+    mass, g, izz, lag = body[0], body[1], body[4], body[5]
+    low, high = thrust_range
     for i in range(x.shape[1]):
         w, qx, qy, qz = x[3, i], x[4, i], x[5, i], x[6, i]
+        p, q, r = x[10, i], x[11, i], x[12, i]
         ex, ey, ez = x[17, i] - x[0, i], x[18, i] - x[1, i], x[19, i] - x[2, i]
         fx, fy, fz = _desired_force(ex, ey, ez, x[7, i], x[8, i], x[9, i], gains, g)
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
         b1 = ((1 - 2 * (qy * qy + qz * qz)) * fx + 2 * (qx * qy + w * qz) * fy + 2 * (qx * qz - w * qy) * fz) / size
         b2 = (2 * (qx * qy - w * qz) * fx + (1 - 2 * (qx * qx + qz * qz)) * fy + 2 * (qy * qz + w * qx) * fz) / size
         b3 = (2 * (qx * qz + w * qy) * fx + 2 * (qy * qz - w * qx) * fy + (1 - 2 * (qx * qx + qy * qy)) * fz) / size
-        mx, my, mz = _moments(b1, b2, b3, x[10, i], x[11, i], x[12, i], gains, body)
-        common = mass * size * b3 / 4 if b3 > gains[9] else low
-        largest, least, most = 0.0, 0.0, 0.0
-        for k in range(4):
-            m = mixer_inverse[k]
-            difference[k] = m[1] * mx + m[2] * my + m[3] * mz
-            largest = max(largest, abs(difference[k]))
-            least, most = min(least, difference[k]), max(most, difference[k])
-        scale = half / largest if largest > half else 1.0  # the moments come first: all differences by one factor ...
-        common = min(
-            high - scale * most, max(low - scale * least, min(high, max(low, common)))
-        )  # ... then the thrust gives way
-        for k in range(4):
-            actions[i, k] = min(1.0, max(-1.0, (common + scale * difference[k] - middle) / half))
+        b1, b2, b3 = _rotated(b1, b2, b3, p, q, r, lag)
+        mx, my = _turn_moments(b1, b2, b3, p, q, r, gains, body)
+        thrust = mass * size * min(1.0, max(0.0, b3 / gains[11]))
+        _allocate(thrust, mx, my, -gains[12] * izz * r, mixer_inverse, low, high, actions[i])
