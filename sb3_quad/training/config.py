@@ -36,6 +36,7 @@ from sb3_quad.training.literals import parse_mapping
 from sb3_quad.training.values import convert, positive_whole, qualified_classes
 
 VEC_ENVS = ("batch", "dummy", "subproc")
+CONFIG_FOLDERS = ("geometric", "thesis")  # with further settings files, inside zoo_configs
 _JOB_KEYS = (
     *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "policy", "policy_kwargs", "expert"),
     *("callback", "env_wrapper", "vec_env_wrapper", "normalize"),
@@ -156,9 +157,13 @@ def check_environment(env_id: str) -> None:
 def config_names() -> list[str]:
     """The YAML files that come with the package, as ``--conf-file`` takes them."""
     root = resources.files("sb3_quad.zoo_configs")
-    names = [entry.name for entry in root.iterdir() if entry.name.endswith(".yml")]
-    thesis = root.joinpath("thesis")
-    return sorted(names) + sorted(f"thesis/{entry.name}" for entry in thesis.iterdir() if entry.name.endswith(".yml"))
+    folders = {"": root, **{f"{name}/": root.joinpath(name) for name in CONFIG_FOLDERS}}
+    return [
+        f"{prefix}{name}"
+        for prefix, folder in folders.items()
+        for name in sorted(entry.name for entry in folder.iterdir())
+        if name.endswith(".yml")
+    ]
 
 
 def read_yaml(text: str, where: str) -> Any:
