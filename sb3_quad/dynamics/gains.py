@@ -44,7 +44,6 @@ class GeometricGains(BaseModel):
     attitude: Positive = Field(description="desired body rate per small angle of thrust direction error, 1/s")
     angular_deceleration: Positive = Field(description="angular deceleration that a turn plans with, rad/s²")
     body_rates: Positive = Field(description="angular acceleration per error of roll and pitch rate, 1/s")
-    thrust_cone: Positive = Field(le=1, description="cosine of the direction error from which the whole thrust is given")
     yaw_rate: Positive = Field(description="angular deceleration per yaw rate, 1/s")
     measured: GeometricFigures | None = Field(default=None, description="the figures these gains reached")
 

@@ -26,7 +26,7 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
     moments = np.abs(vehicle.mixer[1:3]).sum(axis=1) * (high - low) / 2
     turn = float(np.min(moments / np.asarray(vehicle.inertia[:2])))
     lag = command_lag(vehicle)
-    rate = 1.0 / (lag + 1.0 / math.sqrt(turn))
+    rate = min(1.0 / (lag + 1.0 / math.sqrt(turn)), 0.438 / lag)
     sideways = math.sqrt(most**2 - 1.0)
     return GeometricGains(
         position=0.271 * rate,
@@ -40,7 +40,6 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
         attitude=1.19 * rate,
         angular_deceleration=1.81 * turn,
         body_rates=0.685 / lag,
-        thrust_cone=0.157,
         yaw_rate=0.110 / lag,
     )
 
@@ -57,8 +56,8 @@ class GeometricExpert(Expert):
     attitude (Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control", IEEE Control Systems 31(3), 2011): the
     thrust direction only, before the yaw, as in Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control"
     (IEEE Trans. Control Systems Technology 28(2), 2020), since no task here asks for a heading. What it adds to them:
-    velocities and body rates that the vehicle can brake from, the turn as it will be when the command acts, the long way
-    round where the spin makes that quicker, and the least thrust while the thrust points away from where it should.
+    velocities and body rates that the vehicle can brake from, the attitude as it will be when the command acts, the long
+    way round where the spin makes that quicker, and rotor thrusts that give up yaw before thrust and thrust before tilt.
 
     The actions are a function of what the 18 observed features hold; nothing is remembered.
 
@@ -179,5 +178,4 @@ def _geometric(x, gains, body, mixer_inverse, thrust_range, actions):  # type: i
         b3 = (2 * (qx * qz + w * qy) * fx + 2 * (qy * qz - w * qx) * fy + (1 - 2 * (qx * qx + qy * qy)) * fz) / size
         b1, b2, b3 = _rotated(b1, b2, b3, p, q, r, lag)
         mx, my = _turn_moments(b1, b2, b3, p, q, r, gains, body)
-        thrust = mass * size * min(1.0, max(0.0, b3 / gains[11]))
-        _allocate(thrust, mx, my, -gains[12] * izz * r, mixer_inverse, low, high, actions[i])
+        _allocate(mass * size * b3, mx, my, -gains[11] * izz * r, mixer_inverse, low, high, actions[i])
