@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,8 @@ class BestModel(BaseCallback):
     :param best_model: where the best model goes.
     :param evaluations: where the figures go; a file that is there already is continued.
     :param report: told of each evaluation in one line.
+    :param others: by name: further environments, such as those of another task, to evaluate in at the same times. They have no
+        say in which model is best; their figures go to ``evaluations_<name>.npz`` beside ``evaluations``.
     """
 
     def __init__(
@@ -41,30 +43,29 @@ class BestModel(BaseCallback):
         best_model: Path,
         evaluations: Path,
         report: Callable[[str], None] = lambda line: None,
+        others: Mapping[str, VecEnv] | None = None,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
         self._env = env
         self._every, self._next = every, every
         self._n_episodes, self._seed = n_episodes, seed
-        self._best_model, self._evaluations = best_model, evaluations
+        self._best_model = best_model
         self._report = report
         self._start = 0.0
-        self._seconds_before = 0.0
-        self._records: dict[str, list[Any]] = {
-            key: [] for key in ("timesteps", "results", "ep_lengths", "successes", "seconds")
+        self._figures = _Figures(evaluations)
+        self._others = {
+            name: (other, _Figures(evaluations.with_name(f"{evaluations.stem}_{name}.npz")))
+            for name, other in (others or {}).items()
         }
         self.best: tuple[float, float] = (-np.inf, -np.inf)  # success rate, mean reward
 
     def _on_training_start(self) -> None:
         self._start = time.perf_counter()
         self._next = (self.num_timesteps // self._every + 1) * self._every
-        if self._evaluations.is_file():
-            with np.load(self._evaluations) as file:
-                self._records = {key: list(file[key]) for key in self._records}
-            self._seconds_before = float(self._records["seconds"][-1])
-            pairs = zip(self._records["successes"], self._records["results"], strict=True)
-            self.best = max((float(np.mean(successes)), float(np.mean(results))) for successes, results in pairs)
+        for figures in (self._figures, *(figures for _, figures in self._others.values())):
+            figures.go_on()
+        self.best = max(self._figures.scores(), default=self.best)
 
     def _on_step(self) -> bool:
         if self.num_timesteps >= self._next:
@@ -74,35 +75,66 @@ class BestModel(BaseCallback):
 
     def evaluate(self) -> None:
         """Evaluate the model as it is now, note the figures, and keep it if it is the best so far."""
+        seconds = self._figures.seconds_before + time.perf_counter() - self._start
+        score = self._fly(self._env, self._figures, seconds, "eval")
+        line = f"{self.num_timesteps:>12,} transitions, {seconds:6.1f} s: {_in_words(score)}"
+        for name, (env, figures) in self._others.items():
+            line += f"; {name}: {_in_words(self._fly(env, figures, seconds, f'eval_{name}'))}"
+        better = score > self.best
+        if better:
+            self.best = score
+            save_model(self.model, self._best_model)
+        self._report(line + (" (best so far)" if better else ""))
+
+    def _fly(self, env: VecEnv, figures: _Figures, seconds: float, group: str) -> tuple[float, float]:
         successes: list[float] = []
 
         def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
             if local_variables["done"]:  # an environment that knows no success counts as failing: reward decides
                 successes.append(float(local_variables["info"].get("is_success", 0.0)))
 
-        self._env.seed(self._seed)
+        env.seed(self._seed)
         rewards, lengths = evaluate_policy(
-            self.model, self._env, self._n_episodes, deterministic=True, return_episode_rewards=True, callback=note, warn=False
+            self.model, env, self._n_episodes, deterministic=True, return_episode_rewards=True, callback=note, warn=False
         )
+        figures.add(timesteps=self.num_timesteps, results=rewards, ep_lengths=lengths, successes=successes, seconds=seconds)
         score = (float(np.mean(successes)), float(np.mean(rewards)))
-        seconds = self._seconds_before + time.perf_counter() - self._start
-        entry = (self.num_timesteps, rewards, lengths, successes, seconds)
-        for records, value in zip(self._records.values(), entry, strict=True):
-            records.append(value)
-        self._write()
-        self.logger.record("eval/success_rate", score[0])
-        self.logger.record("eval/mean_reward", score[1])
-        self.logger.record("eval/mean_ep_length", float(np.mean(lengths)))
-        better = score > self.best
-        if better:
-            self.best = score
-            save_model(self.model, self._best_model)
-        self._report(
-            f"{self.num_timesteps:>12,} transitions, {seconds:6.1f} s: success {100 * score[0]:.1f} %, "
-            f"mean reward {score[1]:.2f}{' (best so far)' if better else ''}"
-        )
+        self.logger.record(f"{group}/success_rate", score[0])
+        self.logger.record(f"{group}/mean_reward", score[1])
+        self.logger.record(f"{group}/mean_ep_length", float(np.mean(lengths)))
+        return score
 
-    def _write(self) -> None:
+
+def _in_words(score: tuple[float, float]) -> str:
+    return f"success {100 * score[0]:.1f} %, mean reward {score[1]:.2f}"
+
+
+class _Figures:
+    """The figures of a file such as EvalCallback's ``evaluations.npz``, a row more with each evaluation."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.records: dict[str, list[Any]] = {
+            key: [] for key in ("timesteps", "results", "ep_lengths", "successes", "seconds")
+        }
+        self.seconds_before = 0.0
+
+    def go_on(self) -> None:
+        """Take over what the file holds already."""
+        if self.path.is_file():
+            with np.load(self.path) as file:
+                self.records = {key: list(file[key]) for key in self.records}
+            self.seconds_before = float(self.records["seconds"][-1])
+
+    def scores(self) -> list[tuple[float, float]]:
+        """Success rate and mean reward of every evaluation."""
+        pairs = zip(self.records["successes"], self.records["results"], strict=True)
+        return [(float(np.mean(successes)), float(np.mean(results))) for successes, results in pairs]
+
+    def add(self, **row: Any) -> None:
+        """Add a row and write the file."""
+        for key, records in self.records.items():
+            records.append(row[key])
         buffer = io.BytesIO()
-        np.savez(buffer, **{key: np.array(values) for key, values in self._records.items()})  # type: ignore[arg-type]
-        write_bytes(self._evaluations, buffer.getvalue())
+        np.savez(buffer, **{key: np.array(values) for key, values in self.records.items()})  # type: ignore[arg-type]
+        write_bytes(self.path, buffer.getvalue())

@@ -40,7 +40,7 @@ from sb3_quad.dynamics.lowlevel import (
 from sb3_quad.dynamics.state import STATE_SIZE
 from sb3_quad.dynamics.streams import STEP
 from sb3_quad.dynamics.vehicle import PARAMETER_NAMES
-from sb3_quad.envs.episodes import load_limits, score_block, start_episode
+from sb3_quad.envs.episodes import TASK_COLUMNS, load_limits, score_block, start_episode
 from sb3_quad.envs.observation import OBSERVATION_SIZE, observe_block, store_observations
 
 # A job: sizes, then addresses of arrays in this order. Columns: 1 where one serves all rows.
@@ -62,7 +62,6 @@ JOB_SIZE = FIRST_ADDRESS + len(ADDRESSED)
 
 # The control array, each number on a cache line of its own.
 LEFT, DONE, JOB, SERIAL, AWAKE = 0, 16, 32, 48, 64  # AWAKE + 16 k: helper k is looking for work
-_TASK_COLUMNS = 13
 _PARAMETERS = len(PARAMETER_NAMES)
 
 
@@ -84,7 +83,7 @@ def run_block(job, block, scratch, fresh):
     std = carray(pointer(job[A_STD]), (OBSERVATION_SIZE, scaling), np.float64)
     noise_level = carray(pointer(job[A_NOISE]), (scaling,), np.float64)
     task_index = carray(pointer(job[A_TASK_INDEX]), (n,), np.int64)
-    task_parameters = carray(pointer(job[A_TASKS]), (tasks, _TASK_COLUMNS), np.float64)
+    task_parameters = carray(pointer(job[A_TASKS]), (tasks, TASK_COLUMNS), np.float64)
     task_weights = carray(pointer(job[A_WEIGHTS]), (tasks,), np.float64)
     returns = carray(pointer(job[A_RETURNS]), (n,), np.float64)
     observations = carray(pointer(job[A_OBSERVATIONS]), (n, OBSERVATION_SIZE), np.float32)

@@ -37,7 +37,9 @@ from sb3_quad.dynamics.blocks import (
 from sb3_quad.dynamics.lowlevel import LANES, SCRATCH_SIZE, compiled, float64_rows, scratch_pointer
 from sb3_quad.dynamics.streams import EPISODE, EPISODE_START, STEP, uniforms
 
-START, TARGET_DISTANCE, RANDOM_ATTITUDE, VELOCITY_STD, BODY_RATES_STD, LIMITS = 0, 3, 4, 5, 6, 7  # columns of the table
+# Columns of the table; START has three.
+START, NEAREST_TARGET, FARTHEST_TARGET, CLEARANCE, RANDOM_ATTITUDE, VELOCITY_STD, BODY_RATES_STD, LIMITS = 0, *range(3, 10)
+TASK_COLUMNS = LIMITS + 6
 POSITION_COST, TILT_COST, RATES_COST, COLLISION_COST, RANGE_COST = range(MAX_DISTANCE + 1, MAX_DISTANCE + 6)
 TURN = 2.0 * math.pi
 
@@ -47,7 +49,7 @@ def start_episode(i, state, queue, streams, task_index, vehicles, task_parameter
     """Begin the next episode of row i: its stream's next, with a task, state and target drawn from it."""
     streams[EPISODE, i] += np.uint32(1)
     streams[STEP, i] = np.uint32(0)
-    u = uniforms(streams, i, 6, EPISODE_START)
+    u = uniforms(streams, i, 7, EPISODE_START)
     choice, height, azimuth = u[0], u[1], TURN * u[2]
     k = 0
     while k < task_weights.shape[0] - 1 and choice >= task_weights[k]:
@@ -56,9 +58,11 @@ def start_episode(i, state, queue, streams, task_index, vehicles, task_parameter
     column = min(i, vehicles.shape[1] - 1)
     position = task_parameters[k, START], task_parameters[k, START + 1], task_parameters[k, START + 2]
 
-    distance = task_parameters[k, TARGET_DISTANCE]
-    # A uniform direction has a uniform height (Archimedes): cut it where the target would lie below ground.
-    lowest = min(max(-1.0, (vehicles[P_RADIUS, column] - position[2]) / distance), 1.0) if distance > 0.0 else -1.0
+    nearest = task_parameters[k, NEAREST_TARGET]
+    distance = nearest + (task_parameters[k, FARTHEST_TARGET] - nearest) * u[12]
+    # A uniform direction has a uniform height (Archimedes): cut it where the target would lie too close to the ground.
+    ground = vehicles[P_RADIUS, column] + task_parameters[k, CLEARANCE]
+    lowest = min(max(-1.0, (ground - position[2]) / distance), 1.0) if distance > 0.0 else -1.0
     up = lowest + (1.0 - lowest) * height
     across = math.sqrt(max(0.0, 1.0 - up * up))
     state[PX, i], state[PY, i], state[PZ, i] = position

@@ -1,4 +1,4 @@
-"""The two tasks (thesis 4.2): where an episode starts, what a control step is worth and when it is over.
+"""The two tasks (thesis 4.2) and one that is both: where an episode starts, what a step is worth and when it is over.
 
 A task is data, one row of a table; the functions that read the table are in envs/episodes.py, for both environments.
 """
@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from sb3_quad.dynamics.quantities import Finite
 from sb3_quad.envs.episodes import reset_rows, score
@@ -35,6 +35,12 @@ class Task(BaseModel):
     name: str = Field(default="custom", min_length=1, description="what the task is called")
     start_position: tuple[Finite, Finite, Finite] = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
     target_distance: NotNegative = Field(default=0.0, description="|r_T - r0|, m; 0: the target is r0")
+    nearest_target: NotNegative | None = Field(
+        default=None, description="if given, |r_T - r0| is uniform between this and target_distance, m"
+    )
+    target_clearance: NotNegative = Field(
+        default=0.25, description="no target is closer to the ground than the collision body plus this, m"
+    )
     random_attitude: bool = Field(default=False, description="start attitude uniform on SO(3), else level")
     velocity_std: NotNegative = Field(default=0.0, description="standard deviation of v at the start, per axis, m/s")
     body_rates_std: NotNegative = Field(default=0.0, description="of the body rates at the start, per axis, rad/s")
@@ -52,20 +58,36 @@ class Task(BaseModel):
             raise ValueError("must lie above the ground (z > 0)")
         return value
 
+    @model_validator(mode="after")
+    def _nearest_first(self) -> Task:
+        if self.nearest_target is not None and self.nearest_target > self.target_distance:
+            raise ValueError(f"nearest_target {self.nearest_target} exceeds target_distance {self.target_distance}")
+        return self
+
     def parameters(self) -> FloatArray:
         """What the compiled functions need, shape (len(TASK_PARAMETERS),)."""
-        values = [*self.start_position, *(float(getattr(self, name)) for name in TASK_PARAMETERS[3:])]
-        return np.array(values, dtype=np.float64)
+        nearest = self.target_distance if self.nearest_target is None else self.nearest_target
+        others = (float(getattr(self, name)) for name in TASK_PARAMETERS[4:])
+        return np.array([*self.start_position, nearest, *others], dtype=np.float64)
 
 
 TASK_PARAMETERS = (
-    *("start_x", "start_y", "start_z", "target_distance", "random_attitude", "velocity_std", "body_rates_std"),
+    *("start_x", "start_y", "start_z", "nearest_target", "target_distance", "target_clearance"),
+    *("random_attitude", "velocity_std", "body_rates_std"),
     *("max_distance", "position_cost", "tilt_cost", "body_rates_cost", "collision_cost", "out_of_range_cost"),
 )
 
 TASKS: Mapping[str, Task] = {
     "target_tracking": Task(name="target_tracking", target_distance=10.0),
     "state_recovery": Task(name="state_recovery", random_attitude=True, velocity_std=2.0, body_rates_std=4.0),
+    "recovery_and_tracking": Task(
+        name="recovery_and_tracking",
+        target_distance=20.0,
+        nearest_target=0.0,
+        random_attitude=True,
+        velocity_std=2.0,
+        body_rates_std=4.0,
+    ),
 }
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 

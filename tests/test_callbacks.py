@@ -105,6 +105,17 @@ def test_records_are_continued(tmp_path):
     assert best.best == max(zip(means[1].tolist(), means[0].tolist(), strict=True))
 
 
+def test_other_environments_are_evaluated_at_the_same_times_and_decide_nothing(tmp_path):
+    alone = make_best(tmp_path / "alone", every=40)
+    make_model().learn(80, callback=alone)
+    best = make_best(tmp_path / "both", every=40, others={"far": make_vec_env(lambda: Walk(), 2)})
+    make_model().learn(80, callback=best)
+    assert best.best == alone.best
+    with np.load(tmp_path / "both" / "evaluations.npz") as own, np.load(tmp_path / "both" / "evaluations_far.npz") as far:
+        assert own["timesteps"].tolist() == far["timesteps"].tolist() == [40, 80]
+        np.testing.assert_array_equal(own["results"], far["results"])  # here the same environment, so the same episodes
+
+
 def test_checkpoints_are_whole_models_at_their_number_of_steps(tmp_path):
     model = make_model()
     model.learn(160, callback=Checkpoint(50, lambda steps: tmp_path / f"rl_model_{steps}_steps.zip"))

@@ -167,6 +167,7 @@ def test_help_has_examples_and_needs_no_torch():
 def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
     arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "--no-progress"]
     more = ["--eval-freq", "400", "--eval-episodes", "4", "--save-freq", "800", "--env-kwargs", "noise:0.1", "--seed", "3"]
+    more += ["--hyperparams", "eval_tasks:state_recovery"]
     assert main(arguments + more) == 0
     output = capsys.readouterr().out
     run = tmp_path / "logs" / "dagger" / f"{ENV}_1"
@@ -175,7 +176,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
         *(f"{ENV}.zip", "best_model.zip", "rl_model_800_steps.zip", "evaluations.npz", "0.monitor.csv"),
-        *(f"{ENV}/config.yml", f"{ENV}/args.yml"),
+        *("evaluations_state_recovery.npz", f"{ENV}/config.yml", f"{ENV}/args.yml"),
     }
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
     arguments_file = yaml.safe_load((run / ENV / "args.yml").read_text())

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 import pytest
 import yaml
@@ -10,6 +13,7 @@ from stable_baselines3 import PPO
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, TrainingError
+from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.training.pipeline import load_pipeline, make_jobs, run_pipeline, with_settings
 from sb3_quad.training.trim import hover_offset, scale_position, shift_position, trim
 
@@ -115,3 +119,45 @@ def test_scaling_the_position_is_seen_by_the_actor_as_a_longer_way():
     expected = model.predict(longer, deterministic=True)[0]
     scale_position(model, 0.8)
     np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, atol=1e-5)
+
+
+def small_file(tmp_path):
+    settings = {**TINY, "policy_kwargs": {"net_arch": [8, 8]}}
+    return write(tmp_path, [{**stage, "settings": {**settings, **stage.get("settings", {})}} for stage in STAGES])
+
+
+def test_the_reference_agent_stands_in_the_same_table(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sb3_quad.cli.stages.FRESH_EPISODES", 4)
+    arguments = ["train", "--conf-file", str(small_file(tmp_path)), "-f", str(tmp_path / "logs"), "--eval-episodes", "0"]
+    assert main([*arguments, "--reference"]) == 0
+    output = capsys.readouterr().out
+    assert output.count("PPO only") >= 4 and output.count("fresh episodes, the same for all") == 2
+    alone = PPO.load(next((tmp_path / "logs" / "ppo").rglob("QuadStateRecovery-v0.zip")))
+    assert alone.num_timesteps >= 2 * TINY["n_timesteps"]
+
+
+def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("sb3_quad.cli.stages.FRESH_EPISODES", 4)
+    whole, interrupted = (str(tmp_path / name) for name in ("whole", "interrupted"))
+    arguments = ["train", "--conf-file", str(small_file(tmp_path)), "--eval-episodes", "0"]
+    assert main([*arguments, "-f", whole]) == 0
+
+    original, rollouts = PPOBC.train, []
+
+    def train(self):
+        original(self)
+        rollouts.append(None)
+        if len(rollouts) == 1:
+            os.kill(os.getpid(), signal.SIGINT)  # within stage two, when stage one is done
+
+    monkeypatch.setattr(PPOBC, "train", train)
+    assert main([*arguments, "-f", interrupted]) == 130
+    folder = next((tmp_path / "interrupted" / "stages").iterdir())
+    assert len(yaml.safe_load((folder / "pipeline.yml").read_text(encoding="utf-8"))["done"]) == 1
+    capsys.readouterr()
+    assert main(["train", "--resume", str(folder)]) == 0
+    assert capsys.readouterr().out.count("fresh episodes, the same for all") == 2
+    for algo in ("dagger", "ppo_bc"):
+        one, two = (next((tmp_path / name / algo).rglob("Quad*.zip")) for name in ("whole", "interrupted"))
+        for ours, theirs in zip(policy(one).values(), policy(two).values(), strict=True):
+            np.testing.assert_array_equal(ours, theirs)

@@ -52,6 +52,7 @@ def test_the_command_writes_a_picture(runs, capsys):
         (["agent={runs}/Env_1", "-o", "curves.gif"], "must end in"),
         (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
         (["agent={runs}"], "no such file"),
+        (["agent={runs}/Env_1", "--task", "target_tracking"], "none of this run's eval_tasks"),
     ],
 )
 def test_bad_input_is_one_line(runs, arguments, message, capsys):

@@ -10,6 +10,7 @@ from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.ppo_bc import PPOBC
+from sb3_quad.ppo_bc.forward import evaluate
 
 SMALL = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 3, "device": "cpu"}
 
@@ -34,6 +35,41 @@ def test_without_additions_it_is_ppo_bit_for_bit(clip_range_vf):
         "MlpPolicy", "Pendulum-v1", clip_range_vf=clip_range_vf, ent_coef=0.01, bc_coef=0.0, max_clipped_value=False, **SMALL
     ).learn(256)
     assert th.equal(parameters(stock), parameters(ours))
+
+
+@pytest.mark.parametrize("settings", [{}, {"clip_range_vf": 0.2, "max_clipped_value": False}, {"target_kl": 1e-3}])
+def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
+    """The faster update computes what PPO's does: with a weight of 1e-12 on an addition, only rounding is left of it."""
+    for_ppo = {key: value for key, value in settings.items() if key != "max_clipped_value"}
+    stock = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SMALL).learn(128)
+    ours = PPOBC("MlpPolicy", "Pendulum-v1", ent_coef=0.01, l2_coef=1e-12, bc_coef=0.0, **settings, **SMALL).learn(128)
+    start = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SMALL)
+    assert (parameters(stock) - parameters(start)).abs().max() > 1e-3
+    th.testing.assert_close(parameters(ours), parameters(stock), rtol=1e-3, atol=1e-5)
+    assert ours._n_updates == stock._n_updates
+
+
+@pytest.mark.parametrize(
+    ("env", "policy_kwargs", "settings"),
+    [
+        ("Pendulum-v1", {"net_arch": {"pi": [8], "vf": [16, 8]}}, {}),
+        ("Pendulum-v1", {"activation_fn": th.nn.ReLU, "share_features_extractor": False}, {}),
+        ("Pendulum-v1", {}, {"use_sde": True}),
+        ("CartPole-v1", {}, {}),
+    ],
+)
+def test_the_forward_pass_is_the_policys_own(env, policy_kwargs, settings):
+    model = PPO("MlpPolicy", env, policy_kwargs=policy_kwargs, **settings, **SMALL)
+    observations = th.randn(32, *model.observation_space.shape)
+    with th.no_grad():
+        actions = model.policy(observations)[0]
+    values, log_prob, entropy = model.policy.evaluate_actions(observations, actions)
+    ours = evaluate(model.policy, observations, actions)
+    close = {"rtol": 1e-4, "atol": 1e-5}
+    th.testing.assert_close(ours.values, values.flatten(), **close)
+    th.testing.assert_close(ours.log_prob, log_prob, **close)
+    th.testing.assert_close(ours.entropy.expand_as(entropy), entropy, **close)
+    th.testing.assert_close(ours.mean, model.policy.get_distribution(observations).mode(), **close)
 
 
 def test_labelling_alone_changes_nothing():
@@ -133,8 +169,9 @@ def test_labels_that_do_not_fit_stop_training(expert, message):
         PPOBC("MlpPolicy", "Pendulum-v1", expert=expert, **SMALL).learn(64)
 
 
-def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters():
-    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **SMALL)
+@pytest.mark.parametrize("l2_coef", [0.0, 1e-3])
+def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_coef):
+    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, l2_coef=l2_coef, **SMALL)
     before = parameters(model)
     original = model.train
 

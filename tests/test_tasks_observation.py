@@ -11,6 +11,7 @@ import pytest
 from sb3_quad.dynamics.state import QUATERNION, ROTOR_SPEEDS, STATE_SIZE, QuadcopterState
 from sb3_quad.dynamics.streams import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
 from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs.episodes import TASK_COLUMNS
 from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE, observe
 from sb3_quad.envs.tasks import TASK_PARAMETERS, TASKS, Task, reset_rows, resolve_tasks, score
 from sb3_quad.errors import ConfigError
@@ -196,9 +197,16 @@ def test_targets_are_never_below_ground(distance):
     state = QuadcopterState(rows.state)
     np.testing.assert_allclose(state.distance, distance)
     height = state.target[:, 2]
-    assert height.min() >= ITM.collision_radius - 1e-9
-    upper = 15.0 + distance
-    assert height.mean() == pytest.approx((max(15.0 - distance, ITM.collision_radius) + upper) / 2, rel=0.03)
+    lowest = max(15.0 - distance, ITM.collision_radius + 0.25)
+    assert height.min() >= lowest - 1e-9
+    assert height.mean() == pytest.approx((lowest + 15.0 + distance) / 2, rel=0.03)
+
+
+def test_targets_near_and_far():
+    rows = start(20_000, "recovery_and_tracking")
+    state = QuadcopterState(rows.state)
+    assert np.quantile(state.distance, [0.0, 0.25, 0.5, 0.75, 1.0]) == pytest.approx([0, 5, 10, 15, 20], abs=0.4)
+    assert np.linalg.norm(state.velocity, axis=1).min() > 0.0
 
 
 def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():
@@ -258,7 +266,7 @@ def test_tasks_of_the_thesis():
     assert tracking.target_distance == 10.0 and not tracking.random_attitude
     assert recovery.target_distance == 0.0 and recovery.random_attitude
     assert (recovery.velocity_std, recovery.body_rates_std) == (2.0, 4.0)
-    assert len(tracking.parameters()) == len(TASK_PARAMETERS)
+    assert len(tracking.parameters()) == len(TASK_PARAMETERS) == TASK_COLUMNS
 
 
 def test_task_specifications():
@@ -280,6 +288,7 @@ def test_task_specifications():
         ({"target_tracking": 0.0}, {}, "weights"),
         ("target_tracking", {"target_distanc": 1}, "did you mean 'target_distance'"),
         ("target_tracking", {"target_distance": -1}, "target_distance"),
+        ("target_tracking", {"nearest_target": 11}, "nearest_target 11"),
         ("target_tracking", {"velocity_std": float("nan")}, "finite"),
         ("target_tracking", {"max_distance": 0}, "max_distance"),
         ("target_tracking", {"start_position": (0, 0, -1)}, "above the ground"),

@@ -176,7 +176,7 @@ def test_packaged_files_hold_good_settings(name):
     content, _ = read_settings(name)
     if "stages" in content:
         pytest.skip("a pipeline")
-    algo = name.removeprefix("thesis/").removesuffix(".yml")
+    algo = name.rpartition("/")[2].removesuffix(".yml")
     assert algo in ALGORITHMS
     for env_id in content:
         assert load_config(algo, env_id, name).n_timesteps > 0

@@ -21,6 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("groups", nargs="+", metavar="NAME=PATTERN", help="an agent's name and its run folders, * allowed (quote it)")
     add("--line", action="append", default=[], metavar="NAME:SUCCESS:REWARD", help="a horizontal line: success in %%, reward")
+    add("--task", help="draw the evaluations on this one of the runs' eval_tasks, instead of those on their own task")
     add("--title", default="", help="above the picture")
     add("-o", "--output", default="curves.png", metavar="FILE", help="picture to write: .png, .svg or .pdf (curves.png)")
 
@@ -38,7 +39,7 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigError(f"{text!r}: give NAME=PATTERN, such as 'RL-agent=logs/ppo_bc/*'")
         if not folders:
             raise ConfigError(f"{name}: no folder fits {pattern}")
-        groups[name] = [read_curve(folder) for folder in folders]
+        groups[name] = [read_curve(folder, options.task) for folder in folders]
     output = Path(options.output)
     kind = output.suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):

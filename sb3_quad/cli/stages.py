@@ -89,8 +89,10 @@ def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:
     """PPO alone on as many transitions as all stages had together."""
     from sb3_quad.training.config import load_config
 
-    kept: dict[str, Any] = {
-        key: first.config.settings[key] for key in ("vec_env", "env_kwargs") if key in first.config.settings
+    given = first.config.env_kwargs
+    kept = {
+        "vec_env": first.config.vec_env,
+        "env_kwargs": {key: given[key] for key in ("vehicle", "noise", "observation_std") if key in given},
     }
     config = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, {**kept, "n_timesteps": n_timesteps})
     return replace(first, config=config, trained_agent=None)

@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
     from sb3_quad.training.trainer import TrainingResult
 
-HELP = "Train an agent. Without arguments: both stages of the thesis, DAgger from the PID expert, then PPO with cloning."
+HELP = "Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning."
 EXAMPLES = """examples:
   sb3-quad train                                          both stages, on the batched environment
+  sb3-quad train --conf-file two_stage.yml                both stages from the PID expert, as in the thesis
   sb3-quad train --reference                              and PPO alone on the same budget, in the same table
   sb3-quad train --algo dagger                            stage one alone
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, one process each
@@ -34,7 +35,7 @@ EXAMPLES = """examples:
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
 FRESH_EPISODES = 240
-DEFAULT_PIPELINE = "two_stage.yml"
+DEFAULT_PIPELINE = "geometric/two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
@@ -47,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-n", "--n-timesteps", type=whole, metavar="N", help="transitions to train on")
     add("--n-envs", type=whole, metavar="N", help="environments side by side")
     add("--vec-env", metavar="KIND", help="batch (compiled), dummy (PyBullet, one process) or subproc (one process each)")
-    add("--expert", metavar="SPEC", help="pid, path/to/model.zip or package.module:factory")
+    add("--expert", metavar="SPEC", help="pid, geometric, path/to/model.zip or package.module:factory")
     add("-params", "--hyperparams", nargs="+", metavar="K:V", help="settings to change, such as n_steps:500")
     add("--env-kwargs", nargs="+", metavar="K:V", help="keywords of the environment, such as noise:0")
     add("--eval-env-kwargs", nargs="+", metavar="K:V", help="the same, for the evaluation's environments only")

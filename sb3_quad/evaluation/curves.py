@@ -36,13 +36,16 @@ class Curve:
     reward: FloatArray
 
 
-def read_curve(run: str | Path) -> Curve:
+def read_curve(run: str | Path, task: str | None = None) -> Curve:
     """The curve of a run folder, from its ``evaluations.npz``.
 
+    :param task: one of the run's ``eval_tasks``; None for its environment's own.
     :raises ConfigError: a folder without evaluations, or a damaged file.
     """
-    path = Path(run) / "evaluations.npz"
+    path = Path(run) / ("evaluations.npz" if task is None else f"evaluations_{task}.npz")
     if not path.is_file():
+        if task is not None:
+            raise ConfigError(f"{path}: no such file; {task} is none of this run's eval_tasks")
         raise ConfigError(f"{path}: no such file; a run that was trained with --eval-episodes 0 has no curve")
     try:
         with np.load(path) as file:

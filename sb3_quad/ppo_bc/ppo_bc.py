@@ -10,25 +10,18 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.distributions import Distribution
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
-from torch.nn import functional as F
 
 from sb3_quad.common.labels import ExpertLabeller
-from sb3_quad.common.losses import gaussian_nll, l2_loss
-from sb3_quad.common.losses import value_loss as max_clipped_value_loss
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer, ExpertRolloutBufferSamples
-from sb3_quad.ppo_bc.forward import evaluate
 from sb3_quad.ppo_bc.gradients import gradient_norms
+from sb3_quad.ppo_bc.loss import BC_FILTERS, BC_LOSSES, LossTerms, Weights, loss_terms
 
 SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
-BC_LOSSES = ("nll", "mse")
-BC_FILTERS = ("none", "negative_advantage", "agreement")
-AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
 
 
 class PPOBC(PPO):
@@ -39,8 +32,9 @@ class PPOBC(PPO):
     ratio is its exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
 
     All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. With ``bc_coef=0``, ``l2_coef=0`` and
-    ``critic_warmup=0`` (and either no ``clip_range_vf`` or ``max_clipped_value=False``) training is PPO's, bit for bit. A
-    saved model loads with ``PPO.load``, also where this package is not installed.
+    ``critic_warmup=0`` (and either no ``clip_range_vf`` or ``max_clipped_value=False``) training is PPO's, bit for bit; with
+    any of them it is equal to PPO's to rounding, plus what is added, by an update that takes two thirds of the time. A saved
+    model loads with ``PPO.load``, also where this package is not installed.
 
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
         an SB3 model, or a callable from observations to actions. Needed when learning starts with a cloning weight.
@@ -167,7 +161,7 @@ class PPOBC(PPO):
         return float(self.bc_coef(self._current_progress_remaining))  # type: ignore[operator]
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.expert is None and any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0)):
+        if self.expert is None and self._ever_clones():
             raise ExpertError(
                 "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
             )
@@ -206,149 +200,111 @@ class PPOBC(PPO):
         else:
             self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labeller.labels(observation)
 
+    @property
+    def _adds_nothing(self) -> bool:
+        """Whether the loss is PPO's own, from the first update to the last."""
+        cloning = self._labeller is not None and self._ever_clones()
+        own_value_loss = self.clip_range_vf is not None and self.max_clipped_value
+        return not (cloning or own_value_loss or self.l2_coef > 0.0 or self.critic_warmup > 0)
+
+    def _ever_clones(self) -> bool:
+        return any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0))
+
     def train(self) -> None:
-        """One update on the current rollout: ``PPO.train`` with the added terms (each marked "PPO+BC")."""
+        """One update on the current rollout; without any addition, ``PPO.train`` itself."""
+        if self._adds_nothing:
+            self._train_as_ppo()
+            return
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        clip_range = self.clip_range(self._current_progress_remaining)  # type: ignore[operator]
-        if self.clip_range_vf is not None:
-            clip_range_vf = self.clip_range_vf(self._current_progress_remaining)  # type: ignore[operator]
-        # PPO+BC
-        bc_coef = self._current_bc_coef() if self._labeller is not None else 0.0
+        weights = self._weights()
         warming_up = self._n_rollouts_trained < self.critic_warmup
+        parameters = list(self.policy.parameters())
         grad_norms: dict[str, float] = {}
-        bc_losses, l2_losses = [], []
+        monitored: list[dict[str, th.Tensor]] = []
+        stopped = False
 
-        entropy_losses = []
-        pg_losses, value_losses = [], []
-        clip_fractions = []
-
-        continue_training = True
         for epoch in range(self.n_epochs):
-            approx_kl_divs = []
-            for rollout_data in self.rollout_buffer.get(self.batch_size):
-                actions = rollout_data.actions
-                if isinstance(self.action_space, spaces.Discrete):
-                    actions = rollout_data.actions.long().flatten()
-
-                values, log_prob, entropy, distribution = evaluate(self.policy, rollout_data.observations, actions)
-                values = values.flatten()
-                advantages = rollout_data.advantages
-                raw_advantages = advantages  # PPO+BC: the filter looks at their sign before normalisation
-                if self.normalize_advantage and len(advantages) > 1:
-                    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-
-                ratio = th.exp(log_prob - rollout_data.old_log_prob)
-
-                policy_loss_1 = advantages * ratio
-                policy_loss_2 = advantages * th.clamp(ratio, 1 - clip_range, 1 + clip_range)
-                policy_loss = -th.min(policy_loss_1, policy_loss_2).mean()
-
-                pg_losses.append(policy_loss.item())
-                clip_fraction = th.mean((th.abs(ratio - 1) > clip_range).float()).item()
-                clip_fractions.append(clip_fraction)
-
-                if self.clip_range_vf is None:
-                    value_loss = F.mse_loss(rollout_data.returns, values)
-                elif self.max_clipped_value:  # PPO+BC: Eq. 3.8
-                    value_loss = max_clipped_value_loss(values, rollout_data.old_values, rollout_data.returns, clip_range_vf)
-                else:
-                    values_pred = rollout_data.old_values + th.clamp(
-                        values - rollout_data.old_values, -clip_range_vf, clip_range_vf
-                    )
-                    value_loss = F.mse_loss(rollout_data.returns, values_pred)
-                value_losses.append(value_loss.item())
-
-                if entropy is None:
-                    entropy_loss = -th.mean(-log_prob)
-                else:
-                    entropy_loss = -th.mean(entropy)
-
-                entropy_losses.append(entropy_loss.item())
-
-                loss = policy_loss + self.ent_coef * entropy_loss + self.vf_coef * value_loss
-                # PPO+BC: the terms that Eq. 4.4 adds
-                terms = {"policy": policy_loss, "value": self.vf_coef * value_loss}
-                if bc_coef != 0.0:
-                    expert_actions = cast(ExpertRolloutBufferSamples, rollout_data).expert_actions
-                    bc_loss = self._bc_loss(distribution, expert_actions, raw_advantages)
-                    bc_losses.append(bc_loss.item())
-                    terms["bc"] = bc_coef * bc_loss
-                    loss = loss + terms["bc"]
-                if self.l2_coef > 0.0:
-                    l2 = l2_loss(self.policy)
-                    l2_losses.append(l2.item())
-                    loss = loss + self.l2_coef * l2
-                if warming_up:
-                    loss = self.vf_coef * value_loss
-                if not th.isfinite(loss):
-                    raise TrainingError(
-                        f"the loss is {loss.item()} after {self.num_timesteps} steps (policy {policy_loss.item():.3g}, value "
-                        f"{value_loss.item():.3g}): try a smaller learning_rate or bc_coef, and check the expert's actions"
-                    )
+            first = len(monitored)
+            for samples in self.rollout_buffer.get(self.batch_size):
+                terms = loss_terms(self.policy, cast(ExpertRolloutBufferSamples, samples), weights)
+                loss = terms.weighted["value"] if warming_up else th.stack(list(terms.weighted.values())).sum()
+                monitored.append({"loss": loss.detach(), **terms.monitored})
+                self._check_finite(loss, terms)
                 if not grad_norms:
-                    grad_norms = gradient_norms(terms, self.policy.parameters())
-
-                with th.no_grad():
-                    log_ratio = log_prob - rollout_data.old_log_prob
-                    approx_kl_div = th.mean((th.exp(log_ratio) - 1) - log_ratio).cpu().numpy()
-                    approx_kl_divs.append(approx_kl_div)
-
-                if self.target_kl is not None and approx_kl_div > 1.5 * self.target_kl:
-                    continue_training = False
+                    grad_norms = gradient_norms(terms.weighted, parameters)
+                kl = terms.monitored["approx_kl"]
+                if self.target_kl is not None and kl > 1.5 * self.target_kl:
+                    stopped = True
                     if self.verbose >= 1:
-                        print(f"Early stopping at step {epoch} due to reaching max kl: {approx_kl_div:.2f}")
+                        print(f"Early stopping at step {epoch} due to reaching max kl: {kl:.2f}")
                     break
-
                 self.policy.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                th.nn.utils.clip_grad_norm_(self.policy.parameters(), self.max_grad_norm)
+                th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
                 self.policy.optimizer.step()
-
             self._n_updates += 1
-            if not continue_training:
+            if stopped:
                 break
-        self._n_rollouts_trained += 1  # PPO+BC
+        self._n_rollouts_trained += 1
+        self._record(monitored, first, weights, grad_norms)
 
-        explained_var = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
+    def _train_as_ppo(self) -> None:
+        """``PPO.train``, which goes on after a loss that is not finite: the parameters from before it are put back then."""
+        before = [parameter.detach().clone() for parameter in self.policy.parameters()]
+        try:
+            super().train()
+        except ValueError:  # of a distribution whose parameters are NaN
+            finite = False
+        else:
+            finite = all(bool(th.isfinite(parameter).all()) for parameter in self.policy.parameters())
+        if not finite:
+            with th.no_grad():
+                for parameter, old in zip(self.policy.parameters(), before, strict=True):
+                    parameter.copy_(old)
+            raise TrainingError(f"the loss is not finite after {self.num_timesteps} steps: try a smaller learning_rate")
 
-        self.logger.record("train/entropy_loss", np.mean(entropy_losses))
-        self.logger.record("train/policy_gradient_loss", np.mean(pg_losses))
-        self.logger.record("train/value_loss", np.mean(value_losses))
-        self.logger.record("train/approx_kl", np.mean(approx_kl_divs))
-        self.logger.record("train/clip_fraction", np.mean(clip_fractions))
-        self.logger.record("train/loss", loss.item())
-        self.logger.record("train/explained_variance", explained_var)
+    def _weights(self) -> Weights:
+        progress = self._current_progress_remaining
+        return Weights(
+            clip_range=self.clip_range(progress),  # type: ignore[operator]
+            clip_range_vf=None if self.clip_range_vf is None else self.clip_range_vf(progress),  # type: ignore[operator]
+            max_clipped_value=self.max_clipped_value,
+            normalize_advantage=self.normalize_advantage,
+            vf_coef=self.vf_coef,
+            ent_coef=self.ent_coef,
+            bc_coef=self._current_bc_coef() if self._labeller is not None else 0.0,
+            bc_loss=self.bc_loss,
+            bc_filter=self.bc_filter,
+            l2_coef=self.l2_coef,
+        )
+
+    def _check_finite(self, loss: th.Tensor, terms: LossTerms) -> None:
+        if not th.isfinite(loss):
+            raise TrainingError(
+                f"the loss is {loss.item()} after {self.num_timesteps} steps (policy "
+                f"{terms.monitored['policy_gradient_loss'].item():.3g}, value {terms.monitored['value_loss'].item():.3g}): "
+                "try a smaller learning_rate or bc_coef, and check the expert's actions"
+            )
+
+    def _record(
+        self, monitored: list[dict[str, th.Tensor]], first: int, weights: Weights, grad_norms: dict[str, float]
+    ) -> None:
+        """Log an update under PPO's names. As there, ``approx_kl`` is of the last epoch, which began at row ``first``."""
+        for name in monitored[0]:
+            rows = monitored[-1:] if name == "loss" else monitored[first:] if name == "approx_kl" else monitored
+            self.logger.record(f"train/{name}", th.stack([row[name] for row in rows]).mean().item())
+        values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
+        self.logger.record("train/explained_variance", explained_variance(values, returns))
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
-
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", clip_range)
-        if self.clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", clip_range_vf)
-        # PPO+BC
-        self.logger.record("train/bc_coef", bc_coef)
-        if bc_losses:
-            self.logger.record("train/bc_loss", np.mean(bc_losses))
-        if l2_losses:
-            self.logger.record("train/l2_loss", np.mean(l2_losses))
+        self.logger.record("train/clip_range", weights.clip_range)
+        if weights.clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", weights.clip_range_vf)
+        self.logger.record("train/bc_coef", weights.bc_coef)
         for name, norm in grad_norms.items():
             self.logger.record(f"train/grad_norm_{name}", norm)
-
-    def _bc_loss(self, distribution: Distribution, expert_actions: th.Tensor, advantages: th.Tensor) -> th.Tensor:
-        """L_BC of Eq. 3.12 over the mini-batch, or over its filtered part."""
-        mean = distribution.mode()
-        if self.bc_loss == "nll":
-            per_sample = gaussian_nll(mean, self.policy.log_std, expert_actions) / expert_actions.shape[1]
-        else:
-            per_sample = (mean - expert_actions).square().mean(dim=1)
-        if self.bc_filter == "none":
-            return per_sample.mean()
-        if self.bc_filter == "negative_advantage":
-            mask = (advantages < 0).float()
-        else:
-            mask = ((mean - expert_actions).square().mean(dim=1) < AGREEMENT**2).float()
-        return (per_sample * mask).mean()
 
     def learn(
         self: SelfPPOBC,

@@ -8,9 +8,10 @@ n_envs                environments flown side by side (1)
 vec_env               batch (default for this package's environments), dummy (default for others) or subproc
 env_kwargs            keywords of the environment's constructor
 eval_env_kwargs       put over them in the evaluation's environments
+eval_tasks            further tasks to evaluate on, for the curves; the environment's own decides which model is best
 policy                name of a policy, MlpPolicy by default
 policy_kwargs         mapping, or a string such as "dict(net_arch=[64, 64], activation_fn=nn.Tanh)"
-expert                pid, path/to/model.zip or package.module:factory, for algorithms that learn from one
+expert                pid, geometric, path/to/model.zip or package.module:factory, for algorithms that learn from one
 callback              callbacks as package.module.Class, one or a list; with keywords as {package.module.Class: {…}}
 env_wrapper           wrappers around each environment, likewise (dummy and subproc)
 vec_env_wrapper       wrappers around the vectorised environment, likewise
@@ -30,15 +31,17 @@ import gymnasium
 import yaml
 
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.tasks import TASKS
 from sb3_quad.errors import ConfigError, unknown
 from sb3_quad.training.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.training.literals import parse_mapping
 from sb3_quad.training.values import convert, positive_whole, qualified_classes
 
 VEC_ENVS = ("batch", "dummy", "subproc")
+CONFIG_FOLDERS = ("geometric", "thesis")  # with further settings files, inside zoo_configs
 _JOB_KEYS = (
-    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "policy", "policy_kwargs", "expert"),
-    *("callback", "env_wrapper", "vec_env_wrapper", "normalize"),
+    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "eval_tasks", "policy"),
+    *("policy_kwargs", "expert", "callback", "env_wrapper", "vec_env_wrapper", "normalize"),
 )
 # What env_kwargs may give to a quadcopter environment, batched or not.
 QUADCOPTER_KEYWORDS = (
@@ -57,6 +60,7 @@ class TrainingConfig:
     vec_env: str
     env_kwargs: dict[str, Any]
     eval_env_kwargs: dict[str, Any]
+    eval_tasks: tuple[str, ...]
     policy: str
     policy_kwargs: dict[str, Any]
     expert: Any
@@ -134,6 +138,7 @@ def build_config(
         vec_env=_vec_env(settings.get("vec_env"), env_id, at("vec_env")),
         env_kwargs=_env_kwargs(settings.get("env_kwargs"), env_id, at("env_kwargs")),
         eval_env_kwargs=_env_kwargs(settings.get("eval_env_kwargs"), env_id, at("eval_env_kwargs")),
+        eval_tasks=_eval_tasks(settings.get("eval_tasks"), env_id, at("eval_tasks")),
         policy=_known(settings.get("policy", "MlpPolicy"), algorithm.policy_aliases, at("policy")),
         policy_kwargs=parse_mapping(settings.get("policy_kwargs"), at("policy_kwargs")),
         expert=settings.get("expert") or ("pid" if learns else None),
@@ -156,9 +161,13 @@ def check_environment(env_id: str) -> None:
 def config_names() -> list[str]:
     """The YAML files that come with the package, as ``--conf-file`` takes them."""
     root = resources.files("sb3_quad.zoo_configs")
-    names = [entry.name for entry in root.iterdir() if entry.name.endswith(".yml")]
-    thesis = root.joinpath("thesis")
-    return sorted(names) + sorted(f"thesis/{entry.name}" for entry in thesis.iterdir() if entry.name.endswith(".yml"))
+    folders = {"": root, **{f"{name}/": root.joinpath(name) for name in CONFIG_FOLDERS}}
+    return [
+        f"{prefix}{name}"
+        for prefix, folder in folders.items()
+        for name in sorted(entry.name for entry in folder.iterdir())
+        if name.endswith(".yml")
+    ]
 
 
 def read_yaml(text: str, where: str) -> Any:
@@ -198,6 +207,13 @@ def _vec_env(value: Any, env_id: str, where: str) -> str:
     if kind == "batch" and env_id not in ENVIRONMENTS:
         raise ConfigError(f"{where} is batch, but {env_id} has no batched form; use dummy or subproc")
     return kind
+
+
+def _eval_tasks(value: Any, env_id: str, where: str) -> tuple[str, ...]:
+    names = [] if value is None else value if isinstance(value, list) else [value]
+    if names and env_id not in ENVIRONMENTS:
+        raise ConfigError(f"{where}: {env_id} has no tasks; leave it away")
+    return tuple(_known(name, TASKS, where) for name in names)
 
 
 def _env_kwargs(value: Any, env_id: str, where: str) -> dict[str, Any]:

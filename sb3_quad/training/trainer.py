@@ -59,14 +59,14 @@ def train(job: TrainingJob, report: Report = print, started: Callable[[RunFolder
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
-    with StopSignals() as signals, _environments(job) as (env, eval_env):
+    with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         if job.trained_agent is not None:
             hand_over(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
         run.write_yaml(config.settings, job.arguments())
         started(run)
-        return _learn(job, run, model, eval_env, signals, report, config.n_timesteps)
+        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -81,24 +81,33 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         raise ConfigError(f"{run.arguments}: algo or env is missing")
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
     job = TrainingJob.from_arguments(config, {**arguments, **changes}, run.arguments)
-    with StopSignals() as signals, _environments(job) as (env, eval_env):
+    with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = load_snapshot(run, config.algo, env, job.device, **attributes)
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} transitions")
-        return _learn(job, run, model, eval_env, signals, report, config.n_timesteps - model.num_timesteps)
+        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps - model.num_timesteps)
 
 
 @contextmanager
-def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, VecEnv | None]]:
-    """The environments to train in and, if there are evaluations, those to evaluate in; closed in the end."""
+def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str | None, VecEnv]]]:
+    """The environments to train in and those to evaluate in; closed in the end.
+
+    The latter by task, the run's own first, whose name is None; none if there are no evaluations.
+    """
     config = job.config
     made: list[VecEnv] = []
+    evaluating: dict[str | None, VecEnv] = {}
     try:
         made.append(make_environments(config, config.n_envs, job.seed))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
-            made.append(make_environments(for_evaluation(job), min(n_envs, job.eval_episodes), job.seed + EVALUATION_SEED))
-        yield made[0], (made[1] if len(made) > 1 else None)
+            for task in (None, *config.eval_tasks):
+                settings = for_evaluation(job)
+                if task is not None:
+                    settings = replace(settings, env_kwargs={**settings.env_kwargs, "task": task})
+                made.append(make_environments(settings, min(n_envs, job.eval_episodes), job.seed + EVALUATION_SEED))
+                evaluating[task] = made[-1]
+        yield made[0], evaluating
     finally:
         for env in made:
             env.close()
@@ -147,12 +156,12 @@ def _learn(
     job: TrainingJob,
     run: RunFolder,
     model: OnPolicyAlgorithm,
-    eval_env: VecEnv | None,
+    eval_envs: dict[str | None, VecEnv],
     signals: StopSignals,
     report: Report,
     timesteps: int,
 ) -> TrainingResult:
-    callbacks, last_good, best = _callbacks(job, run, eval_env, signals, report)
+    callbacks, last_good, best = _callbacks(job, run, eval_envs, signals, report)
     start = time.perf_counter()
     try:
         model.learn(
@@ -206,7 +215,7 @@ def _finite(model: OnPolicyAlgorithm) -> bool:
 
 
 def _callbacks(
-    job: TrainingJob, run: RunFolder, eval_env: VecEnv | None, signals: StopSignals, report: Report
+    job: TrainingJob, run: RunFolder, eval_envs: dict[str | None, VecEnv], signals: StopSignals, report: Report
 ) -> tuple[list[BaseCallback], LastGoodModel, BestModel | None]:
     from sb3_quad.callbacks.best_model import BestModel
     from sb3_quad.callbacks.checkpoint import Checkpoint
@@ -217,10 +226,11 @@ def _callbacks(
     last_good = LastGoodModel()
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
     best = None
-    if eval_env is not None:
+    if eval_envs:
         every = job.eval_freq if job.eval_freq > 0 else 2**62
         seed = job.seed + EVALUATION_SEED
-        best = BestModel(eval_env, every, job.eval_episodes, seed, run.best_model, run.evaluations, report)
+        others = {task: env for task, env in eval_envs.items() if task is not None}
+        best = BestModel(eval_envs[None], every, job.eval_episodes, seed, run.best_model, run.evaluations, report, others)
         callbacks.append(best)
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
