@@ -14,7 +14,7 @@ from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.envs.backdrop import Camera
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.chase import FIELD_OF_VIEW, ChaseCamera
-from sb3_quad.envs.scenery import RING, DrawnTarget, DrawnVehicle, DrawnWrench, scale_of, take_picture
+from sb3_quad.envs.scenery import RING, DrawnTarget, DrawnVehicle, DrawnWrench, rotor_turning, scale_of, take_picture
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -60,7 +60,7 @@ class Renderer:
         :return: uint8 (height, width, 3); None in human mode.
         """
         self.chase.turn(state[:, 0], 0.04)
-        self.rotor_angles += self.drawn.turning(state[:, :1])[:, 0] * self.vehicle.control_step
+        self.rotor_angles += rotor_turning(self.vehicle, state[:, :1])[:, 0] * self.vehicle.control_step
         if self.human:
             self._show(state[:, 0], wrench[:, 0])
             return None

@@ -36,6 +36,11 @@ def scale_of(vehicle: Vehicle) -> float:
     return arm_length(vehicle) / REFERENCE_ARM
 
 
+def rotor_turning(vehicle: Vehicle, state: FloatArray) -> FloatArray:
+    """How fast the drawn rotors turn about body z, for the columns of ``state``, (STATE_SIZE, n): (4, n), rad/s."""
+    return np.asarray(-np.sign(vehicle.rotor_directions)[:, None] * state[ROTOR_SPEEDS] / SLOWED)
+
+
 class DrawnVehicle:
     """A vehicle to look at.
 
@@ -65,10 +70,6 @@ class DrawnVehicle:
         """Take it out of sight."""
         for body in (*self.rotors, *self.frame):
             move(body, _NOWHERE, _LEVEL, self.client)
-
-    def turning(self, state: FloatArray) -> FloatArray:
-        """How fast the drawn rotors turn, for the columns of ``state``, (STATE_SIZE, n): (4, n), rad/s."""
-        return np.asarray(-np.sign(self.vehicle.rotor_directions)[:, None] * state[ROTOR_SPEEDS] / SLOWED)
 
     def rotor_discs(self, state: FloatArray) -> FloatArray:
         """Centre, normal, radius and colour of each rotor's disc; (4, 10)."""
