@@ -15,6 +15,8 @@ Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
 
 INK: Colour = (24, 32, 44)
 PAPER: Colour = (255, 255, 255)
+STEP = 1.3  # between lines of text, in font sizes
+SMALLER = 0.88  # font size of what stands below a heading
 
 
 @cache
@@ -41,18 +43,6 @@ class Canvas:
         """The picture, uint8 (height, width, 3)."""
         return np.asarray(self.image, dtype=np.uint8)
 
-    def panel_label(self, lines: Sequence[str], colour: Colour, size: int) -> None:
-        """A plate in the top left corner: a bar in ``colour``, the first line bold, the others below."""
-        heading, body = font(size, bold=True), font(round(0.88 * size))
-        fonts = [heading, *(body for _ in lines[1:])]
-        pad, step = round(0.5 * size), round(1.35 * size)
-        wide = max(face.getlength(line) for face, line in zip(fonts, lines, strict=True))
-        plate = (pad, pad, pad + wide + 2.6 * pad, pad + step * len(lines) + pad)
-        self.draw.rounded_rectangle(plate, radius=0.3 * size, fill=(*PAPER, 215))
-        self.draw.rounded_rectangle((pad, pad, pad + 0.35 * size, plate[3]), radius=0.15 * size, fill=(*colour, 255))
-        for number, (face, line) in enumerate(zip(fonts, lines, strict=True)):
-            self.draw.text((2.6 * pad, pad + 0.5 * pad + number * step), line, font=face, fill=INK)
-
     def tag(self, text: str, centre: tuple[float, float], size: int) -> Box:
         """A small plate with ``text`` around ``centre``; the room it takes."""
         box = tag_box(text, centre, size)
@@ -76,6 +66,31 @@ def overlap(one: Box, other: Box) -> float:
     wide = min(one[2], other[2]) - max(one[0], other[0])
     high = min(one[3], other[3]) - max(one[1], other[1])
     return max(wide, 0.0) * max(high, 0.0)
+
+
+def with_header(
+    pixels: npt.NDArray[np.uint8], heading: str, lines: Sequence[str], colour: Colour, size: int
+) -> npt.NDArray[np.uint8]:
+    """A picture with a white band above it: a bar in ``colour``, a bold heading, and lines below; ``size``: of the font.
+
+    :return: uint8; as wide, and higher by :func:`header_height`.
+    """
+    height, width = pixels.shape[:2]
+    band = header_height(len(lines), size)
+    image = np.full((band + height, width, 3), 255, dtype=np.uint8)
+    image[band:] = pixels
+    canvas = Canvas(image)
+    bar = 0.45 * size
+    canvas.draw.rectangle((0, 0, bar, band - 1), fill=(*colour, 255))
+    fonts = [font(size, bold=True), *(font(round(SMALLER * size)) for _ in lines)]
+    for number, (face, line) in enumerate(zip(fonts, [heading, *lines], strict=True)):
+        canvas.draw.text((bar + 0.7 * size, 0.35 * size + number * STEP * size), line, font=face, fill=INK)
+    return canvas.pixels
+
+
+def header_height(n_lines: int, size: int) -> int:
+    """The height of the band of :func:`with_header`, pixels."""
+    return round((0.7 + STEP * (1 + n_lines)) * size)
 
 
 def side_by_side(pictures: Sequence[npt.NDArray[np.uint8]], columns: int, gap: int = 4) -> npt.NDArray[np.uint8]:

@@ -15,13 +15,18 @@ FloatArray = npt.NDArray[np.float64]
 
 
 def draw_line(
-    picture: Picture, camera: Camera, points: FloatArray, colour: tuple[float, float, float], width: float, opacity: float = 1.0
+    picture: Picture,
+    camera: Camera,
+    points: FloatArray,
+    colour: tuple[float, float, float],
+    width: float,
+    opacity: float = 1.0,
 ) -> None:
     """Draw a line through ``points`` into a picture, in place.
 
     :param points: (n, 3), world frame, m.
     :param colour: red, green and blue in [0, 1].
-    :param width: m; never drawn thinner than 1.4 pixels.
+    :param width: m; never drawn thinner than 1.8 pixels.
     """
     height, columns = picture.pixels.shape[:2]
     if len(points) < 2:
@@ -57,7 +62,7 @@ def _cover(cover, screen, depth, samples, width):
         bx, by, bz = screen[k + 1]
         if az < NEAR or bz < NEAR:
             continue
-        thick = max(width / az, width / bz, 1.4)
+        thick = max(width / az, width / bz, 1.8)
         reach = 0.5 * thick + 1.0
         left, right = max(int(min(ax, bx) - reach), 0), min(int(max(ax, bx) + reach) + 1, columns)
         top, bottom = max(int(min(ay, by) - reach), 0), min(int(max(ay, by) + reach) + 1, rows)
@@ -69,7 +74,7 @@ def _cover(cover, screen, depth, samples, width):
                 along = min(max((px * dx + py * dy) / length2, 0.0), 1.0) if length2 > 0.0 else 0.0
                 away = math.sqrt((px - along * dx) ** 2 + (py - along * dy) ** 2)
                 inverse = (1.0 - along) / az + along / bz  # depth is linear in the picture by its inverse
-                half = 0.5 * max(width * inverse, 1.4)
+                half = 0.5 * max(width * inverse, 1.8)
                 share = min(max(half + 0.5 - away, 0.0), 1.0)
                 if share > 0.0:
                     seen = 0

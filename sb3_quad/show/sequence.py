@@ -13,9 +13,9 @@ from sb3_quad.envs.backdrop import Camera
 from sb3_quad.envs.scenery import rotor_turning
 from sb3_quad.envs.urdf import arm_length, rotor_radius
 from sb3_quad.show.framing import FIELD_OF_VIEW, broadside, framing_camera
-from sb3_quad.show.labels import Box, Canvas, Colour, overlap, side_by_side, tag_box
+from sb3_quad.show.labels import Box, Canvas, overlap, side_by_side, tag_box, with_header
 from sb3_quad.show.lines import project
-from sb3_quad.show.palette import colours_of, rgb
+from sb3_quad.show.palette import colours_of, rgb, rgb255
 from sb3_quad.show.recording import Recording
 from sb3_quad.show.stage import Pose, Scene, Stage, Trail
 
@@ -89,15 +89,21 @@ def _view(recordings: Sequence[Recording], ends: Sequence[int], width: int, heig
 
 
 def _apart(recording: Recording, end: int, view: _View) -> list[int]:
-    """Steps whose poses do not hide one another: each the first that is clear of those before; and the last one."""
+    """Steps whose poses do not hide one another: each is the first that is clear of those before it."""
     screen = view.project(recording.path[: end + 1])
     breadth = view.pixels(screen[:, 2])
-    chosen = [end]
-    for step in range(end):
-        gaps = np.linalg.norm(screen[chosen, :2] - screen[step, :2], axis=1)
-        if (gaps > APART * breadth[step]).all():
+
+    def clear_of(steps: Sequence[int], step: int) -> npt.NDArray[np.bool_]:
+        gaps = np.linalg.norm(screen[steps, :2] - screen[step, :2], axis=1)
+        return np.asarray(gaps > APART * breadth[step])
+
+    chosen = [0]
+    for step in range(1, end + 1):
+        if clear_of(chosen, step).all():
             chosen.append(step)
-    return sorted({*chosen, 0} if len(chosen) == 1 else chosen)
+    if recording.outcome != "flying" and chosen[-1] != end:  # how it was lost is to be seen
+        chosen = [0, *(step for step in chosen[1:] if clear_of([step], end)[0]), end]
+    return chosen
 
 
 def _panel(recording: Recording, chosen: Sequence[int], end: int, view: _View, colour: str) -> Picture:
@@ -106,20 +112,16 @@ def _panel(recording: Recording, chosen: Sequence[int], end: int, view: _View, c
     trail = Trail(recording.path[: end + 1], rgb(colour), width=0.05 * view.breadth, opacity=0.85)
     stage = Stage(recording.vehicle, len(poses), len(recording.targets), view.size)
     try:
-        pixels = stage.picture(
-            Scene(poses, recording.targets, [trail]), view.camera, FIELD_OF_VIEW, view.width, view.height
-        )
+        pixels = stage.picture(Scene(poses, recording.targets, [trail]), view.camera, FIELD_OF_VIEW, view.width, view.height)
     finally:
         stage.close()
     canvas = Canvas(pixels)
     size = max(12, round(view.height / 34))
     _tag_times(canvas, recording, chosen, view, round(0.92 * size))
-    bar: Colour = tuple(round(255 * part) for part in rgb(colour))  # type: ignore[assignment]
-    lines = [recording.name, _outcome(recording, end)]
+    lines = [_outcome(recording, end)]
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
-    canvas.panel_label(lines, bar, size)
-    return canvas.pixels
+    return with_header(canvas.pixels, recording.name, lines, rgb255(colour), size)
 
 
 def _tag_times(canvas: Canvas, recording: Recording, chosen: Sequence[int], view: _View, size: int) -> None:
@@ -127,8 +129,7 @@ def _tag_times(canvas: Canvas, recording: Recording, chosen: Sequence[int], view
     screen = view.project(recording.path[list(chosen)])
     half = 0.5 * view.pixels(screen[:, 2])
     vehicles: list[Box] = [(x - r, y - r, x + r, y + r) for (x, y, _), r in zip(screen, 0.8 * half, strict=True)]
-    plate: Box = (0.0, 0.0, 0.45 * view.width, 5.0 * size)
-    taken = [*vehicles, plate]
+    taken = [*vehicles]
     path = view.project(recording.path[::3])[:, :2]
     for step, (x, y, _), reach in zip(chosen, screen, half, strict=True):
         text = f"{recording.times[step]:.2f} s"

@@ -82,11 +82,9 @@ class Stage:
         for drawn, target in zip(self.targets, scene.targets, strict=True):
             drawn.place(target, positions)
         discs = [vehicle.rotor_discs(pose.state) for pose, vehicle in zip(scene.poses, self.vehicles, strict=False)]
-        shadows = [[*position[:2], self.vehicles[0].span] for position in positions]
+        shadows = [[*positions[-1, :2], self.vehicles[0].span]]  # all of them would blacken the ground
         shadows += [[*target[:2], RING * self.scale] for target in scene.targets]
-        picture = take_picture(
-            self.client, camera, field_of_view, width, height, np.array(shadows), np.concatenate(discs)
-        )
+        picture = take_picture(self.client, camera, field_of_view, width, height, np.array(shadows), np.concatenate(discs))
         for trail in scene.trails:
             draw_line(picture, camera, trail.points, trail.colour, trail.width, trail.opacity)
         return picture.pixels
