@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import types
 import typing
 from collections.abc import Mapping
 from importlib import resources
@@ -119,6 +118,6 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[type
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
-        return annotation if issubclass(annotation, BaseModel) else None
+    if typing.get_origin(annotation) is None:
+        return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
     return next((found for entry in typing.get_args(annotation) if (found := _model_in(entry)) is not None), None)

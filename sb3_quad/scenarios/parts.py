@@ -118,7 +118,7 @@ class Start(Part):
 
 
 class Target(Part):
-    """Where to fly: ``[x, y, z]``, ``{distance: 10}`` in a random direction, or ``{waypoints: [[x, y, z], …], radius: 0.5}``."""
+    """Where to fly: ``[x, y, z]``, ``{distance: 10}`` in a random direction, or ``{waypoints: [[x, y, z], …]}``."""
 
     position: Vector | None = Field(default=None, description="r_T, world frame, m")
     distance: NotNegative | None = Field(

@@ -9,11 +9,13 @@ from typing import Annotated, Any
 from pydantic import Field, field_validator, model_validator
 
 from sb3_quad.dynamics.vehicle import Finite, Vehicle, load_vehicle
+from sb3_quad.errors import ConfigError, unknown
 from sb3_quad.scenarios.parts import Part, Positive, Start, Target, VehicleChanges, Wrench
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 Figure = Finite | tuple[Finite, Finite]
+TimeTo = Figure | None
 
 
 class Reference(Part):
@@ -21,7 +23,9 @@ class Reference(Part):
 
     success: Figure | None = Field(default=None, description="share of flights, 0 to 1")
     reward: Figure | None = Field(default=None, description="mean per episode")
-    time_to: dict[str, Figure] = Field(default_factory=dict, description="from tolerances in m to mean times in s")
+    time_to: dict[str, TimeTo] = Field(
+        default_factory=dict, description="from tolerances in m to mean times in s; null: never within it"
+    )
     path: Figure | None = Field(default=None, description="mean path, m")
     final_error: Figure | None = Field(default=None, description="|r - r_T| at the end, m")
     flown: Figure | None = Field(default=None, description="until the flight ended, s")
@@ -89,7 +93,12 @@ class Scenario(Part):
         vehicle = self.flown_vehicle()
         self._check_ground(vehicle)
         self._check_reach(vehicle)
+        step = vehicle.control_step
+        if self.duration < step:
+            raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
         for number, wrench in enumerate(self.wrenches):
+            if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
+                raise ValueError(f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control step, {step:g} s")
             if wrench.start >= self.duration:
                 raise ValueError(
                     f"wrenches.{number}: starts at {wrench.start:g} s, when the episode of {self.duration:g} s is over"
@@ -160,7 +169,18 @@ class Suite(Part):
 
     name: str = Field(pattern=NAME, description="what the suite is called")
     description: str = Field(default="", description="what it is for")
+    source: str = Field(default="reference", description="where the reference figures come from; heads their column")
     scenarios: tuple[Scenario, ...] = Field(min_length=1)
+
+    def scenario(self, name: str) -> Scenario:
+        """The scenario of that name.
+
+        :raises ConfigError: there is none.
+        """
+        for scenario in self.scenarios:
+            if scenario.name == name:
+                return scenario
+        raise ConfigError(unknown("scenario", name, [scenario.name for scenario in self.scenarios]))
 
     @model_validator(mode="after")
     def _unique(self) -> Suite:
