@@ -1,6 +1,7 @@
 """Figures of a report as Plotly draws them in a browser: plain dictionaries of its ``data`` and ``layout``.
 
-Text, grid and background colours are left to the page, which knows whether it is light or dark.
+Text, grid and background colours are left to the page, which knows whether it is light or dark; in ``data`` they are called
+``@ink`` and ``@paper``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ MARKER, FORCE, NEUTRAL = "#1a9a45", "#db1a24", "#8a8f98"
 BAND_OPACITY = 0.16
 PANEL_HEIGHT, HEAT_PANEL_HEIGHT, PATH_HEIGHT = 380, 190, 560  # pixels
 DIGITS = 4
+CROSS = 0.012  # half the size of a cross, of the longest side of what is drawn
 
 
 def draw(figure: Figure) -> dict[str, Any]:
@@ -101,17 +103,17 @@ def _bars(figure: BarFigure) -> dict[str, Any]:
                 "customdata": list(group.notes),
                 "marker": {"color": group.colour},
                 "error_y": {"type": "data", "symmetric": False, "array": _numbers(above), "arrayminus": _numbers(below)}
-                | {"thickness": 1.2, "width": 3, "color": NEUTRAL},
+                | {"thickness": 1.2, "width": 3, "color": "@ink"},
                 "hovertemplate": "%{fullData.name}: %{y}" + (" %{customdata}" if group.notes else "") + "<extra></extra>",
             }
         )
-    symbols = ("diamond-open", "circle-open", "square-open", "triangle-up-open")
+    symbols = ("diamond", "circle", "square", "triangle-up")
     for number, (name, values) in enumerate(figure.references):
-        marker = {"symbol": symbols[number % len(symbols)], "size": 10, "color": NEUTRAL, "line": {"width": 2}}
+        marker = {"symbol": symbols[number % len(symbols)], "size": 9, "color": "@paper", "line": {"width": 2, "color": "@ink"}}
         shared = {"type": "scatter", "mode": "markers", "name": name, "x": list(figure.categories)}
         data.append({**shared, "y": _numbers(values), "marker": marker})
     axes = {"xaxis": _axis(figure.x_label, type="category"), "yaxis": _axis(figure.y_label, rangemode="tozero")}
-    return {"data": data, "layout": _layout(**axes, barmode="group", bargap=0.25), "height": PANEL_HEIGHT}
+    return {"data": data, "layout": _layout(**axes, barmode="group", bargap=max(0.25, 0.7 - 0.1 * len(figure.categories)), bargroupgap=0.06), "height": PANEL_HEIGHT}
 
 
 def _heat(figure: HeatFigure) -> dict[str, Any]:
@@ -160,7 +162,9 @@ def _heat_trace(figure: HeatFigure, panel: HeatPanel, suffix: str, bar: bool) ->
 
 
 def _paths(figure: PathFigure) -> dict[str, Any]:
-    data = [trace for path in figure.paths for trace in _path(path)]
+    low, high = _bounds(figure)
+    size = np.maximum(np.array(high) - low, 1e-3)
+    data = [trace for path in figure.paths for trace in _path(path, CROSS * float(size.max()))]
     targets = {"type": "scatter3d", "mode": "markers", "name": "target", **_xyz(figure.targets)}
     data.append({**targets, "marker": {"size": 6, "color": MARKER, "symbol": "diamond"}})
     start = {"type": "scatter3d", "mode": "markers", "name": "start", **_xyz(figure.start[None])}
@@ -175,7 +179,6 @@ def _paths(figure: PathFigure) -> dict[str, Any]:
         head = {"type": "cone", **_xyz(tip[None]), "u": [u], "v": [v], "w": [w], "anchor": "tip", "showscale": False}
         head |= {"colorscale": [[0, FORCE], [1, FORCE]], "sizemode": "raw", "sizeref": 1.0 if length else 1.0}
         data.append({**shared, **head, "showlegend": False})
-    low, high = _bounds(figure)
     axes = {
         f"{name}axis": {
             "title": {"text": f"{name} (m)"},
@@ -185,21 +188,21 @@ def _paths(figure: PathFigure) -> dict[str, Any]:
         }
         for k, name in enumerate("xyz")
     }
-    size = np.maximum(np.array(high) - low, 1e-3)
-    ratio = dict(zip("xyz", (1.5 * size / size.max()).tolist(), strict=True))
-    camera = {"eye": {"x": 1.15, "y": -1.55, "z": 0.55}, "center": {"x": 0, "y": 0, "z": -0.08}}
+    ratio = dict(zip("xyz", (1.3 * size / size.max()).tolist(), strict=True))
+    camera = {"eye": {"x": 1.45, "y": -1.95, "z": 0.68}, "center": {"x": 0, "y": 0, "z": -0.17}}
     scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": camera, "dragmode": "turntable"}
     layout = _layout(scene=scene, margin={"l": 0, "r": 0, "t": 36, "b": 0})
     return {"data": data, "layout": layout, "height": PATH_HEIGHT}
 
 
-def _path(path: Path) -> list[dict[str, Any]]:
-    shared = {"type": "scatter3d", "legendgroup": path.name, "name": path.name}
-    line = {"mode": "lines", "line": {"color": path.colour, "width": 4}, "showlegend": path.first, **_xyz(path.points)}
-    traces = [{**shared, **line}]
+def _path(path: Path, cross: float) -> list[dict[str, Any]]:
+    """A way, and a cross of that size (m) where it ends too soon; as lines, since not every font has a cross."""
+    shared = {"type": "scatter3d", "mode": "lines", "legendgroup": path.name, "name": path.name}
+    traces = [{**shared, "line": {"color": path.colour, "width": 4}, "showlegend": path.first, **_xyz(path.points)}]
     if path.lost:
-        cross = {"mode": "markers", "marker": {"symbol": "x", "size": 5, "color": path.colour}, "showlegend": False}
-        traces.append({**shared, **cross, **_xyz(path.points[-1:]), "hovertext": path.lost, "hoverinfo": "text+name"})
+        ends = [[sign * x, sign * y, sign] for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)) for sign in (-1.0, 1.0, np.nan)]
+        strokes = {"line": {"color": path.colour, "width": 3}, "showlegend": False, **_xyz(path.points[-1] + cross * np.array(ends))}
+        traces.append({**shared, **strokes, "hovertext": path.lost, "hoverinfo": "text+name"})
     return traces
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -31,6 +32,7 @@ def files(figure: Figure) -> dict[str, bytes]:
             metadata = {"Date": None} if suffix == "svg" else None  # the same figures, the same file
             picture.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata)
             contents[f"{figure.name}.{suffix}"] = buffer.getvalue()
+            picture.set_layout_engine("none")  # what is arranged stays so
     return contents
 
 
@@ -53,11 +55,12 @@ def _picture(width: float, height: float) -> Picture:
     return New(figsize=(width, height), layout="constrained")
 
 
-def _legend(axes: Axes, picture: Picture) -> None:
+def _legend(axes: Axes, picture: Picture, first: Sequence[str] = ()) -> None:
+    """Each name once, those of ``first`` before others."""
     handles, names = axes.get_legend_handles_labels()
-    first = {name: handle for handle, name in reversed(list(zip(handles, names, strict=True)))}
-    order = list(dict.fromkeys(names))
-    picture.legend([first[name] for name in order], order, loc="outside upper left", ncols=min(len(order), 4))
+    found = dict(zip(names, handles, strict=True))
+    order = [*first, *(name for name in found if name not in first)]
+    picture.legend([found[name] for name in order], order, loc="outside upper left", ncols=min(len(order), 4))
 
 
 def _lines(figure: LineFigure) -> Picture:
@@ -103,7 +106,7 @@ def _bars(figure: BarFigure) -> Picture:
     axes.set_xlabel(figure.x_label)
     axes.set_ylabel(figure.y_label)
     axes.grid(axis="x", visible=False)
-    _legend(axes, picture)
+    _legend(axes, picture, [group.name for group in figure.groups])
     return picture
 
 
