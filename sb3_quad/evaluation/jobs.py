@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.errors import SB3QuadError
 from sb3_quad.evaluation.controllers import ControllerSpec, build
 from sb3_quad.evaluation.flightlog import episode_arrays
@@ -56,7 +55,7 @@ def scenario_key(scenario: Scenario, backend: str) -> str:
     """A hash of all that the flights depend on but the controller: equal keys, equal episodes."""
     from sb3_quad import __version__
 
-    vehicles = [vehicle.model_dump(mode="json") for vehicle in (load_vehicle(scenario.vehicle), scenario.flown_vehicle())]
+    vehicles = [vehicle.model_dump(mode="json") for vehicle in (scenario.nominal_vehicle(), scenario.flown_vehicle())]
     content = scenario.model_dump(mode="json", exclude=_SILENT)
     return _digest([SCHEMA_VERSION, __version__, backend, content, vehicles])
 

@@ -14,7 +14,8 @@ from sb3_quad.scenarios.vary import axis_name
 
 SUCCESS, REWARD, PATH, MEDIAN, LARGEST = "success", "mean reward", "mean path", "final error, median", "final error, largest"
 FLOWN, REACHED, COMPLETED, COURSE_TIME = "time flown", "waypoints reached", "courses completed", "time of the course"
-HIT = "half survive up to"
+HIT, HIT_SIZE = "half survive up to", "which is"
+CAPTION = "(…): 95 % interval; ±: half of it; (… %) after a time: the flights that came so close, if not all"
 
 
 TASK_SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of the thesis suite
@@ -37,7 +38,7 @@ def rows(figures: Figures, limit: HitLimit | None = None) -> dict[str, str]:
         cells[COMPLETED] = _share(figures.course.completed)
         cells[COURSE_TIME] = _mean(figures.course.time, " s") or "never"
     if limit is not None:
-        cells[HIT] = _limit(limit)
+        cells[HIT], cells[HIT_SIZE] = _limit(limit)
     return cells
 
 
@@ -64,7 +65,7 @@ def shown_rows(scenario: Scenario) -> list[str]:
             names.insert(1, FLOWN)
     else:
         names = [SUCCESS, REWARD, *times, PATH, MEDIAN, LARGEST]
-    return names + [HIT] * (scenario.hit_search is not None)
+    return names + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
 
 
 def comparison(title: str, columns: Mapping[str, Figures], scenario: Scenario, only: Iterable[str] | None = None) -> Table:
@@ -73,8 +74,8 @@ def comparison(title: str, columns: Mapping[str, Figures], scenario: Scenario, o
     :param columns: from the name of each controller to its figures.
     :param only: the reference columns to show; None: all.
     """
-    table = Table(title=title, title_justify="left")
-    table.add_column("")
+    table = Table(title=title, title_justify="left", caption=CAPTION, caption_justify="left")
+    table.add_column("", no_wrap=True)
     kept = [name for name in (scenario.reference if only is None else only) if name in scenario.reference]
     cells = {name: rows(figures) for name, figures in columns.items()}
     cells |= {f"thesis: {name}": reference_rows(scenario.reference[name]) for name in kept}
@@ -92,8 +93,8 @@ def overview(results: Results, controllers: Sequence[str], source: str = "refere
     :param controllers: labels, in the order of their columns.
     :param source: heads the column of the reference figures.
     """
-    table = Table(title=f"{results.suite}: 95 % intervals in brackets", title_justify="left")
-    table.add_column("", overflow="fold")
+    table = Table(title=results.suite, title_justify="left", caption=CAPTION, caption_justify="left")
+    table.add_column("", no_wrap=True)
     for label in controllers:
         table.add_column(escape(label), justify="right")
     referenced = any(scenario.reference for scenario in results.scenarios)
@@ -127,11 +128,11 @@ def _arrival(arrival: Arrival) -> str:
     if arrival.time is None:
         return "never"
     text = _mean(arrival.time, " s")
-    return text if arrival.share.value == 1.0 else f"{text} ({_percent(arrival.share.value)} % of flights)"
+    return text if arrival.share.value == 1.0 else f"{text} ({100 * arrival.share.value:.3g} %)"
 
 
 def _share(estimate: Estimate) -> str:
-    return f"{_percent(estimate.value)} % ({100 * estimate.low:.1f}-{100 * estimate.high:.1f})"
+    return f"{_percent(estimate.value)} % ({100 * estimate.low:.3g}-{100 * estimate.high:.3g})"
 
 
 def _mean(estimate: Estimate | None, unit: str = "") -> str:
@@ -141,11 +142,13 @@ def _mean(estimate: Estimate | None, unit: str = "") -> str:
     return f"{estimate.value:.2f}" + (f" ± {half:.2f}" if half >= 0.005 else "") + unit
 
 
-def _limit(limit: HitLimit) -> str:
+def _limit(limit: HitLimit) -> tuple[str, str]:
+    factor = limit.trials[-1].factor if limit.factor is None else limit.factor
+    size = " and ".join(f"{factor * part:.1f} {unit}" for part, unit in ((limit.force, "N"), (limit.torque, "N m")) if part)
     if limit.factor is None:
-        return f"beyond {limit.trials[-1].factor:g} x"
+        return f"more than {factor:g} x", f"more than {size}"
     high = "" if limit.high is None else f"{limit.high:.2f}"
-    return f"{limit.factor:.2f} x ({limit.low:.2f}-{high}): {limit.factor * limit.force:.1f} N"
+    return f"{factor:.2f} x ({limit.low:.2f}-{high})", size
 
 
 def _figure(figure: Figure, unit: str) -> str:

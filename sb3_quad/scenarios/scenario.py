@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
@@ -107,12 +109,20 @@ class Scenario(Part):
             raise ValueError("hit_search: there are no wrenches to search with")
         return self
 
+    def nominal_vehicle(self) -> Vehicle:
+        """The vehicle before the changes: the one that experts are made for.
+
+        :raises ConfigError: it cannot be loaded.
+        """
+        path = Path(self.vehicle)
+        return _load(self.vehicle, path.stat().st_mtime_ns if path.is_file() else 0)
+
     def flown_vehicle(self) -> Vehicle:
         """The vehicle that flies, changes included.
 
         :raises ValueError: a vehicle that cannot be loaded (ConfigError), or cannot fly once changed.
         """
-        nominal = load_vehicle(self.vehicle)
+        nominal = self.nominal_vehicle()
         try:
             return self.vehicle_changes.apply(nominal)
         except ValueError as error:
@@ -189,6 +199,12 @@ class Suite(Part):
             if names.count(name) > 1:
                 raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
         return self
+
+
+@lru_cache(maxsize=64)
+def _load(vehicle: str, changed: int) -> Vehicle:
+    """A vehicle, read once while its file stays the same: suites have many scenarios."""
+    return load_vehicle(vehicle)
 
 
 def _first_line(error: Exception) -> str:
