@@ -100,7 +100,7 @@ class DrawnTarget:
     def __init__(self, client: int, scale: float) -> None:
         self.client, self.scale = client, scale
         self.ball = _add(p.createVisualShape(p.GEOM_SPHERE, radius=0.14, rgbaColor=MARKER, physicsClientId=client), client)
-        self.rings = [_add_mesh(meshes.ring(RING * scale, 0.014), MARKER, client) for _ in range(2)]
+        self.rings = [_add_mesh(meshes.ring(RING * scale, 0.014 * scale), MARKER, client) for _ in range(2)]
 
     def place(self, target: FloatArray, positions: FloatArray) -> None:
         """Move it to ``target``, (3,); close to one of the vehicles at ``positions``, (n, 3), the ball would hide it."""

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from sb3_quad.cli.output import console
 
-HELP = "Make report.html from a folder that evaluate has filled: tables, figures that turn and zoom; one file, needs no network."
+HELP = (
+    "Make report.html from a folder that evaluate has filled: tables, figures that turn and zoom; one file, needs no network."
+)
 EXAMPLES = """examples:
   sb3-quad report evaluations/thesis
   sb3-quad report evaluations/thesis --overwrite      again, after more controllers have joined

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.report.figures import BarFigure, FloatArray, Figure, HeatFigure, HeatPanel, Line, LineFigure, Path, PathFigure
+from sb3_quad.report.figures import BarFigure, Figure, FloatArray, HeatFigure, HeatPanel, Line, LineFigure, Path, PathFigure
 
 MARKER, FORCE, NEUTRAL = "#1a9a45", "#db1a24", "#8a8f98"
 BAND_OPACITY = 0.16
@@ -66,8 +66,17 @@ def _lines(figure: LineFigure) -> dict[str, Any]:
         data.append({**trace, "hoverinfo": "skip"} if line.faint else trace)
     shapes = [
         {
-            **{"type": "rect", "xref": "x", "yref": "paper", "x0": begin, "x1": end, "y0": 0, "y1": 1, "layer": "below"},
-            **{"fillcolor": FORCE, "opacity": 0.13, "line": {"color": FORCE, "width": 1}},
+            "type": "rect",
+            "xref": "x",
+            "yref": "paper",
+            "x0": begin,
+            "x1": end,
+            "y0": 0,
+            "y1": 1,
+            "layer": "below",
+            "fillcolor": FORCE,
+            "opacity": 0.13,
+            "line": {"color": FORCE, "width": 1},
             "label": {"text": text, "textposition": "top left", "font": {"size": 12}},
         }
         for begin, end, text in figure.spans
@@ -79,7 +88,8 @@ def _lines(figure: LineFigure) -> dict[str, Any]:
 
 def _band(line: Line) -> list[dict[str, Any]]:
     assert line.low is not None and line.high is not None
-    shared = {"type": "scatter", "mode": "lines", "line": {"width": 0, "color": line.colour}, "hoverinfo": "skip"}
+    shared: dict[str, Any] = {"type": "scatter", "mode": "lines", "hoverinfo": "skip"}
+    shared |= {"line": {"width": 0, "color": line.colour}}
     shared |= {"legendgroup": line.name, "showlegend": False, "x": _numbers(line.x)}
     fill = {"fill": "tonexty", "fillcolor": _with_opacity(line.colour, BAND_OPACITY)}
     return [{**shared, "y": _numbers(line.low)}, {**shared, "y": _numbers(line.high), **fill}]
@@ -109,11 +119,20 @@ def _bars(figure: BarFigure) -> dict[str, Any]:
         )
     symbols = ("diamond", "circle", "square", "triangle-up")
     for number, (name, values) in enumerate(figure.references):
-        marker = {"symbol": symbols[number % len(symbols)], "size": 9, "color": "@paper", "line": {"width": 2, "color": "@ink"}}
+        marker = {
+            "symbol": symbols[number % len(symbols)],
+            "size": 9,
+            "color": "@paper",
+            "line": {"width": 2, "color": "@ink"},
+        }
         shared = {"type": "scatter", "mode": "markers", "name": name, "x": list(figure.categories)}
         data.append({**shared, "y": _numbers(values), "marker": marker})
     axes = {"xaxis": _axis(figure.x_label, type="category"), "yaxis": _axis(figure.y_label, rangemode="tozero")}
-    return {"data": data, "layout": _layout(**axes, barmode="group", bargap=max(0.25, 0.7 - 0.1 * len(figure.categories)), bargroupgap=0.06), "height": PANEL_HEIGHT}
+    return {
+        "data": data,
+        "layout": _layout(**axes, barmode="group", bargap=max(0.25, 0.7 - 0.1 * len(figure.categories)), bargroupgap=0.06),
+        "height": PANEL_HEIGHT,
+    }
 
 
 def _heat(figure: HeatFigure) -> dict[str, Any]:
@@ -174,10 +193,9 @@ def _paths(figure: PathFigure) -> dict[str, Any]:
         shared = {"legendgroup": "force", "name": "force", "hovertext": arrow.text, "hoverinfo": "text"}
         shaft = {"type": "scatter3d", "mode": "lines", "line": {"color": FORCE, "width": 5}, **_xyz(np.stack([arrow.at, tip]))}
         data.append({**shared, **shaft, "showlegend": number == 0})
-        length = float(np.linalg.norm(arrow.vector))
         u, v, w = (0.3 * arrow.vector).tolist()
         head = {"type": "cone", **_xyz(tip[None]), "u": [u], "v": [v], "w": [w], "anchor": "tip", "showscale": False}
-        head |= {"colorscale": [[0, FORCE], [1, FORCE]], "sizemode": "raw", "sizeref": 1.0 if length else 1.0}
+        head |= {"colorscale": [[0, FORCE], [1, FORCE]], "sizemode": "raw", "sizeref": 1.0}
         data.append({**shared, **head, "showlegend": False})
     axes = {
         f"{name}axis": {
@@ -201,7 +219,11 @@ def _path(path: Path, cross: float) -> list[dict[str, Any]]:
     traces = [{**shared, "line": {"color": path.colour, "width": 4}, "showlegend": path.first, **_xyz(path.points)}]
     if path.lost:
         ends = [[sign * x, sign * y, sign] for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)) for sign in (-1.0, 1.0, np.nan)]
-        strokes = {"line": {"color": path.colour, "width": 3}, "showlegend": False, **_xyz(path.points[-1] + cross * np.array(ends))}
+        strokes = {
+            "line": {"color": path.colour, "width": 3},
+            "showlegend": False,
+            **_xyz(path.points[-1] + cross * np.array(ends)),
+        }
         traces.append({**shared, **strokes, "hovertext": path.lost, "hoverinfo": "text+name"})
     return traces
 

@@ -80,8 +80,8 @@ def _arrivals(scenario: Scenario, flown: Sequence[Flown], source: str) -> BarFig
     names = [f"{tolerance:g}" for tolerance in scenario.tolerances]
     references = []
     for name, reference in scenario.reference.items():
-        times = {float(key): time for key, time in reference.time_to.items()}
-        marks = np.array([_number(times.get(tolerance)) for tolerance in scenario.tolerances])
+        given = {float(key): time for key, time in reference.time_to.items()}
+        marks = np.array([_number(given.get(tolerance)) for tolerance in scenario.tolerances])
         if np.isfinite(marks).any():
             references.append((f"{source}: {name}", marks))
     caption = "Mean time until the vehicle is first within a tolerance of its target, over the flights that get there."
@@ -109,7 +109,7 @@ def _paths(scenario: Scenario, flown: Sequence[Flown]) -> PathFigure:
     length = ARROW * float(np.ptp(points, axis=0).max())
     longest = max((float(np.linalg.norm(arrow.vector)) for arrow in arrows), default=1.0)
     scaled = [Arrow(arrow.at, arrow.vector * length / longest, arrow.text) for arrow in arrows]
-    shown = np.unique(np.round(np.concatenate(targets), 6), axis=0)
+    shown = np.asarray(np.unique(np.round(np.concatenate(targets), 6), axis=0), dtype=np.float64)
     what = "The first flight of each controller" if count == 1 else f"The first {count} flights of each controller"
     caption = f"{what}; a cross marks where one is lost." + (" Arrows: the external force." if scaled else "")
     return PathFigure(f"{scenario.name}_paths", caption, paths, shown, flown[0].tracks[0].position[0], scaled)
@@ -123,7 +123,9 @@ def _arrows(track: Track) -> list[Arrow]:
     for part in np.split(pushed, np.flatnonzero(np.diff(pushed) > 1) + 1):
         if part.size:
             number = 1 if part.size < 10 else max(2, round(ARROWS * part.size / len(force)))
-            chosen += part[np.linspace(0, part.size - 1, number).round().astype(int)].tolist() if number > 1 else [int(part[0])]
+            chosen += (
+                part[np.linspace(0, part.size - 1, number).round().astype(int)].tolist() if number > 1 else [int(part[0])]
+            )
     size = np.linalg.norm(force, axis=1)
     return [Arrow(track.position[k], force[k], f"{size[k]:.3g} N at {track.times[k]:.2f} s") for k in chosen]
 
@@ -139,7 +141,9 @@ def _errors(scenario: Scenario, flown: Sequence[Flown]) -> LineFigure:
         if wrench.duration is not None and wrench.start + wrench.duration < scenario.duration:
             spans.append((wrench.start, wrench.start + wrench.duration, "push" if wrench.duration > 0.2 else "hit"))
     count = len(flown[0].tracks)
-    spread = f"band: least to greatest of {count} flights" if scenario.is_fixed else f"thin: {count} flights of each controller"
+    spread = (
+        f"band: least to greatest of {count} flights" if scenario.is_fixed else f"thin: {count} flights of each controller"
+    )
     caption = f"Thick: median, {spread}. A lost flight counts as infinitely far: a median ends where half are lost."
     return LineFigure(f"{scenario.name}_error", caption, "time (s)", "distance from target (m)", lines, spans)
 
@@ -185,17 +189,31 @@ def _sweep(group: str, key: str, scenarios: Sequence[Scenario], flown: Sequence[
             if each.label == label
         ]
         x = np.array([value for value, _ in cells])
-        shares = [100.0 * np.array([getattr(figures.success, name) for _, figures in cells]) for name in ("value", "low", "high")]
-        success.append(Line(label, colour, x, *shares))
+        shares = [
+            100.0 * np.array([getattr(figures.success, name) for _, figures in cells]) for name in ("value", "low", "high")
+        ]
+        value, low, high = shares
+        success.append(Line(label, colour, x, value, low, high))
         medians = [figures.final_error_median for _, figures in cells]
         error.append(Line(label, colour, x, np.array([np.nan if value is None else value for value in medians])))
     x_label = axis_label(key).replace("_", " ")
     return [
         LineFigure(
-            f"{group}_success", "Success, with 95 % intervals.", x_label, "success (%)", success, y_range=(-3.0, 103.0), marks=True
+            f"{group}_success",
+            "Success, with 95 % intervals.",
+            x_label,
+            "success (%)",
+            success,
+            y_range=(-3.0, 103.0),
+            marks=True,
         ),
         LineFigure(
-            f"{group}_error", "Median of the final error of flights that were not lost.", x_label, "final distance (m)", error, marks=True
+            f"{group}_error",
+            "Median of the final error of flights that were not lost.",
+            x_label,
+            "final distance (m)",
+            error,
+            marks=True,
         ),
     ]
 

@@ -57,7 +57,10 @@ def render(results: Results, parts: list[Section], with_pictures: bool) -> str:
 
     figures = {figure.name: interactive.draw(figure) for section in parts for figure in section.figures}
     environment = Environment(
-        loader=PackageLoader("sb3_quad.report", "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        loader=PackageLoader("sb3_quad.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
         lstrip_blocks=True,
     )
     kept = {name: {"data": figure["data"], "layout": figure["layout"]} for name, figure in figures.items()}
@@ -66,7 +69,9 @@ def render(results: Results, parts: list[Section], with_pictures: bool) -> str:
         sections=parts,
         heights={name: figure["height"] for name, figure in figures.items()},
         kinds={name: "space" if "scene" in figure["layout"] else "plane" for name, figure in figures.items()},
-        narrow={figure.name for section in parts for figure in section.figures if isinstance(figure, LineFigure) and figure.marks},
+        narrow={
+            figure.name for section in parts for figure in section.figures if isinstance(figure, LineFigure) and figure.marks
+        },
         colours=colours_of([record.label for record in results.controllers]),
         flights=sum(entry.figures.n for entry in results.entries),
         backends=sorted({entry.backend for entry in results.entries}),

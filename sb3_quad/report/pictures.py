@@ -16,8 +16,21 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture
 
 DPI = 150
-STYLE = {"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.titlesize": 9, "legend.frameon": False}
-STYLE |= {"axes.grid": True, "grid.alpha": 0.3, "grid.linewidth": 0.6, "svg.fonttype": "none", "svg.hashsalt": "sb3_quad"}
+STYLE: Any = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 9,
+    "legend.frameon": False,
+}
+STYLE |= {
+    "legend.frameon": False,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "grid.linewidth": 0.6,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sb3_quad",
+}
 
 
 def files(figure: Figure) -> dict[str, bytes]:
@@ -85,7 +98,10 @@ def _lines(figure: LineFigure) -> Picture:
         axes.set_xscale("log")
     axes.set_xlabel(figure.x_label)
     axes.set_ylabel(figure.y_label)
-    axes.set_ylim(figure.y_range or (0.0, None))
+    if figure.y_range is None:
+        axes.set_ylim(bottom=0.0)
+    else:
+        axes.set_ylim(figure.y_range)
     _legend(axes, picture)
     return picture
 

@@ -98,13 +98,18 @@ def _overview(results: Results, colours: dict[str, str], source: str) -> Section
             else:
                 values = [100.0 * share.value for share in shares]
                 cells.append(Cell(words=f"{min(values):.0f} to {max(values):.0f}"))
-        beside = [reference_cells(first.reference[name]).get(SUCCESS, Cell()) if name in first.reference else Cell() for name in others]
+        beside = [
+            reference_cells(first.reference[name]).get(SUCCESS, Cell()) if name in first.reference else Cell()
+            for name in others
+        ]
         rows.append(Row(_heading(scenarios), "", [*mark_best(SUCCESS, cells), *beside]))
     filled = [k for k in range(len(others)) if any(row.cells[len(colours) + k] != Cell() for row in rows)]
     kept = [*range(len(colours)), *(len(colours) + k for k in filled)]
     rows = [Row(row.name, "", [row.cells[k] for k in kept]) for row in rows]
     table = Table(list(colours.items()), [others[k] for k in filled], rows, source, "success (%)")
-    description = "Share of flights that neither touch the ground nor leave the range. Where a scenario is varied: least to greatest."
+    description = (
+        "Share of flights that neither touch the ground nor leave the range. Where a scenario is varied: least to greatest."
+    )
     return Section("overview", "Success", description, [table])
 
 

@@ -86,7 +86,7 @@ class _Panel:
             return self.shown[1]
         recording, step = self.recording, self.steps[number]
         state = recording.state[:, step]
-        pose = Pose(state, recording.wrench[:, step], self.rotor_angles[:, step])
+        pose = Pose(state, recording.wrench_around(step), self.rotor_angles[:, step])
         trail = Trail(recording.path[: step + 1 : 2], rgb(self.colour), 0.03 * self.stage.scale, opacity=0.75)
         scene = Scene([pose], state[None, TARGET], [trail])
         pixels = self.stage.picture(scene, self.cameras[number], FIELD_OF_VIEW, self.width, self.height)
@@ -130,7 +130,9 @@ class _Panel:
 
     def _caption(self, number: int) -> str:
         recording, step = self.recording, self.steps[number]
-        if step == len(recording.times) - 1 and recording.outcome != "flying":
-            return f"{recording.times[-1]:5.2f} s   {recording.outcome}"
+        if step == len(recording.times) - 1 and recording.lost:
+            return f"{recording.times[-1]:5.2f} s   {recording.lost}"
         height = recording.state[POSITION, step][2]
-        return f"{recording.times[step]:5.2f} s   {recording.error[step]:.2f} m from target   {height:.1f} m high"
+        force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
+        push = f"   force {force:.1f} N" if force else ""
+        return f"{recording.times[step]:5.2f} s   {recording.error[step]:.2f} m from target   {height:.1f} m high{push}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-# Okabe and Ito's palette, less its black and its yellow, which drown on dark and on light paper; some shifted to be read on both.
+# Okabe and Ito's palette, less its black and its yellow, which drown on dark and on light paper; a few moved.
 COLOURS = ("#1B7EC2", "#D55E00", "#009E73", "#B8548A", "#C88A00", "#3E9BD6", "#7A5BC0", "#7F7F7F")
 
 

@@ -1,40 +1,21 @@
-"""One flight, step by step, as it is shown: flown in the reference environment, by any controller."""
+"""One flight as it is shown: every control step, flown in the reference environment by any controller."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import POSITION, STATE_SIZE, TARGET, QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-from sb3_quad.errors import ConfigError
+from sb3_quad.dynamics.state import POSITION, TARGET, QuadcopterState
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.evaluation.fleets import PyBulletFleet
+from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.evaluation.flights import Plan, fly_fleet
 
 FloatArray = npt.NDArray[np.float64]
-Pilot = Callable[[npt.NDArray[np.float32], QuadcopterState], npt.NDArray[np.float32]]
-
-
-@dataclass(frozen=True)
-class Push:
-    """An external force and torque for some time.
-
-    :param force: world frame, N; ``torque``: body frame, N m.
-    :param start: when it begins, s.
-    :param duration: how long it acts, s.
-    """
-
-    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    torque: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    start: float = 0.0
-    duration: float = float("inf")
-
-    def acts(self, seconds: float) -> bool:
-        """Whether it acts in the control step that begins after ``seconds``."""
-        return self.start - 1e-9 <= seconds < self.start + self.duration - 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,10 +27,10 @@ class Recording:
     ==========  ====================  =========================================================================
     times       (T + 1,)              s since the start
     state       (STATE_SIZE, T + 1)   the true state, laid out as in :mod:`sb3_quad.dynamics.state`
-    wrench      (12, T + 1)           force in the world and in the body frame (N), torques likewise (N m)
-    actions     (T, 4)                as they were given, clipped to [-1, 1]
-    rewards     (T,)                  of each control step
-    outcome                           how it ended: ``flying`` (by its time), ``collision`` or ``out of range``
+    wrench      (12, T + 1)           that acted during the step before: force in the world and in the body
+                                      frame (N), torques likewise (N m)
+    reward                            sum of the rewards
+    lost                              how it was lost: ``collision``, ``out of range``, or empty
     ==========  ====================  =========================================================================
     """
 
@@ -58,9 +39,8 @@ class Recording:
     times: FloatArray
     state: FloatArray
     wrench: FloatArray
-    actions: npt.NDArray[np.float32]
-    rewards: FloatArray
-    outcome: str
+    reward: float
+    lost: str
 
     @property
     def error(self) -> FloatArray:
@@ -79,74 +59,87 @@ class Recording:
         changed = np.flatnonzero((np.diff(targets, axis=0) != 0).any(axis=1)) + 1
         return np.asarray(targets[[0, *changed]])
 
+    @property
+    def pushes(self) -> list[int]:
+        """The steps after which a wrench has begun to act."""
+        acts = np.asarray(np.any(self.wrench != 0.0, axis=0))
+        return (np.flatnonzero(acts[1:] & ~acts[:-1]) + 1).tolist()
+
+    def wrench_around(self, step: int, seconds: float = 0.4) -> FloatArray:
+        """The largest force and torque, (12,), of the last while before ``step``: a short blow stays to be seen."""
+        first = max(0, step - round(seconds / self.vehicle.control_step))
+        recent = self.wrench[:, first : step + 1]
+        return np.asarray(recent[:, int(np.argmax(np.linalg.norm(recent, axis=0)))])
+
     def at(self, seconds: float) -> int:
         """The index of the last state not later than ``seconds``."""
-        return int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1
+        return max(0, int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1)
 
 
 def record(
     name: str,
-    pilot: Pilot,
-    env: QuadcopterEnv,
-    seed: int | None,
+    controller: Any,
+    seed: int,
     n_steps: int,
-    target: Sequence[float] | None = None,
-    start: Mapping[str, Any] | None = None,
-    pushes: Sequence[Push] = (),
+    task: Any = "target_tracking",
+    task_kwargs: Mapping[str, Any] | None = None,
+    vehicle: str | Vehicle = "itm",
+    noise: float = 0.05,
+    observation_std: npt.ArrayLike | None = None,
+    plan: Plan | None = None,
+    deterministic: bool = True,
 ) -> Recording:
-    """Fly one episode of ``env`` and write it all down.
+    """Fly one episode on PyBullet and write it all down.
 
-    :param pilot: from an observation (18,) and the true state to an action (4,).
-    :param seed: of the episode; None: the environment's next one.
+    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`, as are ``task``, ``task_kwargs``, ``vehicle``,
+        ``noise`` and ``observation_std``.
     :param n_steps: control steps of an episode that nothing ends before.
-    :param target: r_T, (3,), m; None: the episode's own.
-    :param start: parts of the state at the start, as ``env.reset(options={"state": ...})`` takes them.
+    :param plan: what happens whoever flies; of one episode.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample.
+    :raises ConfigError: a controller that cannot be asked, keywords that the environment refuses.
+    :raises ControllerError: a controller that fails in flight.
     """
-    options: dict[str, Any] = {} if target is None else {"target": target}
-    options |= {"state": dict(start)} if start else {}
-    observation, _ = env.reset(seed=seed, options=options or None)
-    state = np.empty((STATE_SIZE, n_steps + 1))
-    wrench = np.zeros((12, n_steps + 1))
-    actions, rewards = np.empty((n_steps, 4), dtype=np.float32), np.empty(n_steps)
-    state[:, 0] = env.true_state().array[:, 0]
-    steps, outcome = n_steps, "flying"
-    for step in range(n_steps):
-        force, torque = _sum_of(pushes, step * env.vehicle.control_step)
-        env.set_wrench(force, torque)
-        wrench[0:3, step], wrench[9:12, step] = force, torque
-        action = np.asarray(pilot(observation, env.true_state()), dtype=np.float32).reshape(-1)
-        observation, rewards[step], terminated, _, info = env.step(action)
-        actions[step] = np.clip(action, -1.0, 1.0)
-        state[:, step + 1] = env.true_state().array[:, 0]
-        if terminated:
-            steps, outcome = step + 1, "collision" if info["collision"] else "out of range"
-            break
-    env.set_wrench()
-    wrench[:, steps] = wrench[:, steps - 1]
-    times = np.arange(steps + 1) * env.vehicle.control_step
-    return Recording(
-        name, env.vehicle, times, state[:, : steps + 1], wrench[:, : steps + 1], actions[:steps], rewards[:steps], outcome
-    )
+    pilot = controller if deterministic or not hasattr(controller, "predict") else _Sampling(controller)
+    recorder = _EveryStep()
+    fleet = PyBulletFleet([seed], task, task_kwargs, vehicle, noise, n_steps, observation_std)
+    try:
+        flights = fly_fleet(fleet, pilot, plan or Plan(), n_steps, (), recorder)
+    finally:
+        fleet.close()
+    lost = "" if flights.success[0] else "collision" if flights.collision[0] else "out of range"
+    states, wrenches = np.stack(recorder.states, axis=1), np.stack(recorder.wrenches, axis=1)
+    times = np.arange(states.shape[1], dtype=np.float64) * recorder.control_step
+    return Recording(name, load_vehicle(vehicle), times, states, wrenches, float(flights.reward[0]), lost)
 
 
-def as_pilot(controller: Any, deterministic: bool = True) -> Pilot:
-    """A controller as :func:`record` asks it.
+class _Sampling:
+    """A policy whose actions are drawn, not their mean."""
 
-    :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by ``predict``; or a
-        function from an observation (18,) to an action (4,).
-    :raises ConfigError: a controller that is none of the three.
-    """
-    if hasattr(controller, "actions"):
-        return lambda observation, state: np.asarray(controller.actions(state)[0])
-    if hasattr(controller, "predict"):
-        return lambda observation, state: np.asarray(controller.predict(observation, deterministic=deterministic)[0])
-    if callable(controller):
-        return lambda observation, state: np.asarray(controller(observation))
-    raise ConfigError(f"controller {controller!r}: needs actions(state) or predict(observation), or must be callable")
+    def __init__(self, policy: Any) -> None:
+        self._policy = policy
+
+    def predict(self, observation: Any, deterministic: bool = True) -> tuple[Any, Any]:
+        """The policy's sample."""
+        actions, state = self._policy.predict(observation, deterministic=False)
+        return actions, state
 
 
-def _sum_of(pushes: Sequence[Push], seconds: float) -> tuple[FloatArray, FloatArray]:
-    acting = [push for push in pushes if push.acts(seconds)]
-    force = np.sum([push.force for push in acting], axis=0) if acting else np.zeros(3)
-    torque = np.sum([push.torque for push in acting], axis=0) if acting else np.zeros(3)
-    return np.asarray(force, dtype=np.float64), np.asarray(torque, dtype=np.float64)
+class _EveryStep(Recorder):
+    """Keeps all there is of one flight, its last state included."""
+
+    def __init__(self) -> None:
+        super().__init__(1, 1)
+        self.states: list[FloatArray] = []
+        self.wrenches: list[FloatArray] = [np.zeros(12)]
+
+    def begin(self, state: QuadcopterState, control_step: float) -> None:
+        self.control_step = control_step
+        self.states.append(state.array[:, 0].copy())
+
+    def push(self, state: QuadcopterState, wrench: FloatArray) -> None:
+        self.wrenches.append(wrench[0].copy())
+
+    def sample(
+        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
+    ) -> None:
+        self.states.append(state.array[:, 0].copy())

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import POSITION
 from sb3_quad.envs.backdrop import Camera
 from sb3_quad.envs.scenery import rotor_turning
 from sb3_quad.envs.urdf import arm_length, rotor_radius
@@ -24,6 +23,7 @@ Picture = npt.NDArray[np.uint8]
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
+AREA, RATIOS = 290_000, (0.7, 1.6)  # of a panel: pixels, width by height
 LARGEST = 6.0  # how much larger than life it is drawn at most
 APART = 0.8  # least distance between poses in the picture, in the vehicle's drawn breadth
 
@@ -46,14 +46,17 @@ class _View:
         return np.asarray(self.breadth * self.height / (2.0 * self.camera.slope * np.asarray(depth)))
 
 
-def sequence(recordings: Sequence[Recording], times: Sequence[float] | None, width: int, height: int) -> Picture:
+def sequence(
+    recordings: Sequence[Recording], times: Sequence[float] | None = None, size: tuple[int, int] | None = None
+) -> Picture:
     """One panel for each recording, all seen by the same camera.
 
     :param times: s, at which poses are drawn; None: as many as do not hide one another.
-    :param width: of a panel, pixels; ``height`` likewise.
+    :param size: width and height of a panel, its header not counted, pixels; None: in the proportions of the flights.
     :return: uint8 (height, about panels * width, 3).
     """
     ends = [_end(recording) if times is None else recording.at(max(times)) for recording in recordings]
+    width, height = size or _proportions(recordings, ends)
     view = _view(recordings, ends, width, height)
     colours = colours_of([recording.name for recording in recordings])
     panels = []
@@ -73,9 +76,23 @@ def _at(recording: Recording, times: Sequence[float]) -> list[int]:
     return sorted({recording.at(seconds) for seconds in times})
 
 
-def _view(recordings: Sequence[Recording], ends: Sequence[int], width: int, height: int) -> _View:
+def _points(recordings: Sequence[Recording], ends: Sequence[int]) -> FloatArray:
     paths = [recording.path[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
-    points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
+    return np.concatenate([*paths, *(recording.targets for recording in recordings)])
+
+
+def _proportions(recordings: Sequence[Recording], ends: Sequence[int]) -> tuple[int, int]:
+    points = _points(recordings, ends)
+    x, y, _ = broadside(points)
+    high = float(np.ptp(points[:, 2]))
+    wide = float(np.ptp(points[:, 0] * y - points[:, 1] * x))
+    ratio = float(np.clip((wide + 0.3 * high + 1.0) / (high + 0.3 * wide + 1.0), *RATIOS))
+    width = 2 * round((AREA * ratio) ** 0.5 / 2)
+    return width, 2 * round(AREA / width / 2)
+
+
+def _view(recordings: Sequence[Recording], ends: Sequence[int], width: int, height: int) -> _View:
+    points = _points(recordings, ends)
     vehicle = recordings[0].vehicle
     breadth = 2.0 * (arm_length(vehicle) + rotor_radius(vehicle))
     ahead = broadside(points)
@@ -101,8 +118,10 @@ def _apart(recording: Recording, end: int, view: _View) -> list[int]:
     for step in range(1, end + 1):
         if clear_of(chosen, step).all():
             chosen.append(step)
-    if recording.outcome != "flying" and chosen[-1] != end:  # how it was lost is to be seen
-        chosen = [0, *(step for step in chosen[1:] if clear_of([step], end)[0]), end]
+    # When it was pushed, and how it was lost, is to be seen: what would hide that gives way.
+    for step in (*(push for push in recording.pushes if push <= end), *([end] if recording.lost else [])):
+        chosen = [each for each in chosen if each == 0 or clear_of([each], step)[0]]
+        chosen = sorted({*chosen, step})
     return chosen
 
 
@@ -145,8 +164,8 @@ def _tag_times(canvas: Canvas, recording: Recording, chosen: Sequence[int], view
 
 
 def _outcome(recording: Recording, end: int) -> str:
-    if recording.outcome != "flying":
-        return f"{recording.outcome} after {recording.times[-1]:.2f} s"
+    if recording.lost:
+        return f"{recording.lost} after {recording.times[-1]:.2f} s"
     if end < len(recording.times) - 1:
         return f"within {SETTLED:g} m of its target from {recording.times[end]:.2f} s on"
     return f"{recording.error[end]:.2f} m from its target after {recording.times[end]:.2f} s"

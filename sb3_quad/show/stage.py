@@ -14,7 +14,7 @@ import pybullet as p
 from sb3_quad.dynamics.state import POSITION
 from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.envs.backdrop import Camera
-from sb3_quad.envs.scenery import RING, DrawnTarget, DrawnVehicle, DrawnWrench, Picture, scale_of, take_picture
+from sb3_quad.envs.scenery import RING, DrawnTarget, DrawnVehicle, DrawnWrench, scale_of, take_picture
 from sb3_quad.show.lines import draw_line
 
 FloatArray = npt.NDArray[np.float64]

@@ -91,7 +91,7 @@ class _Player:
         state = recording.state[:, step]
         self.vehicle.place(state, self.rotor_angles[:, step])
         self.target.place(state[TARGET], state[None, POSITION])
-        self.wrench.place(state, recording.wrench[:, step])
+        self.wrench.place(state, recording.wrench_around(step))
         if step == self.drawn_to:
             return
         ends = recording.path[[self.drawn_to, step]].tolist()
