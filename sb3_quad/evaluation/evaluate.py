@@ -151,6 +151,7 @@ def _collect(
     return Results(
         suite=suite.name,
         description=suite.description,
+        source=suite.source,
         package_version=__version__,
         controllers=list(controllers.values()),
         scenarios=list(scenarios.values()),

@@ -133,6 +133,7 @@ class Results(Record):
     schema_version: Literal[1] = SCHEMA_VERSION
     suite: str
     description: str
+    source: str = Field(default="reference", description="where the scenarios' reference figures come from")
     package_version: str
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]

@@ -13,7 +13,7 @@ from sb3_quad.errors import ConfigError
 MAX_CELLS = 1000
 _UNITS = dict(
     {"tilt": "deg", "velocity": "m/s", "body_rates": "rad/s", "force": "N", "torque": "N m", "distance": "m", "start": "s"},
-    **dict.fromkeys(("mass", "inertia", "motor_gain"), "of the vehicle's own"),
+    **dict.fromkeys(("mass", "inertia", "motor_gain"), "× the vehicle's own"),
     delay="control steps",
     noise="relative std",
     duration="s",
