@@ -20,7 +20,6 @@ from sb3_quad.dynamics.state import POSITION, TARGET
 from sb3_quad.envs.backdrop import Camera
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.scenery import SUPERSAMPLING, Picture
-from sb3_quad.errors import ConfigError
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.show import framing, sequence
