@@ -79,7 +79,7 @@ def here(tmp_path, monkeypatch):
 
 
 def evaluate(*arguments: str, folder: str = "out") -> int:
-    return main(["evaluate", *arguments, "--suite", "small.yaml", "-o", folder])
+    return main(["evaluate", *arguments, "--suite", "small.yaml", "-o", folder, "--no-report"])
 
 
 def rows(folder: str = "out") -> list[dict[str, str]]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console
+from sb3_quad.cli.report import report
 from sb3_quad.errors import ConfigError, unknown
 
 if TYPE_CHECKING:
@@ -51,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
     add("--overwrite", action="store_true", help="replace results of these controllers that were flown otherwise")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="renew report.html and its figures (yes)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
 
 
@@ -74,6 +76,8 @@ def run(options: argparse.Namespace) -> int:
     if labels:
         console().print(overview(flown, labels, suite.source))
     print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
+    if options.report and results.entries:
+        report(folder, overwrite=True, pictures=True)
     return _report_failures(results, {spec.label for spec in controllers})
 
 

@@ -40,13 +40,13 @@ def framing_camera(
     slope = math.tan(field_of_view / 2)
     half = np.array([slope * aspect, slope])
     local = points @ axes.T
-    centre, distance = np.zeros(2), 0.0
+    centre = np.zeros(2)
     for _ in range(30):  # where the picture's middle lies depends on the distance, and the other way round
         distance = _distance(local, centre, half, margin)
         away, depth = local[:, 1:] - centre, local[:, :1] + distance
         middle = 0.5 * (((away - margin) / depth).min(axis=0) + ((away + margin) / depth).max(axis=0))
         centre = centre + middle * float(depth.mean())
-    return Camera(_above_ground(np.array([-distance, *centre]) @ axes), axes, slope)
+    return Camera(_above_ground(np.array([-_distance(local, centre, half, margin), *centre]) @ axes), axes, slope)
 
 
 def following_cameras(

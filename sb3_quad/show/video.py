@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-import os
+import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.errors import ConfigError
+from sb3_quad.training.files import write_bytes
 
 FORMATS = (".mp4", ".gif")
 
@@ -27,32 +28,26 @@ def check_video(path: Path) -> None:
 
 
 def write_video(path: Path, frames: Iterable[npt.NDArray[np.uint8]], fps: int) -> None:
-    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves no file.
+    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves what was there before.
 
     :raises ConfigError: a folder that cannot be written, a full disk, missing packages.
     """
     imageio = _imageio()
-    beside = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
-    if path.suffix.lower() == ".mp4":
-        options: dict[str, Any] = {
-            "fps": fps,
-            "codec": "libx264",
-            "quality": 7,
-            "macro_block_size": 2,
-            "ffmpeg_log_level": "error",
-        }
-    else:
-        options = {"duration": 1000 / fps, "loop": 0}
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with imageio.get_writer(beside, **options) as writer:
-            for frame in frames:
-                writer.append_data(frame)
-        os.replace(beside, path)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        beside.unlink(missing_ok=True)
+    suffix = path.suffix.lower()
+    options: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}
+    if suffix == ".mp4":
+        options = {"fps": fps, "codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    # Not beside the file: when it is interrupted, the encoder may still be writing for a moment.
+    with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
+        draft = Path(folder, f"film{suffix}")
+        try:
+            with imageio.get_writer(draft, **options) as writer:
+                for frame in frames:
+                    writer.append_data(frame)
+            content = draft.read_bytes()
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be encoded ({error.strerror or error})") from error
+    write_bytes(path, content)
 
 
 def _imageio() -> Any:
