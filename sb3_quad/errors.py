@@ -29,6 +29,10 @@ class ControllerError(SB3QuadError, RuntimeError):
     """A controller that fails in flight: says when, and what it raised or gave."""
 
 
+class ExportError(SB3QuadError, RuntimeError):
+    """An exported policy that does not compute what the trained one does, or cannot be checked."""
+
+
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
     """The message for an unknown ``name``: the nearest valid one and the whole list.
 

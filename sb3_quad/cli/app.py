@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, enjoy, evaluate, plot, report, train
+from sb3_quad.cli import benchmark, enjoy, evaluate, export, plot, report, train
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
@@ -21,6 +21,7 @@ COMMANDS = {
     "evaluate": evaluate,
     "report": report,
     "enjoy": enjoy,
+    "export": export,
     "benchmark": benchmark,
     "plot": plot,
 }
