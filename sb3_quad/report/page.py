@@ -1,4 +1,4 @@
-"""``report.html``: one file that needs nothing else, and the figures as pictures beside it."""
+"""``report.html``: one file that needs nothing else; its tables as ``report.md`` and the figures as pictures beside it."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.records import Results
 from sb3_quad.report import interactive, pictures
 from sb3_quad.report.figures import LineFigure
+from sb3_quad.report.markdown import render_markdown
 from sb3_quad.report.sections import Section, sections
 from sb3_quad.training.files import refuse_existing, write_bytes, write_text
 
-PAGE, PICTURES = "report.html", "figures"
+PAGE, TABLES, PICTURES = "report.html", "report.md", "figures"
 
 
 def write_report(
@@ -24,7 +25,7 @@ def write_report(
     with_pictures: bool = True,
     progress: Callable[[str], None] = lambda heading: None,
 ) -> Path:
-    """Write the report of a folder of results.
+    """Write the report of a folder of results; its tables as ``report.md`` too.
 
     :param overwrite: replace a report that is there.
     :param with_pictures: also write every figure as PNG and SVG, into ``figures/``.
@@ -44,6 +45,7 @@ def write_report(
             for figure in section.figures:
                 for name, content in pictures.files(figure).items():
                     write_bytes(Path(folder) / PICTURES / name, content)
+    write_text(Path(folder) / TABLES, render_markdown(results, parts))
     write_text(page, render(results, parts, with_pictures))
     return page
 
