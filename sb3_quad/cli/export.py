@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.errors import ConfigError, unknown
 
 HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
-EXAMPLES = """The file takes 18 numbers in physical units (position relative to the target, m, world frame; rotation matrix world to
-body, row by row; velocity, m/s, and body rates, rad/s, body frame) and gives what to command of the four rotors. Scaling
+EXAMPLES = """The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix world to
+body, row by row; velocity, m/s, and body rates, rad/s, body frame. It gives what to command of the four rotors. Scaling
 and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
 
 examples:
@@ -40,20 +40,25 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.export.policy import FORMATS, export_policy
     from sb3_quad.training.files import write_bytes
 
-    ending = FORMATS.get(options.format, "")
-    file = Path(options.file) if options.file else Path(options.model).with_suffix(ending)
+    if options.format not in FORMATS:
+        raise ConfigError(unknown("format", options.format, FORMATS))
+    model, ending = Path(options.model), FORMATS[options.format]
+    if not model.is_file():
+        raise ConfigError(f"model {model}: no such file")
+    file = Path(options.file) if options.file else model.with_suffix(ending)
     if file.is_dir():
         raise ConfigError(f"{file}: is a folder; give the path of a file, such as {file / ('policy' + ending)}")
     if file.exists():
-        if file.samefile(options.model):
+        if file.samefile(model):
             raise ConfigError(f"{file}: is the model itself; give another file with -o")
         if not options.overwrite:
             raise ConfigError(f"{file}: is there already; give --overwrite, or another file with -o")
     if options.name is not None and options.format != "c":
         raise ConfigError(f"--name {options.name}: only a C header has one (--format c)")
     name = c_name(file.stem) if options.name is None else options.name
-    exported = export_policy(options.model, options.format, options.output, options.vehicle, name=name)
+    exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
     write_bytes(file, exported.content)
+    print(f"settings: {exported.settings}")
     for key in ("vehicle", "scaling", "network", "observation", "result", "rotors", "check"):
         print(f"{key}: {exported.metadata[key]}")
     if exported.microseconds is not None:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.envs.batch import QuadcopterBatch

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from sb3_quad.export.settings import trained_with
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}
 """Each format and the ending of its files."""
+_SIGN = {1: "+", -1: "-"}
 
 
 @dataclass(frozen=True)
@@ -32,6 +34,7 @@ class Export:
     :param unit: ``N`` or ``rad/s``.
     :param microseconds: per call with one observation, on one thread; None where it could not be run.
     :param checked_by: what ran it.
+    :param settings: the file that vehicle and scaling came from, where they were not given.
     """
 
     content: bytes
@@ -40,6 +43,7 @@ class Export:
     unit: str
     microseconds: float | None
     checked_by: str
+    settings: str
 
 
 def export_policy(
@@ -84,7 +88,7 @@ def export_policy(
     count = len(samples.physical)
     metadata["check"] = f"largest error {error:.2g} {network.unit} in {count} observations ({trial.by})"
     content = _write(file_format, network, metadata, prefix)
-    return Export(content, metadata, error, network.unit, trial.microseconds, trial.by)
+    return Export(content, metadata, error, network.unit, trial.microseconds, trial.by, given.source)
 
 
 def _write(file_format: str, network: Network, metadata: dict[str, str], prefix: str) -> bytes:
@@ -103,26 +107,29 @@ def _describe(path: Path, algorithm: str, network: Network, vehicle: Vehicle) ->
     """What users of the file must know; ASCII but for names."""
     low, high = result_range(vehicle, network.output)
     what = "thrust" if network.output == "thrusts" else "speed"
-    rotors = zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True)
+    rotors = enumerate(zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True))
     sizes = [len(network.mean), *(len(layer.bias) for layer in network.layers)]
     hidden = ", ".join(layer.activation for layer in network.layers[:-1]) or "none"
-    std = ", ".join(f"{1.0 / value:.6g}" for value in network.inverse_std)
-    mean = ", ".join(f"{value:.6g}" for value in network.mean)
+    std = _compact([f"{1.0 / value:.6g}" for value in network.inverse_std])
+    mean = _compact([f"{value:.6g}" for value in network.mean])
     facts: dict[str, Any] = {
         "policy": f"{path.name} ({algorithm}), sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}",
         "made_by": f"sb3_quad {__version__}",
-        "vehicle": f"{vehicle.name}: hover at {vehicle.hover_thrust:.6g} N per rotor, kF {vehicle.thrust_coefficient:.6g} N s^2",
+        "vehicle": f"{vehicle.name}: hover thrust {vehicle.hover_thrust:.6g} N, kF {vehicle.thrust_coefficient:.6g} N s^2",
         "frames": "world: z up; body: x forward, y left, z up",
         "observation": "18 numbers, not scaled: 0-2 position minus target position, world frame, m; "
         "3-11 rotation matrix world to body (v_body = R v_world), row by row; "
         "12-14 linear velocity, body frame, m/s; 15-17 body rates, body frame, rad/s",
         "result": f"4 numbers: the {what} to command of each rotor, {network.unit}, within {low:.6g} to {high:.6g}",
-        "rotors": "; ".join(
-            f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {'+' if sign > 0 else '-'}" for k, ((x, y), sign) in enumerate(rotors)
-        ),
+        "rotors": "; ".join(f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {_SIGN[sign]}" for k, ((x, y), sign) in rotors),
         "period": f"{vehicle.control_step:g} s between calls, as in training",
         "scaling": f"done inside, (x - mean) / std with mean {mean} and std {std}",
         "network": f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, {network.n_parameters} float32 parameters",
         "check": "pending",
     }
     return facts
+
+
+def _compact(words: list[str]) -> str:
+    """Equal words in a row once, with how many they are: ``5.7735 (3 times), 1.73205 (9 times)``."""
+    return ", ".join(f"{word} ({len(list(group))} times)" for word, group in groupby(words))

@@ -23,7 +23,7 @@ class TrainedWith:
     vehicle: Any = None
     observation_mean: Any = None
     observation_std: Any = None
-    source: str = "no run folder"
+    source: str = "none beside the zip (itm, Table A.2)"
 
 
 def trained_with(path: str | Path) -> TrainedWith:

@@ -1,0 +1,251 @@
+"""Exported policies compute what the trained ones do, in physical units, and fly without this package."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import A2C, PPO, SAC
+
+from sb3_quad.cli import main
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError, ExportError
+from sb3_quad.export import c_header, c_trial, policy
+from sb3_quad.export.network import build_network
+from sb3_quad.export.policy import FORMATS, export_policy
+
+ITM = load_vehicle("itm")
+DOCS = (Path(__file__).resolve().parent.parent / "docs" / "export.md").read_text(encoding="utf-8")
+MODELS = {
+    "tanh": (PPO, {"net_arch": [16, 12]}),
+    "relu": (A2C, {"net_arch": {"pi": [24], "vf": [8]}, "activation_fn": torch.nn.ReLU}),
+    "squashed": (A2C, {"net_arch": [], "squash_output": True}),
+}
+needs_compiler = pytest.mark.skipif(c_trial.find_compiler() is None, reason="there is no C compiler here")
+
+
+def untrained(kind, env):
+    algorithm, kwargs = MODELS[kind]
+    model = algorithm("MlpPolicy", env, policy_kwargs=kwargs, use_sde=kind == "squashed", seed=1, device="cpu")
+    with torch.no_grad():  # SB3 starts near zero, where neither order of rotors nor clipping would show
+        model.policy.action_net.weight *= 80.0
+        model.policy.action_net.bias.copy_(torch.tensor([0.3, -0.2, 0.1, 0.0]))
+    return model
+
+
+@pytest.fixture(scope="module")
+def zips(tmp_path_factory):
+    torch.manual_seed(0)
+    folder = tmp_path_factory.mktemp("models")
+    for kind in MODELS:
+        untrained(kind, QuadcopterVecEnv(2, seed=0)).save(folder / f"{kind}.zip")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def flight():
+    """What an environment shows of random states, and the same in physical units, worked out from the true state."""
+    env = QuadcopterVecEnv(300, "recovery_and_tracking", noise=0.0, seed=7)
+    scaled, state = env.reset(), env.true_state()
+    to_body = state.rotation.transpose(0, 2, 1)
+    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
+    parts = (state.position - env.target, to_body.reshape(-1, 9), velocity, state.body_rates)
+    return scaled, np.concatenate(parts, axis=1).astype(np.float32)
+
+
+def run(file_format, content, observations, name="tanh"):
+    """What a file gives, by what users run it with."""
+    if file_format == "onnx":
+        runtime = pytest.importorskip("onnxruntime")
+        session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
+        return session.run(None, {"observation": observations})[0]
+    if file_format == "torchscript":
+        return torch.jit.load(io.BytesIO(content))(torch.from_numpy(observations)).numpy()
+    return c_trial.run(content, observations, name, None).results
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("kind", MODELS)
+@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
+def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
+    path = zips / f"{kind}.zip"
+    scaled, physical = flight
+    exported = export_policy(path, file_format, n_observations=200)
+    actions = MODELS[kind][0].load(path, device="cpu").predict(scaled, deterministic=True)[0]
+    expected = ITM.hover_thrust * (1.0 + 0.5 * actions)  # Eq. 3.18
+    assert expected.std(axis=0).min() > 0.3  # all rotors at work
+    np.testing.assert_allclose(run(file_format, exported.content, physical, kind), expected, atol=1e-4)
+    assert 0 <= exported.max_error < 1e-4 and exported.microseconds > 0
+    assert f"{exported.max_error:.2g} N in 200" in exported.metadata["check"]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
+def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_format):
+    vehicle = ITM.model_copy(update={"thrust_limits": (0.0, 1.9)})
+    contents = [export_policy(zips / "tanh.zip", file_format, kind, vehicle, n_observations=200) for kind in policy_outputs()]
+    thrusts, speeds = (run(file_format, exported.content, flight[1]) for exported in contents)
+    assert contents[1].unit == "rad/s" and thrusts.min() == 0.0
+    np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
+
+
+def policy_outputs():
+    return ("thrusts", "speeds")
+
+
+def test_the_run_folder_tells_vehicle_and_scaling(zips, tmp_path):
+    run_folder = tmp_path / "run"
+    (run_folder / "Env-v0").mkdir(parents=True)
+    path = run_folder / "agent.zip"
+    path.write_bytes((zips / "tanh.zip").read_bytes())
+    (tmp_path / "light.yaml").write_text("\n".join(f"{k}: {v}" for k, v in light().items()))
+    given = {"vehicle": str(tmp_path / "light.yaml"), "observation_std": [2.0] * 18}
+    (run_folder / "Env-v0" / "config.yml").write_text(json.dumps({"env_kwargs": given}))
+    exported = export_policy(path, "torchscript", n_observations=100)
+    assert "light" in exported.metadata["vehicle"] and "std 2 (18 times)" in exported.metadata["scaling"]
+    assert str(tmp_path) not in json.dumps(exported.metadata)
+    assert "itm" in export_policy(path, "torchscript", vehicle="itm", n_observations=100).metadata["vehicle"]
+    (run_folder / "Env-v0" / "vecnormalize.pkl").touch()
+    with pytest.raises(ConfigError, match="VecNormalize"):
+        export_policy(path, "torchscript")
+
+
+def light():
+    kept = ITM.model_dump(mode="json", exclude={"geometric_gains"})
+    return {**kept, "name": "light", "mass": 1.0}
+
+
+def test_torchscript_loads_where_sb3_quad_cannot_be_imported(zips, tmp_path):
+    assert main(["export", str(zips / "relu.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 0
+    snippet = DOCS.split("## TorchScript")[1].split("```python")[1].split("```")[0]
+    code = f"import sys; sys.modules['sb3_quad'] = None\n{snippet}\nprint(thrust.shape)"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "[1, 4]" in done.stdout, done.stderr
+
+
+def test_a_file_that_computes_something_else_is_not_written(zips, tmp_path, capsys, monkeypatch):
+    def wrong(*arguments):
+        found = build_network(*arguments)
+        found.layers[0].weight[3, 5] += 0.05
+        found.layers[0].weight.setflags(write=False)
+        return found
+
+    monkeypatch.setattr(policy, "build_network", wrong)
+    monkeypatch.setattr(policy, "draw_samples", shifted(policy.draw_samples))
+    assert main(["export", str(zips / "tanh.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 2
+    error = capsys.readouterr().err
+    assert "differs from the trained one" in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def shifted(draw):
+    """As the weights are shared with the policy, the mistake is undone for the policy by observations of its own."""
+
+    def samples(*arguments):
+        found = draw(*arguments)
+        return found._replace(scaled=found.scaled[:, ::-1].copy())
+
+    return samples
+
+
+@needs_compiler
+def test_a_header_that_does_not_compile_is_refused(zips, monkeypatch):
+    monkeypatch.setattr(c_header, "_comment", lambda metadata: "float unused;;")
+    with pytest.raises(ExportError, match="cannot be checked"):
+        export_policy(zips / "tanh.zip", "c", n_observations=100)
+
+
+def test_without_a_compiler_the_header_says_so(zips, monkeypatch):
+    monkeypatch.setattr(c_trial, "find_compiler", lambda: None)
+    for kind in ("tanh", "relu"):
+        exported = export_policy(zips / f"{kind}.zip", "c", "speeds", n_observations=100)
+        assert exported.microseconds is None and "not compiled" in exported.content.decode()
+        assert exported.max_error < 0.01
+
+
+@settings(max_examples=50)
+@given(st.text(max_size=200))
+def test_any_file_name_makes_a_c_name_and_a_comment(text):
+    assert c_header.check_name(c_header.c_name(text))
+    comment = c_header._comment({"policy": text})
+    assert comment.isascii() and comment.count("*/") == 1 and comment.count("/*") == 1
+
+
+class Stub(gymnasium.Env):
+    """Spaces without a flight."""
+
+    def __init__(self, observations, actions):
+        self.observation_space, self.action_space = observations, actions
+
+
+SEEN, DONE = spaces.Box(-np.inf, np.inf, (18,), np.float32), spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PPO("MlpPolicy", Stub(spaces.Box(-1, 1, (3,)), DONE), device="cpu"), "of shape"),
+        (lambda: PPO("MlpPolicy", Stub(SEEN, spaces.Box(-2, 2, (4,))), device="cpu"), "actions are"),
+        (lambda: PPO("MlpPolicy", Stub(SEEN, DONE), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu"), "ELU"),
+        (lambda: PPO("CnnPolicy", Stub(spaces.Box(0, 255, (36, 36, 3), np.uint8), DONE), device="cpu"), "CnnPolicy"),
+        (lambda: SAC("MlpPolicy", Stub(SEEN, DONE), device="cpu", buffer_size=10), "off-policy"),
+    ],
+)
+def test_a_policy_that_cannot_fly_so_is_refused(make, message):
+    with pytest.raises(ConfigError, match=message) as raised:
+        build_network(make(), ITM)
+    assert "\n" not in str(raised.value).replace("\n", " ", 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["nowhere.zip", "--format", "c"], "no such file"),
+        (["agent.zip", "--format", "onyx"], "did you mean 'onnx'"),
+        (["agent.zip"], "--format"),
+        (["agent.zip", "--format", "c"], "--overwrite"),
+        (["agent.zip", "--format", "c", "--overwrite", "-o", "agent.zip"], "the model itself"),
+        (["agent.zip", "--format", "c", "-o", "b.h", "--name", "1st"], "C identifier"),
+        (["agent.zip", "--format", "c", "-o", "b.h", "--output", "speed"], "did you mean 'speeds'"),
+        (["agent.zip", "--format", "onnx"], r"pip install 'sb3_quad\[export\]'"),
+    ],
+)
+def test_bad_input_is_one_line(zips, tmp_path, capsys, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    monkeypatch.setattr(policy, "N_OBSERVATIONS", 100)
+    (tmp_path / "agent.zip").write_bytes((zips / "tanh.zip").read_bytes())
+    (tmp_path / "agent.h").write_text("kept")
+    assert main(["export", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error) and error.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["agent.h", "agent.zip"]
+    assert (tmp_path / "agent.h").read_text() == "kept"
+
+
+@needs_compiler
+def test_the_examples_of_the_docs_agree(zips, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("onnxruntime")
+    monkeypatch.chdir(tmp_path)
+    for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
+        assert main(["export", str(zips / "tanh.zip"), "--format", file_format, "-o", file]) == 0
+    assert "µs per call" in capsys.readouterr().out
+    scope = {}
+    exec(DOCS.split("## Python")[1].split("```python")[1].split("```")[0], scope)
+    (tmp_path / "main.c").write_text(DOCS.split("```c\n")[1].split("```")[0])
+    subprocess.run([c_trial.find_compiler(), *c_trial.FLAGS, "main.c", "-lm", "-o", "main"], check=True)
+    printed = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
+    np.testing.assert_allclose([float(word) for word in printed], scope["thrust"][0], atol=1e-5)
+    assert "in 10000 observations" in capsys.readouterr().out
