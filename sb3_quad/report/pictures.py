@@ -43,7 +43,7 @@ def files(figure: Figure) -> dict[str, bytes]:
         for suffix in ("png", "svg"):
             buffer = io.BytesIO()
             metadata = {"Date": None} if suffix == "svg" else None  # the same figures, the same file
-            picture.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata)
+            picture.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata, bbox_inches="tight")
             contents[f"{figure.name}.{suffix}"] = buffer.getvalue()
             picture.set_layout_engine("none")  # what is arranged stays so
     return contents
