@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, plot, train
+from sb3_quad.cli import benchmark, plot, train, tune_expert
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
@@ -15,7 +15,7 @@ EXIT_CODES = """exit codes:
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """
-COMMANDS = {"train": train, "benchmark": benchmark, "plot": plot}
+COMMANDS = {"train": train, "benchmark": benchmark, "plot": plot, "tune-expert": tune_expert}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
