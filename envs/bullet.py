@@ -38,8 +38,10 @@ class BulletBody:
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None, visuals: bool = False) -> None:
-        self.has_window = window is not None and _display()
-        self.client = _open_window(*window) if window is not None and self.has_window else int(p.connect(p.DIRECT))
+        self.has_window = window is not None and has_display()
+        if window is not None and not self.has_window:
+            print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
+        self.client = open_window(*window) if window is not None and self.has_window else int(p.connect(p.DIRECT))
         # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's clients are limited.
         self._close = weakref.finalize(self, _disconnect, self.client)
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
@@ -101,15 +103,16 @@ def load_urdf_text(urdf: str, client: int, **options: Any) -> int:
         return int(p.loadURDF(str(path), physicsClientId=client, **options))
 
 
-def _display() -> bool:
-    # PyBullet would end the whole process.
-    if not sys.platform.startswith("linux") or os.environ.get("DISPLAY"):
-        return True
-    print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
-    return False
+def has_display() -> bool:
+    """Whether a window can be opened; without a display PyBullet would end the whole process."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY"))
 
 
-def _open_window(width: int, height: int) -> int:
+def open_window(width: int, height: int) -> int:
+    """Open PyBullet's window, of ``width`` and ``height`` pixels; its client.
+
+    :raises ConfigError: there is one already in this process, or it cannot be opened.
+    """
     sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
     try:
         client = int(p.connect(p.GUI, options=f"--width={width} --height={height} {sky}"))

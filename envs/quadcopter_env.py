@@ -222,7 +222,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         if self._renderer is not None:
             self._renderer.reset(state)
             self._show()
-        return self._observe(), self._info()
+        return self.observe(), self._info()
 
     def step(self, action: npt.NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Fly one control step.
@@ -250,7 +250,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         if self.render_mode == "human":
             self._show()
         info = self._info()
-        return self._observe(), float(self._reward[0]), not info["is_success"], False, info
+        return self.observe(), float(self._reward[0]), not info["is_success"], False, info
 
     def render(self) -> npt.NDArray[np.uint8] | None:
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""
@@ -320,6 +320,11 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             wrench[2 * number + (frame == "body")] = vector(name, value, 3)
         self._wrench[:, 0] = wrench.ravel()
 
+    @property
+    def wrench(self) -> FloatArray:
+        """What :meth:`set_wrench` has set, (12,), a live view: force world, force body, torque world, torque body; N, N m."""
+        return self._wrench[:, 0]
+
     def set_noise(self, level: float) -> None:
         """Set the relative standard deviation of the observation noise; 0: none."""
         value = vector("noise", np.atleast_1d(np.asarray(level)), 1)
@@ -339,7 +344,8 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         """Set the task of all episodes that begin from now on."""
         self._next_tasks = resolve_tasks(task, task_kwargs)
 
-    def _observe(self) -> Observation:
+    def observe(self) -> Observation:
+        """The present observation, (18,); the same numbers until the next step, unless something was set meanwhile."""
         observation = np.empty(OBSERVATION_SIZE, dtype=np.float32)
         observe(self._state, self._streams, self._mean, self._std, self._noise, observation[None])
         return observation

@@ -25,6 +25,14 @@ class TrainingError(SB3QuadError, RuntimeError):
     """Training that cannot go on, for example a loss that is no longer finite."""
 
 
+class ControllerError(SB3QuadError, RuntimeError):
+    """A controller that fails in flight: says when, and what it raised or gave."""
+
+
+class ExportError(SB3QuadError, RuntimeError):
+    """An exported policy that does not compute what the trained one does, or cannot be checked."""
+
+
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
     """The message for an unknown ``name``: the nearest valid one and the whole list.
 

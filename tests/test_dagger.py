@@ -96,7 +96,7 @@ def test_it_learns_to_fly_from_the_true_state():
     assert np.median(flight.true_state().distance) < 5.0  # of the 10 m it began with; the expert's 2.9 m
 
 
-@pytest.mark.parametrize("bc_loss", ["mse", "nll"])
+@pytest.mark.parametrize("bc_loss", ["mse", "nll", "huber"])
 def test_an_sb3_model_teaches(bc_loss):
     teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")
     model = build(expert=teacher, bc_loss=bc_loss).learn(ROLLOUT)

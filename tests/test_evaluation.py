@@ -15,8 +15,9 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
 from sb3_quad.evaluation.summary import summarise
-from sb3_quad.evaluation.tables import THESIS, comparison
+from sb3_quad.evaluation.tables import comparison
 from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.scenarios.load import load_suite
 
 
 def fall(observation):
@@ -91,13 +92,14 @@ def test_time_zero_is_the_start():
 
 
 def test_the_conventions_give_the_specified_figures():
-    summary = summarise(fly(PIDExpert(), "target_tracking", 480, seed=0))
+    figures = summarise(fly(PIDExpert(), "target_tracking", 480, seed=0))
+    arrivals = {arrival.tolerance: arrival for arrival in figures.arrivals}
     for tolerance, seconds in {0.1: 7.71, 0.2: 6.89, 0.5: 5.80, 1.0: 4.90}.items():
-        assert summary.time_to[tolerance][0] == pytest.approx(seconds, rel=0.02)
-        assert summary.time_to[tolerance][1] == 1.0
-    assert summary.mean_path == pytest.approx(10.42, rel=0.02)
-    assert summary.mean_reward == pytest.approx(-8.10, rel=0.02)
-    assert summary.success_rate == 1.0
+        assert arrivals[tolerance].time.value == pytest.approx(seconds, rel=0.02)
+        assert arrivals[tolerance].share.value == 1.0
+    assert figures.path.value == pytest.approx(10.42, rel=0.02)
+    assert figures.reward.value == pytest.approx(-8.10, rel=0.02)
+    assert figures.success.value == 1.0
 
 
 def test_times_fall_with_the_tolerance():
@@ -131,22 +133,29 @@ def test_tables_say_how_many_arrived():
     n = 4
     flights = Flights(
         success=np.array([True, True, False, True]),
+        collision=np.array([False, False, True, False]),
         reward=np.full(n, -8.0),
         length=np.full(n, 1500),
+        flown=np.full(n, 15.0),
         time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},
         path_length=np.full(n, 10.0),
         final_error=np.array([0.1, 0.2, 9.0, 0.3]),
+        final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
+        waypoint_times=np.zeros((n, 0)),
+        start=np.zeros((n, 13)),
+        target=np.zeros((n, 3)),
     )
-    summary = summarise(flights)
-    assert summary.success_rate == 0.75
-    assert summary.time_to[1.0] == (5.0, 0.75)
-    assert summary.max_final_error == 0.3
-    text = text_of(comparison("title", {"agent": summary}, {"expert": THESIS["target_tracking"]["expert"]}))
-    for part in ("75 %", "5.00 s (75 % of flights)", "never", "0.300 m", "thesis: expert", "7.75 s"):
+    figures = summarise(flights)
+    assert figures.success.value == 0.75 and (figures.collisions, figures.out_of_range) == (1, 0)
+    assert figures.arrivals[-1].time.value == 5.0 and figures.arrivals[-1].share.value == 0.75
+    assert figures.final_error_max == 0.3 and figures.final_offset == pytest.approx((0.2, 0.0, 0.0))
+    text = text_of(comparison("title", {"agent": figures}, load_suite("thesis").scenario("tracking"), ["expert"]))
+    for part in ("75 % (", "5.00 ±", "(75 %)", "never", "0.300 m", "thesis: expert", "7.75 s"):
         assert part in text
 
 
 def test_tables_stand_without_a_single_success():
-    text = text_of(comparison("title", {"agent": summarise(fly(fall, "state_recovery", 2, seed=0))}))
-    assert "0 %" in text
+    figures = summarise(fly(fall, "state_recovery", 2, seed=0))
+    text = text_of(comparison("title", {"agent": figures}, load_suite("thesis").scenario("recovery")))
+    assert "0 % (" in text
     assert "nan" not in text

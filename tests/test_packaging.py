@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
-DATA = {".yaml", ".yml", ".typed"}
+DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js"}
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 
@@ -113,14 +113,15 @@ def test_pyproject_holds_only_the_build_system():
 
 def test_each_dependency_is_pinned(options):
     pins = [line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
-    wanted = options["options"]["install_requires"] + options["options.extras_require"]["dev"]
+    extras = options["options.extras_require"]
+    wanted = options["options"]["install_requires"] + extras["dev"] + extras["video"]
     names = {line.split(">=")[0].strip().lower() for line in wanted.splitlines() if line.strip()}
     assert names <= set(pins)
     assert len(pins) == len(set(pins))
 
 
 def test_what_the_code_imports_is_declared(options):
-    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3"}
+    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow"}
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
     extras = [text for name, text in options["options.extras_require"].items() if name != "dev"]
     wanted = "\n".join([options["options"]["install_requires"], *extras])

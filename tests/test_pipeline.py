@@ -13,9 +13,10 @@ from stable_baselines3 import PPO
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, TrainingError
+from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.training.pipeline import load_pipeline, make_jobs, run_pipeline, with_settings
-from sb3_quad.training.trim import hover_offset, scale_position, shift_position, trim
+from sb3_quad.training.trim import scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
 STAGES = [
@@ -92,7 +93,7 @@ def test_shifting_the_position_is_seen_by_the_actor_as_a_move():
 
 def test_an_agent_that_crashes_cannot_be_trimmed():
     env = QuadcopterVecEnv(4, seed=1)
-    with pytest.raises(ConfigError, match="cannot be trimmed"):
+    with pytest.raises(ConfigError, match="offset from the target cannot be measured"):
         hover_offset(PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"), n_flights=8)
 
 

@@ -79,7 +79,7 @@ def test_labelling_alone_changes_nothing():
     assert th.equal(parameters(stock), parameters(ours))
 
 
-@pytest.mark.parametrize("bc_loss", ["nll", "mse"])
+@pytest.mark.parametrize("bc_loss", ["nll", "mse", "huber"])
 def test_cloning_pulls_towards_the_expert(bc_loss):
     def error(model):
         observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)

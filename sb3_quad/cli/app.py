@@ -5,17 +5,27 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, plot, train, tune_expert
+from sb3_quad.cli import benchmark, enjoy, evaluate, export, plot, report, train, tune_expert
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
 EXIT_CODES = """exit codes:
   0    done
+  1    evaluated, but not every controller: a line on stderr for each that failed
   2    bad input, or a training that cannot go on: one line on stderr says what
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """
-COMMANDS = {"train": train, "benchmark": benchmark, "plot": plot, "tune-expert": tune_expert}
+COMMANDS = {
+    "train": train,
+    "evaluate": evaluate,
+    "report": report,
+    "enjoy": enjoy,
+    "export": export,
+    "benchmark": benchmark,
+    "plot": plot,
+    "tune-expert": tune_expert,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -19,7 +19,7 @@ HELP = "Measure control steps per second: PyBullet, SB3's vectorised environment
 EXAMPLES = """examples:
   sb3-quad benchmark                                   everything, about a minute
   sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, beside PyBullet
-  sb3-quad benchmark --output benchmark.json
+  sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
 """
 SIZES = (64, 240, 1024, 4096, 16384)
 
@@ -30,7 +30,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--sizes", nargs="+", type=whole, default=list(SIZES), metavar="N", help="rows of the batch")
     add("--n-envs", type=whole, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
     add("--seconds", type=float, default=3.0, metavar="S", help="for each measurement (3)")
-    add("--algo", default="dagger", help="algorithm of the training loop, with its default settings (dagger)")
+    add("--algo", default="ppo_bc", help="algorithm of the training loop (ppo_bc)")
+    add("-conf", "--conf-file", metavar="FILE", help="its settings (those that train without arguments uses)")
     add("--training", action=argparse.BooleanOptionalAction, default=True, help="measure a training loop too")
     add("--output", metavar="FILE", help="write everything as JSON, with machine, versions and thread counts")
 
@@ -40,11 +41,13 @@ def run(options: argparse.Namespace) -> int:
     if min(options.sizes) < 1 or options.n_envs < 1 or options.seconds <= 0:
         raise ConfigError("--sizes and --n-envs must be at least 1, --seconds above 0")
     from sb3_quad.evaluation.benchmark import ENV_ID, as_dict, single, training_loop, vectorised
-    from sb3_quad.training.config import load_config
+    from sb3_quad.training.config import config_names, load_config
     from sb3_quad.training.files import write_text
 
     screen = console()
-    config = load_config(options.algo, ENV_ID) if options.training else None
+    default = f"geometric/{options.algo}.yml"
+    conf_file = options.conf_file or (default if default in config_names() else None)
+    config = load_config(options.algo, ENV_ID, conf_file) if options.training else None
     measurements = []
     with screen.status("one PyBullet environment"):
         measurements.append(single(options.seconds))

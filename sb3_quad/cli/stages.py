@@ -75,14 +75,16 @@ def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
     """Both tasks, all pilots on the same fresh episodes, the thesis's figures beside."""
     from sb3_quad.envs.registration import ENVIRONMENTS
     from sb3_quad.evaluation.summary import fly_all
-    from sb3_quad.evaluation.tables import THESIS, comparison
+    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
+    from sb3_quad.scenarios.load import load_suite
     from sb3_quad.training.trainer import FRESH_SEED
 
     keywords = {key: job.config.env_kwargs[key] for key in ("vehicle", "noise") if key in job.config.env_kwargs}
     for task in ENVIRONMENTS.values():
         columns = fly_all(pilots, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
-        thesis = {name: THESIS[task][name] for name in THESIS_PILOTS if name in THESIS[task]}
-        console().print(comparison(f"{task}: {FRESH_EPISODES} fresh episodes, the same for all", columns, thesis))
+        scenario = load_suite("thesis").scenario(TASK_SCENARIOS[task])
+        title = f"{task}: {FRESH_EPISODES} fresh episodes, the same for all"
+        console().print(comparison(title, columns, scenario, THESIS_PILOTS))
 
 
 def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:

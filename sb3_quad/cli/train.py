@@ -163,8 +163,9 @@ def _finish(result: TrainingResult) -> None:
 def _compare(result: TrainingResult) -> Any:
     """The table of agent and expert over the same fresh episodes."""
     from sb3_quad.evaluation.summary import fly_all
-    from sb3_quad.evaluation.tables import THESIS, comparison
+    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
     from sb3_quad.experts.resolve import resolve_expert
+    from sb3_quad.scenarios.load import load_suite
     from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
 
     config = for_evaluation(result.job)
@@ -176,10 +177,9 @@ def _compare(result: TrainingResult) -> Any:
     pilots = {"agent": result.model, "expert": expert}
     columns = fly_all(pilots, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords)
     agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
-    figures = THESIS[str(config.task)]
-    thesis = {name: figures[name] for name in (agent, "expert") if name in figures}
+    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[str(config.task)])
     title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
-    return comparison(title, columns, thesis)
+    return comparison(title, columns, scenario, (agent, "expert"))
 
 
 def _progress(options: argparse.Namespace) -> bool:

@@ -38,13 +38,16 @@ class GeometricGains(BaseModel):
     height_position: Positive = Field(description="desired speed per height error near the target, 1/s")
     height_velocity: Positive = Field(description="acceleration per error of vertical velocity, 1/s")
     deceleration: Positive = Field(description="horizontal deceleration that the approach plans with, m/s²")
-    height_deceleration: Positive = Field(description="vertical deceleration that the approach plans with, m/s²")
+    height_deceleration: Positive = Field(description="vertical deceleration that the approach from below plans with, m/s²")
     descent: Positive = Field(description="greatest desired acceleration downwards, below g, m/s²")
     tilt: Positive = Field(description="tangent of the greatest desired tilt")
     attitude: Positive = Field(description="desired body rate per small angle of thrust direction error, 1/s")
     angular_deceleration: Positive = Field(description="angular deceleration that a turn plans with, rad/s²")
     body_rates: Positive = Field(description="angular acceleration per error of roll and pitch rate, 1/s")
     yaw_rate: Positive = Field(description="angular deceleration per yaw rate, 1/s")
+    descent_deceleration: Positive = Field(
+        description="the same from above: less, so that an agent that imitates it imprecisely does not overshoot, m/s²"
+    )
     measured: GeometricFigures | None = Field(default=None, description="the figures these gains reached")
 
     def values(self) -> npt.NDArray[np.float64]:

@@ -1,15 +1,15 @@
-"""The same n episodes in either environment, side by side in one process, for :func:`sb3_quad.evaluation.flights.fly`."""
+"""The same n episodes in either environment, side by side in one process, for :mod:`sb3_quad.evaluation.flights`."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import QuadcopterState
+from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
 from sb3_quad.errors import ConfigError
 
@@ -17,17 +17,21 @@ MAX_CLIENTS = 512  # PyBullet allows about 1000 physics clients in a process
 Observation = npt.NDArray[np.float32]
 FloatArray = npt.NDArray[np.float64]
 Step = tuple[Observation, FloatArray, npt.NDArray[np.bool_], FloatArray]
+STATE_ROWS = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES, "target": TARGET}
 
 
 class Fleet(ABC):
-    """n vehicles in their first episodes, row k seeded with ``seed + k``."""
+    """n vehicles in their first episodes, row k seeded with ``seeds[k]``."""
 
     n: int
     control_step: float  # s
 
     @abstractmethod
-    def reset(self) -> Observation:
-        """Begin; observations (n, 18)."""
+    def reset(self, start: Mapping[str, FloatArray] | None = None) -> Observation:
+        """Begin; observations (n, 18).
+
+        :param start: what the episodes' own draw is replaced by: any of ``STATE_ROWS``, (n, 3), quaternions (n, 4).
+        """
 
     @abstractmethod
     def step(self, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]) -> Step:
@@ -37,8 +41,21 @@ class Fleet(ABC):
         """
 
     @abstractmethod
+    def retarget(self, rows: npt.NDArray[np.int64], targets: FloatArray) -> Observation:
+        """Move the targets of some rows, (len(rows), 3); all observations with the new targets, (n, 18)."""
+
+    @abstractmethod
+    def set_wrench(self, wrench: FloatArray) -> None:
+        """Forces (N) and torques (N m) from now on, (n, 12): force world, force body, torque world, torque body."""
+
+    @abstractmethod
     def true_state(self) -> QuadcopterState:
         """The true state of all rows, fresh or live."""
+
+    @property
+    @abstractmethod
+    def collided(self) -> npt.NDArray[np.bool_]:
+        """Whether the last episode of each row that ended did so on the ground, (n,)."""
 
     @abstractmethod
     def close(self) -> None:
@@ -50,25 +67,37 @@ class BatchFleet(Fleet):
 
     def __init__(
         self,
-        n: int,
+        seeds: Sequence[int],
         task: Any,
         task_kwargs: Mapping[str, Any] | None,
         vehicle: str | Vehicle,
         noise: float,
-        seed: int,
         max_steps: int,
+        observation_std: npt.ArrayLike | None = None,
     ) -> None:
         from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
+        self.n = len(seeds)
         # One step longer than is flown, so that the time limit never hides the last state behind a reset.
         self._env = QuadcopterVecEnv(
-            n, task=task, task_kwargs=task_kwargs, vehicle=vehicle, noise=noise, seed=seed, max_episode_steps=max_steps + 1
+            self.n,
+            task=task,
+            task_kwargs=task_kwargs,
+            vehicle=vehicle,
+            noise=noise,
+            observation_std=observation_std,
+            max_episode_steps=max_steps + 1,
         )
-        self.n = n
+        self._env.batch.seed(seeds)
         self.control_step = self._env.vehicle.control_step
 
-    def reset(self) -> Observation:
-        return np.asarray(self._env.reset(), dtype=np.float32)
+    def reset(self, start: Mapping[str, FloatArray] | None = None) -> Observation:
+        observation = np.asarray(self._env.reset(), dtype=np.float32)
+        if not start:
+            return observation
+        for name, values in start.items():
+            self._env.true_state().array[STATE_ROWS[name]] = values.T
+        return self._env.batch.observe()
 
     def step(self, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]) -> Step:
         observation, rewards, terminated, infos = self._env.step(actions)
@@ -77,8 +106,19 @@ class BatchFleet(Fleet):
             error[row] = infos[row]["distance"]
         return np.asarray(observation, dtype=np.float32), np.asarray(rewards, dtype=np.float64), terminated, error
 
+    def retarget(self, rows: npt.NDArray[np.int64], targets: FloatArray) -> Observation:
+        self._env.set_target(targets, rows)
+        return self._env.batch.observe()
+
+    def set_wrench(self, wrench: FloatArray) -> None:
+        self._env.batch.wrench[:] = wrench.T
+
     def true_state(self) -> QuadcopterState:
         return self._env.true_state()
+
+    @property
+    def collided(self) -> npt.NDArray[np.bool_]:
+        return self._env.batch.collided
 
     def close(self) -> None:
         self._env.close()
@@ -89,25 +129,33 @@ class PyBulletFleet(Fleet):
 
     def __init__(
         self,
-        n: int,
+        seeds: Sequence[int],
         task: Any,
         task_kwargs: Mapping[str, Any] | None,
         vehicle: str | Vehicle,
         noise: float,
-        seed: int,
         max_steps: int,
+        observation_std: npt.ArrayLike | None = None,
     ) -> None:
         from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 
-        if n > MAX_CLIENTS:
-            raise ConfigError(f"n_episodes {n}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts")
-        self._envs = [QuadcopterEnv(task=task, task_kwargs=task_kwargs, vehicle=vehicle, noise=noise) for _ in range(n)]
-        self.n = n
-        self._seed = seed
+        self.n, self._seeds = len(seeds), seeds
+        if self.n > MAX_CLIENTS:
+            raise ConfigError(
+                f"n_episodes {self.n}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts"
+            )
+        keywords: dict[str, Any] = {"task": task, "task_kwargs": task_kwargs, "vehicle": vehicle, "noise": noise}
+        self._envs = [QuadcopterEnv(**keywords, observation_std=observation_std) for _ in seeds]
         self.control_step = load_vehicle(vehicle).control_step
 
-    def reset(self) -> Observation:
-        self._observation = np.stack([env.reset(seed=self._seed + k)[0] for k, env in enumerate(self._envs)])
+    def reset(self, start: Mapping[str, FloatArray] | None = None) -> Observation:
+        rows = []
+        for k, env in enumerate(self._envs):
+            options: dict[str, Any] = {"state": {name: values[k] for name, values in (start or {}).items()}}
+            options["target"] = options["state"].pop("target", None)
+            rows.append(env.reset(seed=self._seeds[k], options=options)[0])
+        self._observation = np.stack(rows)
+        self._collided = np.zeros(self.n, dtype=np.bool_)
         return self._observation
 
     def step(self, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]) -> Step:
@@ -116,16 +164,31 @@ class PyBulletFleet(Fleet):
         terminated = np.zeros(self.n, dtype=np.bool_)
         for k in np.flatnonzero(flying):
             observation[k], rewards[k], terminated[k], _, info = self._envs[k].step(actions[k])
-            error[k] = info["distance"]
+            error[k], self._collided[k] = info["distance"], info["collision"]
         self._observation = observation
         return observation, rewards, terminated, error
 
+    def retarget(self, rows: npt.NDArray[np.int64], targets: FloatArray) -> Observation:
+        self._observation = self._observation.copy()
+        for row, target in zip(rows, targets, strict=True):
+            self._envs[row].set_target(target)
+            self._observation[row] = self._envs[row].observe()
+        return self._observation
+
+    def set_wrench(self, wrench: FloatArray) -> None:
+        for env, values in zip(self._envs, wrench, strict=True):
+            env.wrench[:] = values
+
     def true_state(self) -> QuadcopterState:
         return QuadcopterState.concatenate([env.true_state() for env in self._envs])
+
+    @property
+    def collided(self) -> npt.NDArray[np.bool_]:
+        return self._collided
 
     def close(self) -> None:
         for env in self._envs:
             env.close()
 
 
-FLEETS = {"batch": BatchFleet, "pybullet": PyBulletFleet}
+FLEETS: Mapping[str, type[BatchFleet] | type[PyBulletFleet]] = {"batch": BatchFleet, "pybullet": PyBulletFleet}

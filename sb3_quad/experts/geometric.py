@@ -41,6 +41,7 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
         angular_deceleration=1.81 * turn,
         body_rates=0.685 / lag,
         yaw_rate=0.110 / lag,
+        descent_deceleration=0.408 * vehicle.gravity * (most - 1.0),
     )
 
 
@@ -99,7 +100,7 @@ def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped
     distance = math.sqrt(ex * ex + ey * ey)
     speed = _braking_profile(distance, gains[0], gains[4]) / distance if distance > 0.0 else gains[0]
     fx, fy = gains[1] * (speed * ex - vx), gains[1] * (speed * ey - vy)
-    rise = math.copysign(_braking_profile(abs(ez), gains[2], gains[5]), ez)
+    rise = math.copysign(_braking_profile(abs(ez), gains[2], gains[5] if ez > 0.0 else gains[12]), ez)
     fz = max(0.1 * g, g + max(-gains[6], gains[3] * (rise - vz)))  # upwards, so that a tilt can be told
     horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[7] * fz
     scale = limit / horizontal if horizontal > limit else 1.0

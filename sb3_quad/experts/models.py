@@ -12,13 +12,39 @@ from sb3_quad.errors import ConfigError
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
-# The module of the saved policy class tells the algorithm's family; DAgger and PPO+BC save stock actor-critic policies.
+# The module of the saved policy class tells the algorithm's family.
+_ACTOR_CRITIC = "stable_baselines3.common.policies"
 _FAMILIES = {
-    "stable_baselines3.common.policies": "PPO",
+    _ACTOR_CRITIC: "PPO",
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
 }
+_OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
+
+
+def saved_algorithm(path: str | Path) -> str:
+    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG or DQN, or PPOBC or DAgger of this package.
+
+    A zip does not name its algorithm; the policy class and the settings that were saved with it tell.
+
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an unknown family.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise ConfigError(f"model {file}: no such file")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            data = json.loads(archive.read("data"))
+        module = str(data["policy_class"]["__module__"])
+    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
+    if module not in _FAMILIES:
+        raise ConfigError(f"model {file}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
+    if module == _ACTOR_CRITIC:
+        own = next((name for key, name in _OURS.items() if key in data), None)
+        return own or ("PPO" if "n_epochs" in data else "A2C")
+    return "DDPG" if _FAMILIES[module] == "TD3" and data.get("policy_delay") == 1 else _FAMILIES[module]
 
 
 def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
@@ -29,18 +55,10 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     import stable_baselines3
 
     file = Path(path)
-    if not file.is_file():
-        raise ConfigError(f"model {file}: no such file")
+    algorithm = saved_algorithm(file)
+    stock = "PPO" if algorithm in _OURS.values() else algorithm
     try:
-        with zipfile.ZipFile(file) as archive:
-            policy = json.loads(archive.read("data"))["policy_class"]
-        module = str(policy["__module__"])
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
-    if module not in _FAMILIES:
-        raise ConfigError(f"model {file}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
-    try:
-        model: BaseAlgorithm = getattr(stable_baselines3, _FAMILIES[module]).load(file, device=device)
+        model: BaseAlgorithm = getattr(stable_baselines3, stock).load(file, device=device)
     except Exception as error:  # a zip whose parts do not fit raises whatever its unpickling raises
         raise ConfigError(f"model {file}: cannot be loaded ({type(error).__name__}: {error})") from None
     return model

@@ -14,12 +14,13 @@ from sb3_quad.experts.models import load_model
 EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.experts.geometric:GeometricExpert"}
 
 
-def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm") -> Any:
+def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:
     """The expert that ``spec`` names.
 
     :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where
         ``factory(vehicle)`` returns an expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for.
+    :param kind: what messages call it.
     :raises ConfigError: an unknown name, a missing or unreadable file.
     :raises ExpertError: a factory that fails.
     """
@@ -27,28 +28,31 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm") -> Any:
         return spec
     text = str(spec)
     if text in EXPERTS:
-        return _factory(EXPERTS[text])(load_vehicle(vehicle))
+        return _factory(EXPERTS[text], kind)(load_vehicle(vehicle))
     if text.endswith(".zip"):
         return load_model(text)
     if ":" in text:
-        factory = _factory(text)
+        factory = _factory(text, kind)
         try:
             return factory(load_vehicle(vehicle))
         except SB3QuadError:
             raise
         except Exception as error:
-            raise ExpertError(f"expert {text}: the factory failed with {type(error).__name__}: {error}") from error
-    raise ConfigError(unknown("expert", text, EXPERTS) + ", or path/to/model.zip, or package.module:factory")
+            raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
+    raise ConfigError(unknown(kind, text, EXPERTS) + ", or path/to/model.zip, or package.module:factory")
 
 
-def _factory(path: str) -> Callable[[Vehicle], Any]:
+def _factory(path: str, kind: str) -> Callable[[Vehicle], Any]:
     module_name, _, attribute = path.partition(":")
     try:
         factory = getattr(importlib.import_module(module_name), attribute)
     except ImportError as error:
-        raise ConfigError(f"expert {path}: module {module_name} cannot be imported ({error})") from None
+        raise ConfigError(f"{kind} {path}: module {module_name} cannot be imported ({error})") from None
     except AttributeError:
-        raise ConfigError(f"expert {path}: module {module_name} has no {attribute!r}") from None
+        raise ConfigError(f"{kind} {path}: module {module_name} has no {attribute!r}") from None
+    except Exception as error:  # whatever the module does when it is imported
+        reason = f"{type(error).__name__}: {error}"
+        raise ConfigError(f"{kind} {path}: module {module_name} fails when it is imported ({reason})") from error
     if not callable(factory):
-        raise ConfigError(f"expert {path}: {attribute} is not callable")
+        raise ConfigError(f"{kind} {path}: {attribute} is not callable")
     return factory  # type: ignore[no-any-return]

@@ -9,12 +9,11 @@ from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.nn import functional as F
 
-from sb3_quad.common.losses import gaussian_nll, l2_loss
+from sb3_quad.common.losses import CloningLoss, gaussian_nll, l2_loss, mean_errors
 from sb3_quad.common.losses import value_loss as max_clipped_value_loss
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBufferSamples
 from sb3_quad.ppo_bc.forward import Evaluation, evaluate
 
-BC_LOSSES = ("nll", "mse")
 BC_FILTERS = ("none", "negative_advantage", "agreement")
 AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
 
@@ -29,7 +28,7 @@ class Weights(NamedTuple):
     vf_coef: float
     ent_coef: float
     bc_coef: float
-    bc_loss: str
+    bc_loss: CloningLoss
     bc_filter: str
     l2_coef: float
 
@@ -98,12 +97,14 @@ def _bc_loss(
 ) -> th.Tensor:
     """L_BC of Eq. 3.12 over the mini-batch; rows that the filter leaves out count as zero."""
     mean, expert_actions = evaluation.mean, samples.expert_actions
-    squared = (mean - expert_actions).square().mean(dim=1)
     if weights.bc_loss == "nll":
         per_sample = gaussian_nll(mean, policy.log_std, expert_actions) / expert_actions.shape[1]
     else:
-        per_sample = squared
+        per_sample = mean_errors(weights.bc_loss, mean, expert_actions)
     if weights.bc_filter == "none":
         return per_sample.mean()
-    mask = samples.advantages < 0 if weights.bc_filter == "negative_advantage" else squared < AGREEMENT**2
+    if weights.bc_filter == "negative_advantage":
+        mask = samples.advantages < 0
+    else:
+        mask = mean_errors("mse", mean, expert_actions) < AGREEMENT**2
     return (per_sample * mask).mean()

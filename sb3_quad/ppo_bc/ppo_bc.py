@@ -16,10 +16,11 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.common.labels import ExpertLabeller
+from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer, ExpertRolloutBufferSamples
 from sb3_quad.ppo_bc.gradients import gradient_norms
-from sb3_quad.ppo_bc.loss import BC_FILTERS, BC_LOSSES, LossTerms, Weights, loss_terms
+from sb3_quad.ppo_bc.loss import BC_FILTERS, LossTerms, Weights, loss_terms
 
 SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
 
@@ -41,7 +42,8 @@ class PPOBC(PPO):
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining progress (SB3's
         ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a mean over the action's
-        dimensions; or ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone.
+        dimensions; ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone; or
+        ``"huber"``, that is linear beyond 0.05.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"negative_advantage"``, where the flown action did worse than
         the critic expected; ``"agreement"``, where expert and policy differ by less than 0.3 (root mean square over the
         action): an expert for small angles, such as the PID, then holds the agent on its way to the target and has no say
@@ -85,7 +87,7 @@ class PPOBC(PPO):
         device: th.device | str = "auto",
         expert: Any = None,
         bc_coef: float | Schedule = 0.005,
-        bc_loss: str = "nll",
+        bc_loss: CloningLoss = "nll",
         bc_filter: str = "none",
         l2_coef: float = 0.0,
         max_clipped_value: bool = True,
@@ -120,8 +122,8 @@ class PPOBC(PPO):
             device=device,
             _init_setup_model=False,
         )
-        if bc_loss not in BC_LOSSES:
-            raise ConfigError(unknown("bc_loss", bc_loss, BC_LOSSES))
+        if bc_loss not in CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
         if bc_filter not in BC_FILTERS:
             raise ConfigError(unknown("bc_filter", bc_filter, BC_FILTERS))
         if not l2_coef >= 0:

@@ -17,6 +17,8 @@ from sb3_quad.training.expert_objective import Cost, ExpertObjective
 if TYPE_CHECKING:
     from optuna import Study, Trial
 
+# Slow descents are for agents that imitate the expert imprecisely; the expert itself could do without, and is not asked.
+SEARCHED = tuple(name for name in GAIN_NAMES if name != "descent_deceleration")
 RANGE = 2.0  # each gain between its first value divided by this and multiplied by it
 SETTINGS, WRITTEN = "settings", "written"
 
@@ -49,7 +51,7 @@ class ExpertSearch:
         known = self.study.user_attrs.get(SETTINGS)
         if known is None:
             self.study.set_user_attr(SETTINGS, settings)
-            self.study.enqueue_trial({name: getattr(first, name) for name in GAIN_NAMES})
+            self.study.enqueue_trial({name: getattr(first, name) for name in SEARCHED})
         elif known != settings:
             raise ConfigError(
                 f"journal {journal}: is of a search for another vehicle, or with other gains, sizes or seed; give another one"
@@ -98,7 +100,7 @@ class ExpertSearch:
     def _fly(self, trial: Trial) -> float:
         assert self._objective is not None
         values = {}
-        for name in GAIN_NAMES:
+        for name in SEARCHED:
             middle = getattr(self.first, name)
             values[name] = trial.suggest_float(name, middle / RANGE, middle * RANGE, log=True)
         cost: Cost = self._objective.cost(self._gains(values))
@@ -106,9 +108,9 @@ class ExpertSearch:
             trial.set_user_attr(part, value)
         return cost.value
 
-    @staticmethod
-    def _gains(values: dict[str, float]) -> GeometricGains:
-        return GeometricGains.model_validate({name: float(f"{value:.4g}") for name, value in values.items()})
+    def _gains(self, values: dict[str, float]) -> GeometricGains:
+        rounded = {name: float(f"{value:.4g}") for name, value in values.items()}
+        return GeometricGains.model_validate({**self.first.model_dump(exclude={"measured"}), **rounded})
 
 
 def _study(journal: Path | None, seed: int) -> Study:

@@ -33,6 +33,17 @@ def write_text(path: str | Path, text: str) -> None:
     write_bytes(path, text.encode("utf-8"))
 
 
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """See that a file that a command is to write does not cost one that is there.
+
+    :raises ConfigError: it exists, and ``overwrite`` was not asked for; or it is a folder.
+    """
+    if Path(path).is_dir():
+        raise ConfigError(f"{path}: is a folder; name a file")
+    if Path(path).exists() and not overwrite:
+        raise ConfigError(f"{path}: exists already; name another file, or add --overwrite")
+
+
 def model_bytes(model: BaseAlgorithm) -> bytes:
     """The zip that ``model.save`` would write."""
     buffer = io.BytesIO()

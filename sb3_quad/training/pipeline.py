@@ -20,7 +20,8 @@ algo, env  as for a single run
 conf_file  settings file; ``<algo>.yml`` of the package without it
 settings   changes to these settings, such as ``n_timesteps: 5_000_000``
 pass_on    ``best`` (default): the best evaluation, by success, then by reward; or ``last``
-trim       fold offset and scale of the position into the agent (:mod:`sb3_quad.training.trim`) before passing it on
+trim       correct the agent's steady offset before passing it on: ``position``, by offset and scale of its position
+           (:mod:`sb3_quad.training.trim`), or ``hover``, by its last layer (:mod:`sb3_quad.training.hover`)
 require    ``success_rate``, ``mean_reward``: what the best evaluation must reach, or the pipeline stops here
 eval_freq  transitions between evaluations, ``eval_episodes`` in each, for this stage
 =========  ================================================================================================
@@ -41,6 +42,7 @@ from sb3_quad.errors import ConfigError, TrainingError, unknown
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.config import load_config, read_settings
 from sb3_quad.training.files import save_model, write_text
+from sb3_quad.training.hover import trim_hover
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train
@@ -71,7 +73,7 @@ class Stage(BaseModel):
     conf_file: str | None = None
     settings: dict[str, Any] = Field(default_factory=dict)
     pass_on: Literal["best", "last"] = "best"
-    trim: bool = False
+    trim: Literal["position", "hover"] | None = None
     require: Requirement = Requirement()
     eval_freq: int | None = None
     eval_episodes: int | None = Field(default=None, ge=1)
@@ -232,8 +234,8 @@ def _go_on(
             report(f"to go on with the whole pipeline: --resume {folder}")
             return PipelineResult(folder, done, result.exit_code)
         agent = _passed_on(stage, result.run)
-        if stage.trim:
-            agent = _trimmed(agent, job, report)
+        if stage.trim is not None:
+            agent = _trimmed(agent, job, stage.trim, report)
         done.append(StageResult(stage, result.run, agent, result.model.num_timesteps, round(result.seconds, 1)))
         _write_status(folder, pipeline, jobs, done, None)
     return PipelineResult(folder, done)
@@ -260,19 +262,20 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
 
 
-def _trimmed(agent: Path, job: TrainingJob, report: Callable[[str], None]) -> Path:
+def _trimmed(agent: Path, job: TrainingJob, kind: str, report: Callable[[str], None]) -> Path:
     """Trim the agent in a zip; the trimmed one lies beside it."""
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
-    kept = ("vehicle", "noise", "observation_std")
-    result = trim(
-        model, job.seed + TRIM_SEED, **{key: job.config.env_kwargs[key] for key in kept if key in job.config.env_kwargs}
-    )
+    given = job.config.env_kwargs
+    kept = {key: given[key] for key in ("vehicle", "noise", "observation_std") if key in given}
+    if kind == "hover":
+        hover = trim_hover(model, job.seed + TRIM_SEED, **kept)
+        done = f"action at the target {hover.before:.4f} from hover, now {hover.after:.4f}"
+    else:
+        result = trim(model, job.seed + TRIM_SEED, **kept)
+        done = f"steady offset {result.offset_before:.3f} m, now {result.offset_after:.3f} m; position scale {result.scale:g}"
     trimmed = agent.with_name("trimmed_model.zip")
     save_model(model, trimmed)
-    report(
-        f"trimmed: steady offset {result.offset_before:.3f} m, now {result.offset_after:.3f} m; position scale "
-        f"{result.scale:g}: {trimmed}"
-    )
+    report(f"trimmed: {done}: {trimmed}")
     return trimmed
 
 

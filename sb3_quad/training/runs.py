@@ -5,6 +5,7 @@ file                        what
 ==========================  =========================================================================
 <Env>.zip                   the model at the end, or where it was interrupted
 best_model.zip              the best of the evaluations: by success, then by mean reward
+trimmed_model.zip           the same after trimming, where a pipeline does that
 rl_model_<N>_steps.zip      checkpoints (``--save-freq``)
 evaluations.npz             every evaluation, as SB3's EvalCallback writes it
 0.monitor.csv               every training episode, as SB3's Monitor writes it
@@ -43,6 +44,15 @@ class RunFolder:
     @property
     def best_model(self) -> Path:
         return self.path / "best_model.zip"
+
+    @property
+    def trimmed_model(self) -> Path:
+        return self.path / "trimmed_model.zip"
+
+    @property
+    def result(self) -> Path:
+        """What the run has to offer: its trimmed agent, else its best one, else its last one."""
+        return next((path for path in (self.trimmed_model, self.best_model) if path.is_file()), self.model)
 
     @property
     def evaluations(self) -> Path:
@@ -152,3 +162,31 @@ def open_run(path: str | Path) -> RunFolder:
     if len(configs) != 1:
         raise ConfigError(f"run folder {folder}: holds no run (<Env>/config.yml is missing)")
     return RunFolder(folder, configs[0].parent.name)
+
+
+def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
+    """A run by rl-zoo's ``--exp-id``.
+
+    :param exp_id: number of the run; 0: the latest.
+    :raises ConfigError: there is no such run; the message names those there are.
+    """
+    parent, name = Path(log_folder) / algo, file_name(env_id)
+    number = exp_id if exp_id > 0 else latest_run(parent, name)
+    found = sorted(entry for entry in parent.glob(f"{name}_*") if entry.is_dir())
+    for entry in found:
+        if entry.name.removeprefix(f"{name}_").split("_")[0] == str(number):
+            return RunFolder(entry, name)
+    there = ", ".join(entry.name for entry in found) or "no run of this environment"
+    wanted = f"{name}_{number}" if number else name
+    raise ConfigError(f"{parent}: there is no run {wanted}, but {there}; give another with --env, --algo, -f or --exp-id")
+
+
+def latest_checkpoint(run: RunFolder) -> Path:
+    """The checkpoint after most transitions.
+
+    :raises ConfigError: there is none.
+    """
+    steps = [entry.name.split("_")[2] for entry in run.path.glob("rl_model_*_steps.zip")]
+    if not steps:
+        raise ConfigError(f"{run.path}: holds no checkpoint; train with --save-freq to have some")
+    return run.checkpoint(max(int(step) for step in steps if step.isdigit()))

@@ -19,12 +19,11 @@ import torch as th
 from sb3_quad.envs.observation import DEFAULT_STD
 from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 
 if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-STEPS = 1500  # control steps until the offset is read: 15 s, as an episode
-ROUNDS = 3  # the offset is measured anew after each correction
 SCALES = (1.0, 0.85, 0.75, 0.65, 0.55, 0.5)  # α
 N_TARGETS, N_RECOVERIES = 120, 480  # flights that judge a scale
 TOLERATED = 0.02  # loss of recovery success for which a smaller α is still taken, if it does not double the failures
@@ -80,30 +79,6 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, **env_kwargs: Any) -> Trim:
     return Trim(before, float(np.linalg.norm(hover_offset(model, seed=seed, **env_kwargs))), best)
 
 
-def hover_offset(
-    model: OnPolicyAlgorithm, n_flights: int = N_TARGETS, seed: int = 0, **env_kwargs: Any
-) -> npt.NDArray[np.float64]:
-    """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking.
-
-    :param env_kwargs: for :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as ``vehicle`` and ``noise``.
-    :raises ConfigError: an agent that crashes on the way in more than half of the flights.
-    """
-    from sb3_quad.envs.vec_env import QuadcopterVecEnv
-
-    env = QuadcopterVecEnv(n_flights, "target_tracking", seed=seed, max_episode_steps=STEPS + 1, **env_kwargs)
-    observation = env.reset()
-    flying = np.ones(n_flights, dtype=np.bool_)
-    for _ in range(STEPS):
-        observation, _, dones, _ = env.step(model.predict(observation, deterministic=True)[0])  # type: ignore[arg-type]
-        flying &= ~dones
-    state = env.true_state()
-    if flying.mean() < 0.5:
-        raise ConfigError(
-            f"the agent cannot be trimmed: {100 * (1 - flying.mean()):.0f} % of its flights to targets end early"
-        )
-    return np.asarray((state.position - state.target)[flying].mean(axis=0))
-
-
 def shift_position(model: OnPolicyAlgorithm, offset: npt.NDArray[np.float64], std: npt.NDArray[np.float64]) -> None:
     """Let the actor see its position moved by ``offset`` (m, world frame), in place.
 
@@ -128,9 +103,8 @@ def _cancel_offset(model: OnPolicyAlgorithm, std: npt.NDArray[np.float64], seed:
 
 def _judge(model: OnPolicyAlgorithm, seed: int, env_kwargs: dict[str, Any]) -> tuple[float, float, float]:
     """Mean reward and success of target tracking, success of state recovery."""
-    keywords = {key: value for key, value in env_kwargs.items() if key in ("vehicle", "noise")}
-    tracking = fly(model, "target_tracking", N_TARGETS, seed, **keywords)
-    recovery = fly(model, "state_recovery", N_RECOVERIES, seed, **keywords)
+    tracking = fly(model, "target_tracking", N_TARGETS, seed, **env_kwargs)
+    recovery = fly(model, "state_recovery", N_RECOVERIES, seed, **env_kwargs)
     return float(tracking.reward.mean()), float(tracking.success.mean()), float(recovery.success.mean())
 
 

@@ -1,0 +1,104 @@
+"""``evaluate``: any number of controllers through a suite of scenarios, side by side on the same episodes."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+from sb3_quad.cli.arguments import whole
+from sb3_quad.cli.output import console
+from sb3_quad.cli.report import report
+from sb3_quad.errors import ConfigError, unknown
+
+if TYPE_CHECKING:
+    from sb3_quad.evaluation.evaluate import Progress
+    from sb3_quad.evaluation.records import Results
+
+HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
+EXAMPLES = """controllers:
+  pid, geometric          the experts
+  path/to/agent.zip       an agent of any Stable-Baselines3 algorithm
+  package.module:factory  a function that is given the vehicle and returns a controller
+  name=…                  any of these, called so in the tables
+
+examples:
+  sb3-quad evaluate pid geometric                              the thesis's chapter 4 for both experts
+  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/best_model.zip" --suite thesis -o evaluations/mine
+  sb3-quad evaluate pid agent.zip --suite quick                a look, in less than a minute
+  sb3-quad evaluate agent.zip --suite robustness --workers 2
+  sb3-quad evaluate agent.zip --scaling adaptive --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10
+  sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
+  sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
+
+Results lie in a folder: the same command again flies only what is missing, further controllers join those that are there.
+"""
+DEFAULT_FOLDER = "evaluations"
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of ``evaluate``."""
+    add = parser.add_argument
+    add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
+    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, quick, or the path of a YAML file")
+    add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
+    add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
+    add("--episodes", type=whole, metavar="N", help="of every scenario, instead of its own number")
+    add("--seed", type=whole, metavar="N", help="of the first episode of every scenario, instead of its own")
+    add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
+    add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
+    add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
+    add("--overwrite", action="store_true", help="replace results of these controllers that were flown otherwise")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="renew report.html and its figures (yes)")
+    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Fly, print the table, tell where everything is. Returns the exit code."""
+    from sb3_quad.evaluation.controllers import SCALINGS, parse_controllers
+    from sb3_quad.evaluation.evaluate import evaluate, with_changes
+    from sb3_quad.evaluation.tables import overview
+    from sb3_quad.scenarios.load import load_suite
+
+    if options.scaling not in SCALINGS:
+        raise ConfigError(unknown("scaling", options.scaling, SCALINGS))
+    suite = with_changes(load_suite(options.suite), options.scenario, options.episodes, options.seed)
+    controllers = parse_controllers(options.controllers, options.scaling)
+    folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
+    start = time.perf_counter()
+    with _progress(options) as progress:
+        results = evaluate(suite, controllers, folder, options.backend, options.workers, options.overwrite, progress)
+    flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
+    labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
+    if labels:
+        console().print(overview(flown, labels, suite.source))
+    print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
+    if options.report and results.entries:
+        report(folder, overwrite=True, pictures=True)
+    return _report_failures(results, {spec.label for spec in controllers})
+
+
+def _report_failures(results: Results, labels: set[str]) -> int:
+    failures = [failure for failure in results.failures if failure.controller in labels]
+    for failure in failures:
+        where = "" if failure.scenario is None else f", scenario {failure.scenario}"
+        print(f"failed: {failure.controller}{where}: {failure.message}", file=sys.stderr)
+    return 1 if failures else 0
+
+
+@contextmanager
+def _progress(options: argparse.Namespace) -> Iterator[Progress]:
+    """A progress bar on stderr, if one is wanted."""
+    if not (sys.stderr.isatty() if options.progress is None else options.progress):
+        yield lambda done, total, name: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=Console(file=sys.stderr), transient=True) as bar:
+        task = bar.add_task("loading", total=None)
+        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)

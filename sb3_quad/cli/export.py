@@ -1,0 +1,62 @@
+"""``export``: a trained policy as a file that flies without this package."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from sb3_quad.errors import ConfigError
+
+HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
+EXAMPLES = """The file takes 18 numbers in physical units (position relative to the target, m, world frame; rotation matrix world to
+body, row by row; velocity, m/s, and body rates, rad/s, body frame) and gives what to command of the four rotors. Scaling
+and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
+
+examples:
+  sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/best_model.zip --format onnx
+  sb3-quad export agent.zip --format c -o firmware/agent.h --name agent     agent_policy(observation, thrust)
+  sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
+  sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
+
+ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of ``export``."""
+    add = parser.add_argument
+    add("model", metavar="MODEL.zip", help="an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy")
+    add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
+    add("-o", metavar="FILE", dest="file", help="where it goes (beside the zip, ending in .onnx, .pt or .h)")
+    add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
+    add("--vehicle", metavar="VEHICLE", help="name or .yaml file (that of the zip's run folder, or else itm)")
+    add("--name", metavar="NAME", help="the C function is called NAME_policy (the file's name, less its ending)")
+    add("--overwrite", action="store_true", help="replace FILE if it is there")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Build, check, time, write. Returns the exit code."""
+    from sb3_quad.export.c_header import c_name
+    from sb3_quad.export.policy import FORMATS, export_policy
+    from sb3_quad.training.files import write_bytes
+
+    ending = FORMATS.get(options.format, "")
+    file = Path(options.file) if options.file else Path(options.model).with_suffix(ending)
+    if file.is_dir():
+        raise ConfigError(f"{file}: is a folder; give the path of a file, such as {file / ('policy' + ending)}")
+    if file.exists():
+        if file.samefile(options.model):
+            raise ConfigError(f"{file}: is the model itself; give another file with -o")
+        if not options.overwrite:
+            raise ConfigError(f"{file}: is there already; give --overwrite, or another file with -o")
+    if options.name is not None and options.format != "c":
+        raise ConfigError(f"--name {options.name}: only a C header has one (--format c)")
+    name = c_name(file.stem) if options.name is None else options.name
+    exported = export_policy(options.model, options.format, options.output, options.vehicle, name=name)
+    write_bytes(file, exported.content)
+    for key in ("vehicle", "scaling", "network", "observation", "result", "rotors", "check"):
+        print(f"{key}: {exported.metadata[key]}")
+    if exported.microseconds is not None:
+        print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
+    print(f"saved {file} ({len(exported.content)} bytes)")
+    return 0

@@ -1,0 +1,145 @@
+"""Sampled trajectories of flights, and the ``.npz`` file that holds them beside the figures of every flight.
+
+====================  =================  ============================================================================
+array                 shape              meaning; m flights, k samples (50 Hz), n episodes, T tolerances, W waypoints
+====================  =================  ============================================================================
+time                  (k,)               s, of the samples; sample 0 is the start
+position              (m, k, 3)          r, world frame, m; NaN after the end of a flight, as in all of these
+quaternion            (m, k, 4)          body to world, (w, x, y, z)
+velocity              (m, k, 3)          v, world frame, m/s
+body_rates            (m, k, 3)          body frame, rad/s
+action                (m, k, 4)          the last action given before the sample; NaN at the start
+target                (m, k, 3)          r_T, world frame, m
+wrench                (m, k, 6)          mean since the sample before: force, world frame, N; torque, body frame, N m
+samples               (m,)               how many samples each flight has
+episode_seed          (n,)
+episode_outcome       (n,) text          success, collision or out_of_range
+episode_start         (n, 13)            position, quaternion, velocity, body rates, in the units above
+episode_target        (n, 3)             first target, m
+episode_flown         (n,)               s until lost or the end
+episode_reward        (n,)
+episode_path          (n,)               m
+episode_final_error   (n,)               |r - r_T|, m
+episode_final_offset  (n, 3)             r - r_T, world frame, m; NaN where the flight was lost
+episode_time_to       (n, T)             s until |r - r_T| was first within the tolerance; NaN: never
+episode_tolerances    (T,)               m
+episode_waypoints     (n, W)             s until each waypoint was reached; NaN: never; W = 0 without a course
+====================  =================  ============================================================================
+
+Trajectory i is that of episode i: all episodes of a scenario that is the same each time, the first few of others.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_quad.dynamics.state import QuadcopterState
+from sb3_quad.errors import ConfigError
+
+if TYPE_CHECKING:
+    from sb3_quad.evaluation.flights import Flights
+
+SAMPLE_RATE = 50.0  # Hz
+TRAJECTORIES = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "action": 4, "target": 3, "wrench": 6}
+Arrays = dict[str, npt.NDArray[Any]]
+
+
+class Recorder:
+    """Samples the first ``m`` flights at 50 Hz; float32, since it is for looking at.
+
+    :param m: flights to record.
+    :param max_steps: control steps of the longest of them.
+    :param rate: Hz; as near to it as whole control steps allow.
+    """
+
+    def __init__(self, m: int, max_steps: int, rate: float = SAMPLE_RATE) -> None:
+        self._m, self._max_steps, self._rate = m, max_steps, rate
+
+    def begin(self, state: QuadcopterState, control_step: float) -> None:
+        """The start is sample 0."""
+        self._control_step = control_step
+        self._stride = max(1, round(1.0 / (self._rate * control_step)))
+        k = self._max_steps // self._stride + 1
+        self._arrays = {name: np.full((self._m, k, size), np.nan, np.float32) for name, size in TRAJECTORIES.items()}
+        self._samples = np.zeros(self._m, dtype=np.int64)
+        self._wrench, self._steps = np.zeros((self._m, 6)), 0
+        self._write(0, state, np.ones(self._m, dtype=np.bool_))
+
+    def push(self, state: QuadcopterState, wrench: npt.NDArray[np.float64]) -> None:
+        """The wrench, (n, 12), that acts during the control step which begins at ``state``."""
+        self._steps += 1
+        if not wrench.any():
+            return
+        rows = wrench[: self._m]
+        rotation = QuadcopterState(state.array[:, : self._m]).rotation
+        self._wrench[:, 0:3] += rows[:, 0:3] + np.einsum("nij,nj->ni", rotation, rows[:, 3:6])
+        self._wrench[:, 3:6] += rows[:, 9:12] + np.einsum("nji,nj->ni", rotation, rows[:, 6:9])
+
+    def sample(
+        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
+    ) -> None:
+        """The state at the end of control step ``step``, of the flights that go on."""
+        if step % self._stride:
+            return
+        rows, number = flying[: self._m], step // self._stride
+        self._arrays["action"][rows, number] = actions[: self._m][rows]
+        self._write(number, state, rows)
+
+    def _write(self, number: int, state: QuadcopterState, rows: npt.NDArray[np.bool_]) -> None:
+        for name in ("position", "quaternion", "velocity", "body_rates", "target"):
+            self._arrays[name][rows, number] = getattr(state, name)[: self._m][rows]
+        self._arrays["wrench"][rows, number] = self._wrench[rows] / max(1, self._steps)
+        self._wrench[:], self._steps = 0.0, 0
+        self._samples[rows] = number + 1
+
+    def arrays(self) -> Arrays:
+        """``time``, ``samples`` and the arrays of ``TRAJECTORIES``, as long as the longest flight."""
+        k = int(self._samples.max(initial=1))
+        time = np.arange(k) * (self._stride * self._control_step)
+        return {"time": time, "samples": self._samples, **{name: values[:, :k] for name, values in self._arrays.items()}}
+
+
+def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
+    """The ``episode_`` arrays of this module's table."""
+    outcome = np.where(flights.success, "success", np.where(flights.collision, "collision", "out_of_range"))
+    return {
+        "episode_seed": np.asarray(seeds, dtype=np.int64),
+        "episode_outcome": outcome,
+        "episode_start": flights.start,
+        "episode_target": flights.target,
+        "episode_flown": flights.flown,
+        "episode_reward": flights.reward,
+        "episode_path": flights.path_length,
+        "episode_final_error": flights.final_error,
+        "episode_final_offset": flights.final_offset,
+        "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),
+        "episode_tolerances": np.array(list(flights.time_to)),
+        "episode_waypoints": flights.waypoint_times,
+    }
+
+
+def flight_file(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
+    """The content of a flight file."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
+    return buffer.getvalue()
+
+
+def read_flights(path: str | Path, prefix: str = "") -> Arrays:
+    """The arrays of a flight file, by the names of this module's table.
+
+    :param prefix: only those whose names begin with it, such as ``episode_``; the others are not even read.
+    :raises ConfigError: a missing or damaged file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files if name.startswith(prefix)}
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None

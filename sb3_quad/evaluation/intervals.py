@@ -1,0 +1,42 @@
+"""95 % intervals: Wilson's for shares, the bootstrap for means."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_quad.evaluation.records import Estimate
+
+Z = 1.959963984540054  # 97.5 % of the normal distribution lie below
+RESAMPLES = 1000
+
+
+def share(hits: npt.ArrayLike) -> Estimate:
+    """The share of True with Wilson's score interval (Wilson, JASA 22, 1927).
+
+    :param hits: bool, (n,), n at least 1.
+    """
+    array = np.asarray(hits, dtype=np.bool_)
+    n = array.size
+    p = float(array.mean())
+    centre, half = p + Z * Z / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
+    scale = 1 + Z * Z / n
+    return Estimate(value=p, low=min(p, (centre - half) / scale), high=max(p, (centre + half) / scale), n=n)
+
+
+def mean(values: npt.ArrayLike) -> Estimate | None:
+    """The mean of the finite values with the percentile bootstrap's interval (Efron, 1979); None if there are none.
+
+    The same values give the same interval: the resamples are those of a fixed seed.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    array = array[np.isfinite(array)]
+    n = array.size
+    if n == 0:
+        return None
+    middle = float(array.mean())
+    rows = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
+    low, high = np.percentile(array[rows].mean(axis=1), [2.5, 97.5])
+    return Estimate(value=middle, low=min(middle, float(low)), high=max(middle, float(high)), n=n)

@@ -1,0 +1,145 @@
+"""What an evaluation leaves behind, as validated objects: ``results.json`` is one :class:`Results`.
+
+A folder of results:
+
+==========================================  ==========================================================================
+file                                        what
+==========================================  ==========================================================================
+results.json                                :class:`Results`: scenarios, controllers, figures with their intervals
+episodes.csv                                one line per flight: seed, start, outcome, times, path, final error
+flights/<controller>/<scenario>.json        one :class:`Entry`, written when its flights are done
+flights/<controller>/<scenario>.npz         the same flights in numbers, and the sampled trajectories (``flightlog.py``)
+==========================================  ==========================================================================
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from sb3_quad.scenarios.scenario import Scenario
+
+SCHEMA_VERSION: Literal[1] = 1
+
+
+class Record(BaseModel):
+    """Base of all records: frozen, no unknown keys. Numbers that there are none of are None, never NaN."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Estimate(Record):
+    """A mean or a share with its 95 % interval: Wilson's for shares, the bootstrap percentiles for means."""
+
+    value: float
+    low: float
+    high: float
+    n: int = Field(description="flights it is taken over")
+
+
+class Arrival(Record):
+    """Arrival within one tolerance."""
+
+    tolerance: float = Field(description="m")
+    share: Estimate = Field(description="of the flights that came within the tolerance")
+    time: Estimate | None = Field(description="mean time of those flights, s; None: no flight arrived")
+
+
+class Course(Record):
+    """A course of waypoints."""
+
+    reached: Estimate = Field(description="mean number of waypoints reached")
+    completed: Estimate = Field(description="share of the flights that reached all")
+    time: Estimate | None = Field(description="mean time until the last waypoint of those flights, s")
+
+
+class Figures(Record):
+    """The figures of one controller in one scenario; path and errors are of the flights that were not lost."""
+
+    n: int = Field(description="flights")
+    success: Estimate = Field(description="share that neither touched the ground nor left the range")
+    collisions: int = Field(description="flights that touched the ground")
+    out_of_range: int = Field(description="flights that left the range")
+    reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
+    flown: Estimate = Field(description="mean time flown, until lost or the end, s")
+    arrivals: list[Arrival] = Field(description="by tolerance, the tightest first")
+    path: Estimate | None = Field(description="mean length of the path over the whole episode, m")
+    final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
+    final_error_median: float | None = Field(description="m")
+    final_error_max: float | None = Field(description="m")
+    final_offset: tuple[float, float, float] | None = Field(description="mean r - r_T at the end, world frame, m")
+    course: Course | None = Field(default=None, description="of scenarios with waypoints")
+
+
+class HitTrial(Record):
+    """The flights with one factor of the wrenches."""
+
+    factor: float
+    survived: Estimate
+
+
+class HitLimit(Record):
+    """How large the wrenches of a scenario may get: the factor at which half of the flights are lost."""
+
+    factor: float | None = Field(description="None: more than half survive even the greatest factor tried")
+    low: float = Field(description="greatest factor that more than half survive for certain (95 %)")
+    high: float | None = Field(description="least factor that fewer than half survive for certain; None: not found")
+    force: float = Field(description="largest force of the scenario, N; times the factor is what is survived")
+    torque: float = Field(description="largest torque of the scenario, N m")
+    trials: list[HitTrial] = Field(description="all factors tried, rising")
+
+
+class ControllerRecord(Record):
+    """Who flew."""
+
+    label: str = Field(description="column title; unique in a folder")
+    spec: str = Field(description="as given: pid, geometric, the file name of a zip, package.module:factory")
+    kind: Literal["expert", "model", "factory"]
+    algorithm: str | None = Field(description="SB3 class that loaded a zip")
+    content: str = Field(description="SHA-256 of the zip, or of the source and version of an expert or factory")
+    scaling: Literal["none", "adaptive"] = Field(description="of its observation (4.3.1)")
+    offset: tuple[float, float, float] | None = Field(
+        default=None, description="with adaptive scaling: the position components of μ, measured beforehand, m"
+    )
+
+
+class Entry(Record):
+    """One controller in one scenario."""
+
+    controller: str = Field(description="label")
+    scenario: str = Field(description="name")
+    key: str = Field(description="hash of all that the flights depend on: equal keys, equal flights")
+    scenario_key: str = Field(description="hash of the part of it that is not the controller")
+    seed: int = Field(description="of episode 0; episode k has seed + k")
+    backend: str
+    seconds: float = Field(description="wall-clock time it took")
+    figures: Figures
+    hit_limit: HitLimit | None = None
+    flights: str = Field(description="path of the .npz, relative to the folder")
+
+
+class Failure(Record):
+    """A controller that could not be loaded, or did not get through a scenario."""
+
+    controller: str
+    scenario: str | None = Field(description="None: it could not be loaded")
+    message: str
+
+
+class Results(Record):
+    """A folder of results."""
+
+    schema_version: Literal[1] = SCHEMA_VERSION
+    suite: str
+    description: str
+    source: str = Field(default="reference", description="where the scenarios' reference figures come from")
+    package_version: str
+    controllers: list[ControllerRecord]
+    scenarios: list[Scenario]
+    entries: list[Entry]
+    failures: list[Failure] = Field(default_factory=list)
+
+    def entry(self, controller: str, scenario: str) -> Entry | None:
+        """The entry of a controller's label and a scenario's name, None if there is none."""
+        return next((each for each in self.entries if each.controller == controller and each.scenario == scenario), None)

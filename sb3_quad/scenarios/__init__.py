@@ -1,0 +1,1 @@
+"""Scenarios as data: what is flown to judge a controller, from YAML files."""

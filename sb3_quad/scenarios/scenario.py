@@ -1,0 +1,213 @@
+"""A scenario: one way to judge a controller, flown many times; and a suite of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import Field, field_validator, model_validator
+
+from sb3_quad.dynamics.quantities import Finite
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.scenarios.parts import Part, Positive, Start, Target, VehicleChanges, Wrench
+
+TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
+NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
+Figure = Finite | tuple[Finite, Finite]
+TimeTo = Figure | None
+
+
+class Reference(Part):
+    """Figures from elsewhere, printed beside the measured ones; a pair is a range."""
+
+    success: Figure | None = Field(default=None, description="share of flights, 0 to 1")
+    reward: Figure | None = Field(default=None, description="mean per episode")
+    time_to: dict[str, TimeTo] = Field(
+        default_factory=dict, description="from tolerances in m to mean times in s; null: never within it"
+    )
+    path: Figure | None = Field(default=None, description="mean path, m")
+    final_error: Figure | None = Field(default=None, description="|r - r_T| at the end, m")
+    flown: Figure | None = Field(default=None, description="until the flight ended, s")
+    note: str = Field(default="", description="what the source says in words")
+
+    @field_validator("time_to", mode="before")
+    @classmethod
+    def _as_text(cls, value: Any) -> Any:
+        return {f"{key:g}" if isinstance(key, float) else str(key): time for key, time in dict(value).items()}
+
+
+class HitSearch(Part):
+    """Search for the factor of all wrenches, force and torque alike, at which half of the flights are lost."""
+
+    largest: Positive = Field(default=16.0, description="greatest factor that is tried")
+    resolution: Annotated[Finite, Field(gt=0, lt=1)] = Field(default=0.02, description="width of the answer, in its own size")
+    episodes: Annotated[int, Field(ge=1)] = Field(default=120, description="flights per factor")
+
+
+class Scenario(Part):
+    """What is flown, how often, and what others measured there. Units m, s, rad, N, N m, kg."""
+
+    name: str = Field(pattern=NAME, description="letters, digits, _ . -; unique in its suite")
+    title: str = Field(default="", description="heading of tables and figures; left out: the name")
+    description: str = Field(default="", description="what it is, and where it comes from")
+    start: Start = Field(default=Start(), description="where an episode starts; left out: hovering at (0, 0, 15) m")
+    target: Target = Field(default=Target(distance=0.0), description="where to fly; left out: to the start")
+    wrenches: tuple[Wrench, ...] = Field(default=(), description="external forces and torques")
+    noise: Annotated[Finite, Field(ge=0)] = Field(
+        default=0.05, description="relative std of the observation noise: 0.05 is 5 %"
+    )
+    duration: Positive = Field(default=15.0, description="of an episode, s")
+    max_distance: Positive = Field(default=30.0, description="farther than this from the target ends an episode, m")
+    vehicle: str = Field(default="itm", description="name, or path of a YAML file (relative to the suite's)")
+    vehicle_changes: VehicleChanges = Field(default=VehicleChanges(), description="unknown to the controller")
+    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(default=240, description="how many are flown")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=2**19, description="episode k is drawn from seed + k")
+    tolerances: tuple[Positive, ...] = Field(default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m")
+    hit_search: HitSearch | None = Field(default=None, description="find how large the wrenches may get")
+    reference: dict[str, Reference] = Field(default_factory=dict, description="from a column's title to others' figures")
+    group: str | None = Field(default=None, description="the scenario that this one is a cell of; set by vary")
+    cell: dict[str, float] = Field(default_factory=dict, description="this cell's values, by key; set by vary")
+
+    @field_validator("duration")
+    @classmethod
+    def _seconds(cls, value: float) -> float:
+        if value > 600.0:
+            raise ValueError(f"{value:g} is beyond 600 s; the unit is s")
+        return value
+
+    @field_validator("noise")
+    @classmethod
+    def _share(cls, value: float) -> float:
+        if value > 1.0:
+            raise ValueError(f"{value:g} is beyond 1; it is a share, not a percentage: 0.05 is 5 %")
+        return value
+
+    @field_validator("tolerances")
+    @classmethod
+    def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(sorted(set(value)))
+
+    @model_validator(mode="after")
+    def _possible(self) -> Scenario:
+        vehicle = self.flown_vehicle()
+        self._check_ground(vehicle)
+        self._check_reach(vehicle)
+        step = vehicle.control_step
+        if self.duration < step:
+            raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
+        for number, wrench in enumerate(self.wrenches):
+            if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
+                raise ValueError(f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control step, {step:g} s")
+            if wrench.start >= self.duration:
+                raise ValueError(
+                    f"wrenches.{number}: starts at {wrench.start:g} s, when the episode of {self.duration:g} s is over"
+                )
+        if self.hit_search is not None and not self.wrenches:
+            raise ValueError("hit_search: there are no wrenches to search with")
+        return self
+
+    def nominal_vehicle(self) -> Vehicle:
+        """The vehicle before the changes: the one that experts are made for.
+
+        :raises ConfigError: it cannot be loaded.
+        """
+        path = Path(self.vehicle)
+        return _load(self.vehicle, path.stat().st_mtime_ns if path.is_file() else 0)
+
+    def flown_vehicle(self) -> Vehicle:
+        """The vehicle that flies, changes included.
+
+        :raises ValueError: a vehicle that cannot be loaded (ConfigError), or cannot fly once changed.
+        """
+        nominal = self.nominal_vehicle()
+        try:
+            return self.vehicle_changes.apply(nominal)
+        except ValueError as error:
+            raise ValueError(f"vehicle_changes: no such vehicle can fly ({_first_line(error)})") from None
+
+    @property
+    def heading(self) -> str:
+        """The title, or the name."""
+        return self.title or self.name
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether every episode has the same start, target and wrenches, so that only noise tells them apart."""
+        start = self.start
+        draws = [start.velocity, start.body_rates, *(wrench.force for wrench in self.wrenches)]
+        draws += [wrench.torque for wrench in self.wrenches]
+        drawn = any(draw.value is None and draw.largest > 0.0 for draw in draws)
+        fixed_target = self.target.distance is None or self.target.distance == 0.0
+        return fixed_target and not drawn and (start.attitude.quaternion is not None or start.attitude.tilt == 0.0)
+
+    def _check_ground(self, vehicle: Vehicle) -> None:
+        least = vehicle.collision_radius
+        if self.start.position[2] <= least:
+            raise ValueError(f"start.position: {list(self.start.position)} touches the ground; z must exceed {least:g} m")
+        for point in self.target.points:
+            if point[2] <= least:
+                raise ValueError(f"target: {list(point)} lies below ground; z must exceed {least:g} m")
+
+    def _check_reach(self, vehicle: Vehicle) -> None:
+        start, least = self.start.position, self.start.velocity.largest
+        points = [start, *self.target.points]
+        for before, after in itertools.pairwise(points):
+            if math.dist(before, after) > self.max_distance:
+                raise ValueError(
+                    f"target: {list(after)} is {math.dist(before, after):.3g} m away, and an episode ends beyond"
+                    f" max_distance {self.max_distance:g} m"
+                )
+        distance = self.target.distance or 0.0
+        if distance > self.max_distance:
+            raise ValueError(f"target.distance: {distance:g} m is beyond max_distance {self.max_distance:g} m")
+        # Full thrust in one direction throughout: no point outside this ball can be reached, whatever flies there.
+        thrust, fall = vehicle.thrust_limits[1] * vehicle.gravity, vehicle.gravity
+        half = 0.5 * self.duration**2
+        length = sum(math.dist(before, after) for before, after in itertools.pairwise(points))
+        needed = [math.dist(start, (x, y, z + fall * half)) for x, y, z in self.target.points]
+        reach = thrust * half + least * self.duration
+        out = any(far > reach for far in needed) or distance > (thrust - fall) * half + least * self.duration
+        if out or length > (thrust + fall) * half + least * self.duration:
+            raise ValueError(f"target: cannot be reached within the duration of {self.duration:g} s at full thrust")
+
+
+class Suite(Part):
+    """Scenarios that belong together."""
+
+    name: str = Field(pattern=NAME, description="what the suite is called")
+    description: str = Field(default="", description="what it is for")
+    source: str = Field(default="reference", description="where the reference figures come from; heads their column")
+    scenarios: tuple[Scenario, ...] = Field(min_length=1)
+
+    def scenario(self, name: str) -> Scenario:
+        """The scenario of that name.
+
+        :raises ConfigError: there is none.
+        """
+        for scenario in self.scenarios:
+            if scenario.name == name:
+                return scenario
+        raise ConfigError(unknown("scenario", name, [scenario.name for scenario in self.scenarios]))
+
+    @model_validator(mode="after")
+    def _unique(self) -> Suite:
+        names = [scenario.name for scenario in self.scenarios]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
+        return self
+
+
+@lru_cache(maxsize=64)
+def _load(vehicle: str, changed: int) -> Vehicle:
+    """A vehicle, read once while its file stays the same: suites have many scenarios."""
+    return load_vehicle(vehicle)
+
+
+def _first_line(error: Exception) -> str:
+    errors = getattr(error, "errors", None)
+    return str(errors()[0]["msg"]).removeprefix("Value error, ") if callable(errors) else str(error)

@@ -1,0 +1,1 @@
+"""The suites of scenarios that come with the package, one YAML file each."""

@@ -1,0 +1,64 @@
+"""Agents in run folders, by rl-zoo's names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.config import build_config
+from sb3_quad.training.runs import RunFolder, find_run, latest_checkpoint
+
+# Of the settings of an environment, those that a flight to be shown can have.
+KEYWORDS = ("task", "task_kwargs", "vehicle", "noise", "observation_std", "max_episode_steps")
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained agent.
+
+    :param label: heads its picture.
+    :param path: of its zip.
+    :param env_kwargs: the settings of the environment it was judged in.
+    """
+
+    label: str
+    path: Path
+    env_kwargs: dict[str, Any]
+
+
+def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int = "result") -> Agent:
+    """The agent of a run.
+
+    :param exp_id: number of the run; 0: the latest.
+    :param which: ``result`` (trimmed, else best, else last), ``best``, ``last checkpoint``, or the number of transitions of a
+        checkpoint.
+    :raises ConfigError: no such run or file, or one whose environment cannot be shown.
+    """
+    run = find_run(log_folder, algo, env_id, exp_id)
+    path = _path(run, which)
+    if not path.is_file():
+        raise ConfigError(
+            f"{path}: no such file; the run holds {', '.join(sorted(each.name for each in run.path.glob('*.zip')))}"
+        )
+    settings, _ = run.read_yaml()
+    config = build_config(algo, env_id, settings, str(run.config))
+    if config.env_wrapper or config.vec_env_wrapper:
+        raise ConfigError(f"{run.path}: was trained behind wrappers, which enjoy does not put around the environment")
+    return Agent(f"{algo} {run.path.name}", path, {**config.env_kwargs, **config.eval_env_kwargs})
+
+
+def check_keywords(env_kwargs: dict[str, Any]) -> None:
+    """:raises ConfigError: a setting that a flight to be shown cannot have."""
+    for key in env_kwargs:
+        if key not in KEYWORDS:
+            raise ConfigError(f"env_kwargs {key}: enjoy can set {', '.join(KEYWORDS)}")
+
+
+def _path(run: RunFolder, which: str | int) -> Path:
+    if isinstance(which, int):
+        return run.checkpoint(which)
+    if which == "last checkpoint":
+        return latest_checkpoint(run)
+    return run.best_model if which == "best" else run.result

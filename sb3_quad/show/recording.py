@@ -1,0 +1,145 @@
+"""One flight as it is shown: every control step, flown in the reference environment by any controller."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sb3_quad.dynamics.state import POSITION, TARGET, QuadcopterState
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.evaluation.fleets import PyBulletFleet
+from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.evaluation.flights import Plan, fly_fleet
+
+FloatArray = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A flight of T control steps.
+
+    ==========  ====================  =========================================================================
+    name        shape                 meaning
+    ==========  ====================  =========================================================================
+    times       (T + 1,)              s since the start
+    state       (STATE_SIZE, T + 1)   the true state, laid out as in :mod:`sb3_quad.dynamics.state`
+    wrench      (12, T + 1)           that acted during the step before: force in the world and in the body
+                                      frame (N), torques likewise (N m)
+    reward                            sum of the rewards
+    lost                              how it was lost: ``collision``, ``out of range``, or empty
+    ==========  ====================  =========================================================================
+    """
+
+    name: str
+    vehicle: Vehicle
+    times: FloatArray
+    state: FloatArray
+    wrench: FloatArray
+    reward: float
+    lost: str
+
+    @property
+    def error(self) -> FloatArray:
+        """|r - r_T|, (T + 1,), m."""
+        return np.asarray(np.linalg.norm(self.state[POSITION] - self.state[TARGET], axis=0))
+
+    @property
+    def path(self) -> FloatArray:
+        """r, (T + 1, 3), world frame, m."""
+        return self.state[POSITION].T
+
+    @property
+    def targets(self) -> FloatArray:
+        """The targets flown to, one after the other, (k, 3), world frame, m."""
+        targets = self.state[TARGET].T
+        changed = np.flatnonzero((np.diff(targets, axis=0) != 0).any(axis=1)) + 1
+        return np.asarray(targets[[0, *changed]])
+
+    @property
+    def pushes(self) -> list[int]:
+        """The steps after which a wrench has begun to act."""
+        acts = np.asarray(np.any(self.wrench != 0.0, axis=0))
+        return (np.flatnonzero(acts[1:] & ~acts[:-1]) + 1).tolist()
+
+    def wrench_around(self, step: int, seconds: float = 0.4) -> FloatArray:
+        """The largest force and torque, (12,), of the last while before ``step``: a short blow stays to be seen."""
+        first = max(0, step - round(seconds / self.vehicle.control_step))
+        recent = self.wrench[:, first : step + 1]
+        return np.asarray(recent[:, int(np.argmax(np.linalg.norm(recent, axis=0)))])
+
+    def at(self, seconds: float) -> int:
+        """The index of the last state not later than ``seconds``."""
+        return max(0, int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1)
+
+
+def record(
+    name: str,
+    controller: Any,
+    seed: int,
+    n_steps: int,
+    task: Any = "target_tracking",
+    task_kwargs: Mapping[str, Any] | None = None,
+    vehicle: str | Vehicle = "itm",
+    noise: float = 0.05,
+    observation_std: npt.ArrayLike | None = None,
+    plan: Plan | None = None,
+    deterministic: bool = True,
+) -> Recording:
+    """Fly one episode on PyBullet and write it all down.
+
+    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`, as are ``task``, ``task_kwargs``, ``vehicle``,
+        ``noise`` and ``observation_std``.
+    :param n_steps: control steps of an episode that nothing ends before.
+    :param plan: what happens whoever flies; of one episode.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample.
+    :raises ConfigError: a controller that cannot be asked, keywords that the environment refuses.
+    :raises ControllerError: a controller that fails in flight.
+    """
+    pilot = controller if deterministic or not hasattr(controller, "predict") else _Sampling(controller)
+    recorder = _EveryStep()
+    fleet = PyBulletFleet([seed], task, task_kwargs, vehicle, noise, n_steps, observation_std)
+    try:
+        flights = fly_fleet(fleet, pilot, plan or Plan(), n_steps, (), recorder)
+    finally:
+        fleet.close()
+    lost = "" if flights.success[0] else "collision" if flights.collision[0] else "out of range"
+    states, wrenches = np.stack(recorder.states, axis=1), np.stack(recorder.wrenches, axis=1)
+    times = np.arange(states.shape[1], dtype=np.float64) * recorder.control_step
+    return Recording(name, load_vehicle(vehicle), times, states, wrenches, float(flights.reward[0]), lost)
+
+
+class _Sampling:
+    """A policy whose actions are drawn, not their mean."""
+
+    def __init__(self, policy: Any) -> None:
+        self._policy = policy
+
+    def predict(self, observation: Any, deterministic: bool = True) -> tuple[Any, Any]:
+        """The policy's sample."""
+        actions, state = self._policy.predict(observation, deterministic=False)
+        return actions, state
+
+
+class _EveryStep(Recorder):
+    """Keeps all there is of one flight, its last state included."""
+
+    def __init__(self) -> None:
+        super().__init__(1, 1)
+        self.states: list[FloatArray] = []
+        self.wrenches: list[FloatArray] = [np.zeros(12)]
+
+    def begin(self, state: QuadcopterState, control_step: float) -> None:
+        self.control_step = control_step
+        self.states.append(state.array[:, 0].copy())
+
+    def push(self, state: QuadcopterState, wrench: FloatArray) -> None:
+        self.wrenches.append(wrench[0].copy())
+
+    def sample(
+        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
+    ) -> None:
+        self.states.append(state.array[:, 0].copy())

@@ -1,0 +1,293 @@
+"""``evaluate``: every controller on the same episodes, nothing flown twice or lost, failures in one line."""
+
+from __future__ import annotations
+
+import csv
+import functools
+import json
+import zipfile
+
+import gymnasium
+import numpy as np
+import pytest
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+
+from sb3_quad.cli import main
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.evaluation.flightlog import read_flights
+from sb3_quad.evaluation.folder import load_results
+from sb3_quad.evaluation.scaling import measure_mean
+from sb3_quad.experts.models import load_model, saved_algorithm
+
+SUITE = """
+name: small
+source: paper
+scenarios:
+  - name: tracking
+    target: {distance: 3}
+    duration: 2
+    tolerances: [0.5, 1.0]
+    episodes: 5
+    reference: {expert: {success: 0.5, time_to: {0.5: 1.25}, path: [2, 3]}}
+  - name: course
+    target: {waypoints: [[0, 0, 15.5], [0, 0.5, 15.5]], radius: 0.4}
+    duration: 4
+    episodes: 2
+  - name: starts
+    vary: {start.attitude.tilt: [0, 60]}
+    duration: 1
+    episodes: 3
+"""
+FACTORIES = """
+import numpy as np
+
+calls = 0
+
+def hover(vehicle):
+    return lambda observation: np.zeros((len(observation), 4))
+
+def broken(vehicle):
+    raise RuntimeError("no\\nmodel")
+
+def fails_in_flight(vehicle):
+    return lambda observation: observation
+
+def interrupted(vehicle):
+    global calls
+    calls += 1
+    if calls == 2:
+        raise KeyboardInterrupt
+    return hover(vehicle)
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A folder with a suite and a module of factories, as a user's."""
+    (tmp_path / "small.yaml").write_text(SUITE)
+    (tmp_path / "my_controllers.py").write_text(FACTORIES)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    import importlib
+    import sys
+
+    sys.modules.pop("my_controllers", None)
+    importlib.invalidate_caches()
+    return tmp_path
+
+
+def evaluate(*arguments: str, folder: str = "out") -> int:
+    return main(["evaluate", *arguments, "--suite", "small.yaml", "-o", folder, "--no-report"])
+
+
+def rows(folder: str = "out") -> list[dict[str, str]]:
+    with open(f"{folder}/episodes.csv", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def times_of_change(folder):
+    return {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))}
+
+
+def test_table_results_and_episodes_agree(here, capsys):
+    assert evaluate("pid", "still=my_controllers:hover") == 0
+    text = capsys.readouterr().out
+    for part in ("pid", "still", "paper", "expert 50 %", "expert 1.25 s", "expert 2-3 m", "tilt 60", "waypoints reached"):
+        assert part in text
+    results = load_results("out")
+    assert [record.label for record in results.controllers] == ["pid", "still"]
+    assert [each.name for each in results.scenarios] == ["tracking", "course", "starts.0", "starts.60"]
+    assert len(results.entries) == 8 and not results.failures
+    episodes = rows()
+    assert len(episodes) == 2 * (5 + 2 + 3 + 3)
+    for entry in results.entries:
+        own = [row for row in episodes if (row["controller"], row["scenario"]) == (entry.controller, entry.scenario)]
+        assert len(own) == entry.figures.n
+        assert np.mean([row["outcome"] == "success" for row in own]) == entry.figures.success.value
+        assert np.mean([float(row["reward"]) for row in own]) == pytest.approx(entry.figures.reward.value)
+        assert [int(row["seed"]) for row in own] == list(range(entry.seed, entry.seed + len(own)))
+        arrays = read_flights(f"out/{entry.flights}")
+        assert len(arrays["episode_seed"]) == len(own)
+        assert arrays["position"].shape[:2] == (min(len(own), 8), len(arrays["time"]))
+    # The same starts and targets for both.
+    names = [name for name in episodes[0] if name.startswith(("start_", "target_"))]
+    pid, still = ([[row[name] for name in names] for row in episodes if row["controller"] == who] for who in ("pid", "still"))
+    assert pid == still
+    course = results.entry("pid", "course").figures.course
+    assert course.completed.value == 1.0 and results.entry("still", "course").figures.course.completed.value == 0.0
+    assert [row["waypoints_reached"] for row in episodes if row["scenario"] == "course"] == ["2", "2", "0", "0"]
+
+
+def test_a_second_run_flies_only_what_is_missing(here, capsys):
+    assert evaluate("pid", "--scenario", "tracking", "starts") == 0
+    before = times_of_change(here)
+    assert len(before) == 3
+    assert evaluate("pid", "still=my_controllers:hover") == 0
+    after = times_of_change(here)
+    assert len(after) == 8 and {path: after[path] for path in before} == before
+    assert [each.name for each in load_results("out").scenarios][:2] == ["tracking", "starts.0"]
+    content = (here / "out" / "results.json").read_bytes(), (here / "out" / "episodes.csv").read_bytes()
+    assert evaluate("pid", "still=my_controllers:hover") == 0
+    assert times_of_change(here) == after
+    assert content == ((here / "out" / "results.json").read_bytes(), (here / "out" / "episodes.csv").read_bytes())
+
+
+def test_other_flights_are_never_replaced_silently(here, capsys):
+    assert evaluate("a=pid", "--scenario", "tracking") == 0
+    before = times_of_change(here)
+    for arguments in (["a=geometric"], ["a=pid", "--seed", "7"], ["a=pid", "--episodes", "3"], ["b=pid", "--seed", "7"]):
+        assert evaluate(*arguments, "--scenario", "tracking") == 2
+        error = capsys.readouterr().err
+        assert "give another folder with -o" in error and error.count("\n") == 1
+        assert ("--overwrite" in error) == (arguments[0] != "b=pid")
+    assert times_of_change(here) == before
+    assert evaluate("a=pid", "--scenario", "tracking", "--seed", "7", "--overwrite") == 0
+    assert {row["seed"] for row in rows()} == {"7", "8", "9", "10", "11"}
+
+
+def test_an_interrupt_keeps_what_is_done(here, capsys):
+    assert evaluate("pid", "--scenario", "tracking") == 0
+    assert evaluate("pid", "x=my_controllers:interrupted", "--scenario", "tracking", "course") == 130
+    results = load_results("out")
+    done = {(entry.controller, entry.scenario) for entry in results.entries}
+    assert ("x", "tracking") in done and ("pid", "course") in done and ("x", "course") not in done
+    before = times_of_change(here)
+    assert evaluate("pid", "x=my_controllers:interrupted", "--scenario", "tracking", "course") == 0
+    assert len(load_results("out").entries) == 4
+    assert {path: times_of_change(here)[path] for path in before} == before
+
+
+def test_failures_are_one_line_each_and_the_others_fly(here, capsys):
+    (here / "broken_module.py").write_text("1 / 0\n")
+    other = PPO("MlpPolicy", gymnasium.make("Pendulum-v1"), n_steps=8, batch_size=8, device="cpu")
+    other.save(here / "pendulum.zip")
+    (here / "half.zip").write_bytes(b"PK")
+    bad = {
+        "pendulum.zip": "observations are Box(",
+        "half.zip": "not a complete SB3 zip",
+        "missing.zip": "no such file",
+        "pidd": "did you mean 'pid'",
+        "my_controllers:broken": "RuntimeError: no model",
+        "my_controllers:nothing": "has no 'nothing'",
+        "no_such_module:make": "cannot be imported",
+        "broken_module:make": "ZeroDivisionError",
+        "my_controllers:fails_in_flight": "shape (5, 18)",
+    }
+    assert evaluate("pid", *bad, "--scenario", "tracking") == 1
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("failed: ")]
+    assert len(lines) == len(bad)
+    for spec, message in bad.items():
+        label = spec.removesuffix(".zip")
+        (line,) = [line for line in lines if line.startswith((f"failed: {label}:", f"failed: {label},"))]
+        assert message in line
+    results = load_results("out")
+    assert [entry.controller for entry in results.entries] == ["pid"]
+    assert len(results.failures) == len(bad)
+    # A controller that has been mended is no failure any more.
+    assert evaluate("missing=pid", "--scenario", "tracking") == 0
+    assert len(load_results("out").failures) == len(bad) - 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--backend", "bulet"], "did you mean 'pybullet'"),
+        (["--scaling", "adaptiv"], "did you mean 'adaptive'"),
+        (["--scenario", "trackin"], "did you mean 'tracking'"),
+        (["--episodes", "0"], "at least one"),
+        (["--workers", "0"], "at least 1"),
+        (["pid"], "two are called so"),
+        (["=pid"], "name=path"),
+    ],
+)
+def test_bad_arguments_are_one_line(here, capsys, arguments, message):
+    assert evaluate("pid", *arguments) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not (here / "out").exists()
+
+
+def test_a_damaged_folder_is_said_so(here, capsys):
+    (here / "out").mkdir()
+    (here / "out" / "results.json").write_text(json.dumps({"schema_version": 99}))
+    assert evaluate("pid") == 2
+    assert "damaged, or of another version" in capsys.readouterr().err
+
+
+def test_labels_are_as_short_as_tells_apart():
+    specs = parse_controllers(["pid", "a/1/best.zip", "a/2/best.zip", "x/other.zip", "runs/lr=1/z.zip", "me=q.zip"])
+    assert [spec.label for spec in specs] == ["pid", "1/best", "2/best", "other", "z", "me"]
+    with pytest.raises(ConfigError, match="two are called so"):
+        parse_controllers(["a=pid", "a=geometric"])
+    adaptive = parse_controllers(["pid", "q.zip"], "adaptive")
+    assert [(spec.label, spec.scaling) for spec in adaptive] == [("pid", "none"), ("q (adaptive)", "adaptive")]
+
+
+SMALL_OFF_POLICY = {"buffer_size": 200, "learning_starts": 8, "batch_size": 8}
+ALGORITHMS = {
+    PPO: {"n_steps": 16, "batch_size": 16, "n_epochs": 1},
+    A2C: {},
+    SAC: SMALL_OFF_POLICY,
+    TD3: SMALL_OFF_POLICY,
+    DDPG: SMALL_OFF_POLICY,
+}
+
+
+@pytest.mark.parametrize("backend", ["batch", "pybullet"])
+def test_zips_of_stock_algorithms_fly(here, capsys, backend):
+    labels = []
+    for algorithm, arguments in ALGORITHMS.items():
+        if backend == "pybullet" and algorithm not in (PPO, SAC):
+            continue
+        env = QuadcopterVecEnv(2, seed=0)
+        model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0, **arguments)
+        model.learn(32)
+        model.save(f"{algorithm.__name__}.zip")
+        with zipfile.ZipFile(f"{algorithm.__name__}.zip") as archive:
+            assert b"sb3_quad" not in archive.read("data")
+        assert saved_algorithm(f"{algorithm.__name__}.zip") == algorithm.__name__
+        assert type(load_model(f"{algorithm.__name__}.zip")) is algorithm
+        labels.append(algorithm.__name__)
+    arguments = ["--scenario", "tracking", "--episodes", "2", "--backend", backend]
+    assert evaluate(*(f"{label}.zip" for label in labels), *arguments) == 0
+    results = load_results("out")
+    assert [(record.label, record.algorithm) for record in results.controllers] == [(label, label) for label in labels]
+    assert len(results.entries) == len(labels)
+
+
+def test_discrete_agents_are_refused(here, capsys):
+    DQN("MlpPolicy", gymnasium.make("CartPole-v1"), buffer_size=10, device="cpu").save("dqn.zip")
+    assert evaluate("dqn.zip") == 1
+    assert "the quadcopter's are of shape" in capsys.readouterr().err
+
+
+def test_adaptive_scaling_is_measured_and_another_controller(here, capsys, monkeypatch):
+    monkeypatch.setattr("sb3_quad.evaluation.controllers.measure_mean", functools.partial(measure_mean, n_flights=4))
+    monkeypatch.setattr("sb3_quad.evaluation.scaling.ROUNDS", 1)
+    (here / "observing.py").write_text(
+        "import numpy as np\n"
+        "from sb3_quad import PIDExpert\n"
+        "def make(vehicle):\n"
+        "    mean = np.zeros(18); mean[0] = -0.3\n"
+        "    expert = PIDExpert(vehicle, observation_mean=mean)\n"
+        "    return lambda observation: expert.predict(observation)[0]\n"
+    )
+    assert evaluate("agent=observing:make", "pid", "--scenario", "tracking") == 0
+    assert evaluate("agent=observing:make", "pid", "--scenario", "tracking", "--scaling", "adaptive") == 0
+    results = load_results("out")
+    plain, adaptive = (
+        next(each for each in results.controllers if each.label == name) for name in ("agent", "agent (adaptive)")
+    )
+    assert plain.offset is None and adaptive.offset == pytest.approx((-0.15, 0.0, 0.0), abs=0.01)  # α is 0.5 at the target
+    assert {record.label for record in results.controllers} == {"agent", "agent (adaptive)", "pid"}
+    keys = {entry.key for entry in results.entries}
+    assert len(keys) == len(results.entries) == 3
+
+
+@pytest.mark.slow
+def test_workers_fly_the_same(here, capsys):
+    assert evaluate("pid", "geometric", "--scenario", "starts") == 0
+    assert evaluate("pid", "geometric", "--scenario", "starts", "--workers", "2", folder="other") == 0
+    assert rows() == rows("other")

@@ -1,0 +1,64 @@
+"""Trimming at the hover: the agent gives hover thrust at its target with every heading, and flies elsewhere as before."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch as th
+from stable_baselines3 import PPO
+
+from sb3_quad.dynamics.state import QuadcopterState
+from sb3_quad.envs.observation import DEFAULT_STD
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.hover import trim_hover
+
+
+@pytest.fixture
+def model():
+    env = QuadcopterVecEnv(4, task="state_recovery", seed=1)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    with th.no_grad():  # far from hover at the target, and differently for each heading
+        model.policy.action_net.weight.mul_(30.0)
+        model.policy.action_net.bias.copy_(th.tensor([0.1, -0.05, 0.02, 0.0]))
+    return model
+
+
+def at_target(heading):
+    """Noise-free observations at the target, level and at rest, built from quaternions."""
+    state = np.zeros((20, heading.size))
+    state[3], state[6] = np.cos(heading / 2), np.sin(heading / 2)
+    features = np.zeros((heading.size, 18))
+    features[:, 3:12] = np.swapaxes(QuadcopterState(state).rotation, 1, 2).reshape(-1, 9)
+    return (features / DEFAULT_STD).astype(np.float32)
+
+
+def test_the_agent_hovers_at_its_target_with_every_heading(model):
+    observations = at_target(np.linspace(-np.pi, np.pi, 50))
+    before = model.predict(observations, deterministic=True)[0]
+    result = trim_hover(model, seed=3, noise=0.0)
+    after = model.predict(observations, deterministic=True)[0]
+    assert np.square(after).mean() < 0.1 * np.square(before).mean()
+    assert result.before == pytest.approx(np.sqrt(np.square(before).mean()), rel=0.05) and result.after < result.before
+
+
+def test_only_the_last_layer_changes_and_the_zip_stays_stock(model, tmp_path):
+    before = {key: value.clone() for key, value in model.policy.state_dict().items()}
+    trim_hover(model, seed=3)
+    changed = {key for key, value in model.policy.state_dict().items() if not th.equal(value, before[key])}
+    assert changed == {"action_net.weight", "action_net.bias"}
+    model.save(tmp_path / "agent.zip")
+    observation = np.random.default_rng(0).normal(size=(5, 18)).astype(np.float32)
+    np.testing.assert_array_equal(PPO.load(tmp_path / "agent.zip").predict(observation)[0].shape, (5, 4))
+
+
+def test_what_is_trimmed_already_is_left_alone(model):
+    trim_hover(model, seed=3)
+    weight = model.policy.action_net.weight.clone()
+    again = trim_hover(model, seed=3)
+    assert again.before < 0.05 and (model.policy.action_net.weight - weight).norm() < 0.05 * weight.norm()
+
+
+def test_an_agent_of_other_observations_is_refused():
+    with pytest.raises(ConfigError, match="18 features"):
+        trim_hover(PPO("MlpPolicy", "Pendulum-v1", device="cpu"))

@@ -1,0 +1,205 @@
+"""Scenarios: what a file says is what is drawn, impossible ones are refused in one line, the shipped suites hold together."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_quad.dynamics.state import QuadcopterState
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.errors import ConfigError
+from sb3_quad.scenarios.draw import draw_episodes, wrench_changes
+from sb3_quad.scenarios.load import load_suite, parse_suite, suite_names
+from sb3_quad.scenarios.parts import VehicleChanges
+from sb3_quad.scenarios.scenario import Scenario, Suite
+from sb3_quad.scenarios.vary import axis_label
+
+
+def suite(*entries: str) -> Suite:
+    return parse_suite(
+        "name: mine\nscenarios:\n" + "".join(f"  - {{name: s{k}, {entry}}}\n" for k, entry in enumerate(entries)), "x"
+    )
+
+
+def scenario(entry: str) -> Scenario:
+    return suite(entry).scenarios[0]
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_shipped_suites_survive_json(name):
+    loaded = load_suite(name)
+    assert loaded.name == name
+    assert Suite.model_validate_json(loaded.model_dump_json()) == loaded
+
+
+def test_the_thesis_suite_holds_all_of_chapter_four():
+    thesis = load_suite("thesis")
+    tracking = {thesis.scenario(name).target.distance for name in ("tracking", "tracking_15m", "tracking_20m")}
+    assert tracking == {10.0, 15.0, 20.0}
+    assert set(np.round(np.arange(0.2, 1.01, 0.1), 1)) | {0.05, 0.1} <= set(thesis.scenario("tracking").tolerances)
+    for name, sign in (("target_up", 1), ("target_down", -1)):
+        way = np.array(thesis.scenario(name).target.position) - [0, 0, 15]
+        np.testing.assert_allclose(way, sign * 10 / math.sqrt(3) * np.ones(3))
+    assert len(thesis.scenario("waypoints_plane").target.points) == 4
+    assert len(thesis.scenario("waypoints_spiral").target.points) == 5
+    assert thesis.scenario("recovery").episodes == 4 * 240
+    assert thesis.scenario("side_hit").hit_search is not None
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("strat: 3", "did you mean 'start'"),
+        ("start: {velocity: {sdt: 2}}", "start.velocity: unknown key 'sdt': did you mean 'std'"),
+        ("wrenches: [{fore: [1, 2, 3]}]", "wrenches.0: unknown key 'fore': did you mean 'force'"),
+        ("reference: {thesis: {succes: 1}}", "did you mean 'success'"),
+        ("duration: 15 s", "'15 s' must be a number alone"),
+        ("duration: 15000", "the unit is s"),
+        ("noise: 5", "0.05 is 5 %"),
+        ("start: {body_rates: [230, 0, 0]}", "not deg/s"),
+        ("start: {attitude: levle}", "did you mean 'level'"),
+        ("start: {attitude: {tilt: 200}}", "180"),
+        ("start: {position: [0, 0, 0.1]}", "touches the ground"),
+        ("target: [0, 0, -3]", "below ground"),
+        ("target: [0, 0, 60]", "max_distance"),
+        ("target: {distance: 31}", "max_distance"),
+        ("target: [10, 0, 15], duration: 0.5", "cannot be reached within the duration of 0.5 s"),
+        ("target: {distance: 10}, duration: 0.5", "cannot be reached"),
+        ("target: {waypoints: [[0, 0, 20], [0, 0, -1]]}", "below ground"),
+        ("target: {distance: 10, position: [1, 2, 3]}", "exactly one of"),
+        ("target: {distance: 10, radius: 1}", "radius goes with waypoints"),
+        ("vehicle: itn", "did you mean 'itm'"),
+        ("vehicle_changes: {mass: 1.7}", "no such vehicle can fly"),
+        ("vehicle_changes: {mass: 30}", "is a factor"),
+        ("wrenches: [{start: 16}]", "when the episode of 15 s is over"),
+        ("wrenches: [{duration: 0.001}]", "below a control step"),
+        ("hit_search: {}", "no wrenches"),
+        ("vary: {start.tilt: [1]}", "did you mean 'attitude'"),
+        ("vary: {noise: [0, 0]}", "different numbers"),
+        ("vary: {noise.level: [0, 1]}, noise: 0.1", "holds no keys"),
+    ],
+)
+def test_what_is_impossible_is_named(entry, message):
+    with pytest.raises(ConfigError) as caught:
+        scenario(entry)
+    assert message in str(caught.value) and str(caught.value).startswith("x: scenario s0: ") and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [("a: [", "not valid YAML"), ("name: x", "scenarios"), ("name: x\nscenarios: []", "at least 1"), ("- 1", "scenarios")],
+)
+def test_files_that_are_no_suites(text, message, tmp_path):
+    path = tmp_path / "s.yaml"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=message):
+        load_suite(path)
+
+
+def test_the_example_of_the_documentation_is_valid():
+    text = (Path(__file__).parent.parent / "docs" / "evaluate.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    names = [scenario.name for scenario in parse_suite(example, "example").scenarios]
+    assert names[:2] == ["yard", "course"] and len(names) == 8 and names[-1] == "rolled.90_8"
+
+
+def test_missing_files_and_unknown_names():
+    with pytest.raises(ConfigError, match=r"no/such\.yaml: no such file"):
+        load_suite("no/such.yaml")
+    with pytest.raises(ConfigError, match="did you mean 'thesis'"):
+        load_suite("tesis")
+    with pytest.raises(ConfigError, match="twice"):
+        parse_suite("name: x\nscenarios: [{name: a}, {name: a}]", "x")
+
+
+def test_vehicle_files_lie_beside_the_suite(tmp_path):
+    vehicle = load_vehicle("itm").model_copy(update={"name": "other", "mass": 1.5})
+    (tmp_path / "other.yaml").write_text(vehicle.model_dump_json())  # JSON is YAML
+    (tmp_path / "mine.yaml").write_text("name: x\nscenarios: [{name: a, vehicle: other.yaml}]")
+    assert load_suite(tmp_path / "mine.yaml").scenarios[0].flown_vehicle().mass == 1.5
+
+
+@settings(max_examples=20)
+@given(high=st.floats(1.0, 29.0), short=st.floats(0.05, 0.95))
+def test_reach_is_what_full_thrust_allows(high, short):
+    """Straight up at 1.5 hover thrusts: 0.25 g t²."""
+    needed = math.sqrt(high / (0.25 * 9.81))
+    scenario(f"target: [0, 0, {15 + high}], duration: {max(needed * 1.001, 0.01)}")
+    with pytest.raises(ConfigError, match="cannot be reached"):
+        scenario(f"target: [0, 0, {15 + high}], duration: {needed * short}")
+
+
+def test_vary_is_a_grid_of_named_cells():
+    cells = suite("title: grid, vary: {noise: [0, 0.1], start.attitude.tilt: [0, 45, 90]}").scenarios
+    assert len(cells) == 6 and len({cell.name for cell in cells}) == 6
+    for cell in cells:
+        assert cell.group == "s0"
+        assert (cell.noise, cell.start.attitude.tilt) == (cell.cell["noise"], cell.cell["start.attitude.tilt"])
+    assert axis_label("start.attitude.tilt") == "tilt (deg)"
+
+
+@settings(max_examples=20)
+@given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))
+def test_draws_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
+    entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"
+    drawn, again = (draw_episodes(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
+    state = np.zeros((20, 3))
+    state[3:7] = drawn["quaternion"].T
+    cosines = QuadcopterState(state).rotation[:, 2, 2]
+    np.testing.assert_allclose(cosines, math.cos(math.radians(tilt)), atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(drawn["velocity"], axis=1), speed, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(drawn["body_rates"], axis=1), rate, atol=1e-9)
+    for name, values in drawn.items():
+        np.testing.assert_array_equal(values, again[name])
+        if name == "velocity" and speed > 0:
+            assert len(np.unique(values[:, 0])) == 3
+
+
+def test_the_tasks_own_draws_stay_with_the_environment():
+    recovery = draw_episodes(load_suite("thesis").scenario("recovery"))
+    assert recovery.start == {}
+    assert recovery.task.random_attitude and recovery.task.velocity_std == 2.0 and recovery.task.body_rates_std == 4.0
+
+
+@settings(max_examples=30)
+@given(
+    st.lists(st.tuples(st.integers(0, 40), st.integers(1, 60), st.sampled_from(["world", "body"])), min_size=1, max_size=4),
+    st.floats(0, 3),
+)
+def test_the_wrench_at_any_time_is_the_sum_of_those_that_act(times, factor):
+    entries = ", ".join(
+        f"{{start: {first / 100}, duration: {length / 100}, force_frame: {frame},"
+        f" force: [{k + 1}, 0, 0], torque: [0, {k + 1}, 0]}}"
+        for k, (first, length, frame) in enumerate(times)
+    )
+    episodes = draw_episodes(scenario(f"duration: 0.5, wrenches: [{entries}]"), [0, 1], np.array([1.0, factor]))
+    changes = wrench_changes(episodes.wrenches, episodes.steps)
+    now = np.zeros((2, 12))
+    for step in range(episodes.steps):
+        now = changes.get(step, now)
+        expected = np.zeros(12)
+        for k, (first, length, frame) in enumerate(times):
+            if first <= step < first + length:
+                expected[0 if frame == "world" else 3] += k + 1
+                expected[10] += k + 1  # torques are in the body frame unless said
+        np.testing.assert_allclose(now, [expected, factor * expected], atol=1e-12)
+
+
+@settings(max_examples=20)
+@given(mass=st.floats(0.7, 1.4), action=st.floats(-1, 1))
+def test_a_heavier_vehicle_keeps_its_motors(mass, action):
+    vehicle = load_vehicle("itm")
+    changed = VehicleChanges(mass=mass).apply(vehicle)
+    assert changed.mass == pytest.approx(mass * 1.727)
+    np.testing.assert_allclose(changed.action_to_thrust(np.array(action)), vehicle.action_to_thrust(np.array(action)))
+
+
+def test_no_changes_change_nothing():
+    vehicle = load_vehicle("itm")
+    assert VehicleChanges().apply(vehicle) == vehicle

@@ -1,0 +1,313 @@
+"""Flights to look at: recordings are the flights, cameras see what they must, files are whole and never lost."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from sb3_quad.cli import main
+from sb3_quad.dynamics.state import POSITION, TARGET
+from sb3_quad.envs.backdrop import Camera
+from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.scenery import SUPERSAMPLING, Picture
+from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.scenarios.parts import Wrench
+from sb3_quad.show import framing, sequence
+from sb3_quad.show.episodes import Setting, fly_all, scenario_setting
+from sb3_quad.show.film import FPS, HOLD, Film
+from sb3_quad.show.labels import header_height, side_by_side, with_header
+from sb3_quad.show.lines import draw_line, project
+from sb3_quad.show.recording import record
+from sb3_quad.show.video import write_video
+from sb3_quad.training.config import load_config
+from sb3_quad.training.runs import claim_run
+
+HIT = Wrench(start=0.1, duration=0.02, force=(-20, -20, 0), torque=(-5, -5, -5))
+VIDEO = importlib.util.find_spec("imageio_ffmpeg") is not None
+
+
+@pytest.fixture(scope="module")
+def fall():
+    """An upside-down start that the PID expert does not survive."""
+    plan = scenario_setting("thesis:recovery_s1")
+    return plan.fly("pid", PIDExpert(), 0, 1500, True)
+
+
+@pytest.fixture(scope="module")
+def hit():
+    """A hit on the way to a target."""
+    setting = Setting.from_keywords({"task": "target_tracking", "noise": 0.0}, target=(3, 0, 16), wrench=HIT)
+    return setting.fly("pid", PIDExpert(), 0, 60, True)
+
+
+def test_a_recording_is_the_flight_of_the_environment():
+    expert = PIDExpert()
+    recording = record("pid", expert, seed=3, n_steps=40, task="state_recovery")
+    env = QuadcopterEnv(task="state_recovery")
+    env.reset(seed=3)
+    total = 0.0
+    for step in range(40):
+        np.testing.assert_array_equal(recording.state[:, step], env.true_state().array[:, 0])
+        total += env.step(expert.actions(env.true_state())[0])[1]
+    np.testing.assert_array_equal(recording.state[:, 40], env.true_state().array[:, 0])
+    assert recording.reward == pytest.approx(total) and recording.lost == ""
+    env.close()
+
+
+def test_a_lost_flight_ends_where_it_was_lost(fall):
+    assert fall.lost == "collision" and fall.path[-1, 2] <= fall.vehicle.collision_radius < fall.path[-2, 2]
+    assert fall.times[-1] == pytest.approx(1.78, abs=0.02)  # the specification's expert: 1.78 s
+
+
+def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
+    acting = np.flatnonzero(hit.wrench.any(axis=0))
+    np.testing.assert_array_equal(acting, [11, 12])  # during the steps that begin at 0.10 and 0.11 s
+    assert hit.pushes == [11]
+    np.testing.assert_array_equal(hit.wrench_around(40)[:3], [-20, -20, 0])
+    assert not hit.wrench_around(10).any() and not hit.wrench_around(59).any()
+    np.testing.assert_array_equal(hit.targets, [[3, 0, 16]])
+
+
+def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
+    setting = Setting.from_keywords({"task": "state_recovery", "max_episode_steps": 20})
+    episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50, True))
+    assert [len(a.times) - 1 for a, _ in episodes] == [20, 20, 10]
+    for first, second in episodes:
+        np.testing.assert_array_equal(first.state[:, 0], second.state[:, 0])
+        assert not np.array_equal(first.state[:, -1], second.state[:, -1])
+    assert not np.array_equal(episodes[0][0].state[:, 0], episodes[1][0].state[:, 0])
+
+
+def test_a_course_has_all_its_targets():
+    recording = scenario_setting("thesis:waypoints_plane").fly("pid", PIDExpert(), 0, 900, True)
+    np.testing.assert_array_equal(recording.targets[:2], [[0, 10, 25], [0, 20, 15]])
+
+
+def looking_along_x():
+    return Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), 0.5)
+
+
+def test_points_are_seen_where_they_are():
+    columns, rows, depth = project(looking_along_x(), np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]]), 80, 40).T
+    np.testing.assert_allclose(columns, [40, 60, 40, 40])
+    np.testing.assert_allclose(rows, [20, 20, 0, 20])
+    np.testing.assert_allclose(depth, [4, 4, 4, 2])
+
+
+@pytest.mark.parametrize(("distance", "seen"), [(3.0, True), (8.0, False), (-3.0, False)])
+def test_lines_are_hidden_by_what_is_before_them(distance, seen):
+    picture = Picture(np.zeros((40, 80, 3), np.uint8), np.full((40 * SUPERSAMPLING, 80 * SUPERSAMPLING), 5.0, np.float32))
+    points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0]])
+    draw_line(picture, looking_along_x(), points, (1.0, 0.0, 0.0), 0.1)
+    assert (picture.pixels[:, :, 0] > 200).any() == seen and not picture.pixels[:, :, 1:].any()
+
+
+coordinates = st.floats(-20, 20, allow_nan=False)
+clouds = st.lists(st.tuples(coordinates, coordinates, st.floats(10, 40)), min_size=1, max_size=8).map(np.array)
+
+
+@given(points=clouds, aspect=st.floats(0.5, 2), course=st.floats(0, 6.28))
+@settings(max_examples=50)
+def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(points, aspect, course):
+    ahead = np.array([np.cos(course), np.sin(course), 0.0])
+    camera = framing.framing_camera(points, 1.0, aspect, ahead)
+    forward, right, up = ((points - camera.eye) @ camera.axes.T).T
+    filled = np.stack([(np.abs(right) + 1.0) / (camera.slope * aspect), (np.abs(up) + 1.0) / camera.slope]) / forward
+    assert filled.max() == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_following_camera_never_loses_what_it_follows(fall):
+    points = [fall.state[:, step][np.array([[0, 1, 2], [17, 18, 19]])] for step in range(0, len(fall.times), 4)]
+    cameras = framing.following_cameras(points, 0.04, 0.9, 1.0, np.array([0.0, 1.0, 0.0]))
+    for camera, each in zip(cameras, points, strict=True):
+        columns, rows, _ = project(camera, each, 100, 100).T
+        assert ((columns > 0) & (columns < 100) & (rows > 0) & (rows < 100)).all()
+    eyes = np.array([camera.eye for camera in cameras])
+    assert np.abs(np.diff(eyes, n=2, axis=0)).max() < 0.6  # m per frame²: no jolts
+
+
+def test_broadside_looks_across_the_motion():
+    line = np.outer(np.linspace(0, 5, 20), [3.0, 4.0, 1.0])
+    assert abs(framing.broadside(line) @ [0.6, 0.8, 0.0]) < 1e-6
+
+
+def test_sheets_suit_video_codecs():
+    panels = [np.zeros((31, 41, 3), np.uint8)] * 4
+    sheet = side_by_side(panels, columns=3)
+    assert sheet.shape[0] % 2 == sheet.shape[1] % 2 == 0 and sheet.shape[0] >= 62 and sheet.shape[1] >= 123
+    assert with_header(panels[0], "pid", ["a", "b"], (1, 2, 3), 10).shape == (31 + header_height(2, 10), 41, 3)
+
+
+def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
+    film = Film([fall, hit], 64, 48, speed=0.5)
+    assert film.n_frames == round((fall.times[-1] / 0.5 + HOLD) * FPS) + 1
+    frames = film.frames()
+    some = [next(frames) for _ in range(6)]
+    film.close()
+    film.close()
+    assert all(frame.shape == some[0].shape and frame.dtype == np.uint8 for frame in some)
+    assert not np.array_equal(some[0], some[5])
+
+
+def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
+    view = sequence._view([fall, hit], [len(fall.times) - 1, 60], 300, 400)
+    poses = sequence._apart(fall, len(fall.times) - 1, view)
+    assert poses[0] == 0 and poses[-1] == len(fall.times) - 1 and len(poses) > 4
+    screen = view.project(fall.path[poses])
+    gaps = np.linalg.norm(screen[:, None, :2] - screen[None, :, :2], axis=2)[np.triu_indices(len(poses), 1)]
+    assert gaps.min() > 0.7 * view.pixels(screen[:, 2]).min()
+    assert hit.pushes[0] in sequence._apart(hit, 60, view)
+    picture = sequence.sequence([fall, hit], times=[0.0, 0.5], size=(120, 100))
+    assert picture.shape[0] > 100 and picture.shape[1] >= 240 and picture.std() > 20
+
+
+@pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
+def test_videos_hold_every_frame(tmp_path, name):
+    import imageio.v2 as imageio
+
+    frames = [np.full((48, 64, 3), 30 * k, np.uint8) for k in range(6)]
+    write_video(tmp_path / name, frames, 25)
+    read = [np.asarray(frame) for frame in imageio.get_reader(tmp_path / name)]
+    assert [frame.shape[:2] for frame in read] == [(48, 64)] * 6
+    np.testing.assert_allclose([frame.mean() for frame in read], [30 * k for k in range(6)], atol=6)
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
+def test_an_interrupted_video_leaves_what_was_there(tmp_path):
+    def frames():
+        yield np.zeros((48, 64, 3), np.uint8)
+        raise KeyboardInterrupt
+
+    (tmp_path / "film.mp4").write_bytes(b"earlier")
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / "film.mp4", frames(), 25)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
+    assert (tmp_path / "film.mp4").read_bytes() == b"earlier"
+
+
+def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert main(["enjoy", "pid", "--record", str(tmp_path / "film.mp4")]) == 2
+    assert "pip install sb3_quad[video]" in capsys.readouterr().err
+
+
+def test_the_command_draws_and_tells(tmp_path, capsys):
+    picture, film = tmp_path / "s.png", tmp_path / "f.gif"
+    size = ["--size", "64x64", "-n", "12", "--seed", "3"]
+    asked = ["enjoy", "pid", "still=geometric", "--task", "state_recovery", *size, "--sequence", str(picture)]
+    assert main([*asked, *(["--record", str(film)] if VIDEO else [])]) == 0
+    output = capsys.readouterr().out
+    assert "pid: " in output and "still: " in output and "0.12 s" in output and str(picture) in output
+    with Image.open(picture) as image:
+        assert image.width >= 128
+    assert film.is_file() == VIDEO
+    before = picture.read_bytes()
+    assert main(asked) == 2
+    assert "--overwrite" in capsys.readouterr().err and picture.read_bytes() == before
+    assert main([*asked, "--overwrite", "--times", "0"]) == 0
+    assert picture.read_bytes() != before
+
+
+@pytest.fixture
+def run_folder(tmp_path):
+    """A run with an agent that has learnt nothing."""
+    from stable_baselines3 import PPO
+
+    from sb3_quad.envs.vec_env import QuadcopterVecEnv
+
+    config = load_config("ppo", "QuadStateRecovery-v0", None, {"eval_env_kwargs": {"noise": 0.0, "max_episode_steps": 30}})
+    run = claim_run(tmp_path / "logs", "ppo", "QuadStateRecovery-v0")
+    run.write_yaml(config.settings, {})
+    env = QuadcopterVecEnv(1, task="state_recovery")
+    PPO("MlpPolicy", env, n_steps=2, batch_size=2, policy_kwargs={"net_arch": [4]}, device="cpu").save(run.best_model)
+    return run
+
+
+def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
+    logs = str(run_folder.path.parent.parent)
+    asked = ["enjoy", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "--no-render"]
+    assert main(asked) == 0
+    output = capsys.readouterr().out
+    assert str(run_folder.best_model) in output and "0.30 s" in output  # the run's own episodes
+    assert main([*asked, "--exp-id", "1", "--load-best", "--stochastic"]) == 0
+    for wrong, message in (
+        (["--exp-id", "7"], "QuadStateRecovery-v0_1"),
+        (["--load-last-checkpoint"], "--save-freq"),
+        (["--load-checkpoint", "500"], "best_model.zip"),
+        (["--algo", "ppoo"], "did you mean 'ppo'"),
+    ):
+        capsys.readouterr()
+        assert main([*asked, *wrong]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "nobody to fly"),
+        (["pdi", "--no-render"], "did you mean 'pid'"),
+        (["nowhere.zip", "--no-render"], "no such file"),
+        (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
+        (["pid", "--task", "recovery", "--no-render"], "did you mean 'state_recovery'"),
+        (["pid", "--task", "state_recovery", "--scenario", "thesis:side_hit", "--no-render"], "give one"),
+        (["pid", "--scenario", "thesis:side_hitt", "--no-render"], "did you mean 'side_hit'"),
+        (["pid", "--scenario", "side_hit", "--no-render"], "suite:name"),
+        (["pid", "--target", "0", "0", "-1", "--no-render"], "below ground"),
+        (["pid", "--at", "2", "--no-render"], "--force"),
+        (["pid", "--force", "1", "0", "0", "--for", "-1", "--no-render"], "duration"),
+        (["pid", "--env-kwargs", "nois:0", "--no-render"], "nois"),
+        (["pid", "--record", "film.avi"], ".mp4"),
+        (["pid", "--sequence", "poses.jpg"], ".png"),
+        (["pid", "--sequence", "poses.png", "--size", "big"], "640x480"),
+        (["pid", "--times", "1", "--no-render"], "--sequence"),
+        (["pid", "-n", "0", "--no-render"], "--n-timesteps"),
+        (["pid", "--speed", "0", "--no-render"], "--speed"),
+        (["pid", "pid", "--no-render"], "label"),
+    ],
+)
+def test_bad_input_is_one_line(arguments, message, capsys):
+    assert main(["enjoy", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_window_without_a_display_is_refused(monkeypatch, capsys):
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.setattr("sys.platform", "linux")
+    assert main(["enjoy", "pid"]) == 2
+    assert "--record" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed: no display to open a window on")
+def test_flights_are_shown_in_a_window():
+    command = [sys.executable, "-m", "sb3_quad.cli", "enjoy", "pid", "geometric", "-n", "20", "--speed", "0.5"]
+    result = subprocess.run(
+        ["xvfb-run", "-a", *command, "--force", "1", "0", "0"],
+        cwd=Path(__file__).parent.parent,
+        env={**os.environ, "LIBGL_ALWAYS_SOFTWARE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert "geometric: " in result.stdout
+
+
+def test_targets_and_positions_are_where_the_pictures_look_for_them(hit):
+    np.testing.assert_array_equal(hit.state[np.r_[POSITION], 0], hit.path[0])
+    np.testing.assert_array_equal(hit.state[np.r_[TARGET], 0], hit.targets[0])
