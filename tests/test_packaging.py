@@ -123,7 +123,8 @@ def test_each_dependency_is_pinned(options):
 def test_what_the_code_imports_is_declared(options):
     distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow"}
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
-    wanted = options["options"]["install_requires"]
+    extras = [text for name, text in options["options.extras_require"].items() if name != "dev"]
+    wanted = "\n".join([options["options"]["install_requires"], *extras])
     declared = {line.split(">=")[0].strip().lower() for line in wanted.splitlines() if line.strip()}
     for path in (path for name in CODE for path in (ROOT / name).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, enjoy, evaluate, export, plot, report, train
+from sb3_quad.cli import benchmark, enjoy, evaluate, export, plot, report, train, tune_expert
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
@@ -24,6 +24,7 @@ COMMANDS = {
     "export": export,
     "benchmark": benchmark,
     "plot": plot,
+    "tune-expert": tune_expert,
 }
 
 
