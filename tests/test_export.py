@@ -95,14 +95,12 @@ def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
 @pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
 def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_format):
     vehicle = ITM.model_copy(update={"thrust_limits": (0.0, 1.9)})
-    contents = [export_policy(zips / "tanh.zip", file_format, kind, vehicle, n_observations=200) for kind in policy_outputs()]
+    contents = [
+        export_policy(zips / "tanh.zip", file_format, kind, vehicle, n_observations=200) for kind in ("thrusts", "speeds")
+    ]
     thrusts, speeds = (run(file_format, exported.content, flight[1]) for exported in contents)
     assert contents[1].unit == "rad/s" and thrusts.min() == 0.0
     np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
-
-
-def policy_outputs():
-    return ("thrusts", "speeds")
 
 
 def test_the_run_folder_tells_vehicle_and_scaling(zips, tmp_path):
@@ -139,25 +137,13 @@ def test_a_file_that_computes_something_else_is_not_written(zips, tmp_path, caps
     def wrong(*arguments):
         found = build_network(*arguments)
         found.layers[0].weight[3, 5] += 0.05
-        found.layers[0].weight.setflags(write=False)
         return found
 
     monkeypatch.setattr(policy, "build_network", wrong)
-    monkeypatch.setattr(policy, "draw_samples", shifted(policy.draw_samples))
     assert main(["export", str(zips / "tanh.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 2
     error = capsys.readouterr().err
     assert "differs from the trained one" in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
-
-
-def shifted(draw):
-    """As the weights are shared with the policy, the mistake is undone for the policy by observations of its own."""
-
-    def samples(*arguments):
-        found = draw(*arguments)
-        return found._replace(scaled=found.scaled[:, ::-1].copy())
-
-    return samples
 
 
 @needs_compiler
@@ -204,9 +190,8 @@ SEEN, DONE = spaces.Box(-np.inf, np.inf, (18,), np.float32), spaces.Box(-1.0, 1.
     ],
 )
 def test_a_policy_that_cannot_fly_so_is_refused(make, message):
-    with pytest.raises(ConfigError, match=message) as raised:
+    with pytest.raises(ConfigError, match=message):
         build_network(make(), ITM)
-    assert "\n" not in str(raised.value).replace("\n", " ", 1)
 
 
 @pytest.mark.parametrize(

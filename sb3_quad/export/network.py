@@ -177,7 +177,7 @@ def _layers(policy: Any, where: str) -> tuple[Layer, ...]:
 
 def _linear(module: Any, activation: Activation, where: str) -> Layer:
     def array(tensor: Any) -> Float32Array:
-        found = np.ascontiguousarray(tensor.detach().cpu().numpy(), dtype=np.float32)
+        found = np.array(tensor.detach().cpu().numpy(), dtype=np.float32, order="C")  # a copy
         if not math.isfinite(float(np.abs(found).sum())):
             raise ConfigError(f"{where}: holds parameters that are not finite")
         return found
