@@ -9,8 +9,8 @@ from sb3_quad.errors import ConfigError, unknown
 
 HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
 EXAMPLES = """The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
-world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It gives what to command of the four rotors. Scaling
-and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
+world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It gives what to command of the four rotors.
+Scaling and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
 
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/best_model.zip --format onnx
