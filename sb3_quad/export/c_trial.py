@@ -103,9 +103,10 @@ def _by_numpy(text: str, observations: Float32Array, name: str, network: Network
     value = (observations - tables["mean"]) * tables["inverse_std"]
     for k, layer in enumerate(network.layers):
         value = value @ tables[f"weight_{k}"].T + tables[f"bias_{k}"]
-        value = {"none": lambda x: x, "tanh": np.tanh, "relu": lambda x: np.maximum(x, 0)}[layer.activation](value)
+        if layer.activation != "none":
+            value = np.tanh(value) if layer.activation == "tanh" else np.maximum(value, 0)
     found = re.search(r"a = (\S+)f \+ (\S+)f \* a;", text)
     if found is None:
         raise ExportError("the C header cannot be checked: it holds no line from actions to rotors")
     value = np.float32(found[1]) + np.float32(found[2]) * np.clip(value, np.float32(-1), np.float32(1))
-    return value if network.output == "thrusts" else np.sqrt(np.maximum(value, 0))
+    return np.asarray(value if network.output == "thrusts" else np.sqrt(np.maximum(value, 0)), dtype=np.float32)

@@ -94,13 +94,13 @@ def export_policy(
 def _write(file_format: str, network: Network, metadata: dict[str, str], prefix: str) -> bytes:
     if file_format == "c":
         return c_header.write(network, metadata, prefix)
-    return (onnx if file_format == "onnx" else torchscript).write(network, metadata)
+    return onnx.write(network, metadata) if file_format == "onnx" else torchscript.write(network, metadata)
 
 
 def _run(file_format: str, content: bytes, observations: Float32Array, prefix: str, network: Network) -> Trial:
     if file_format == "c":
         return c_trial.run(content, observations, prefix, network)
-    return (onnx if file_format == "onnx" else torchscript).run(content, observations)
+    return onnx.run(content, observations) if file_format == "onnx" else torchscript.run(content, observations)
 
 
 def _describe(path: Path, algorithm: str, network: Network, vehicle: Vehicle) -> dict[str, str]:

@@ -31,7 +31,7 @@ def write(network: Network, metadata: Mapping[str, str]) -> bytes:
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
-        traced = th.jit.trace(_module(network), th.zeros(2, OBSERVATION_SIZE))
+        traced = th.jit.trace(_module(network), th.zeros(2, OBSERVATION_SIZE))  # type: ignore[no-untyped-call]
         th.jit.save(traced, buffer, _extra_files={METADATA: json.dumps(dict(metadata))})
     return buffer.getvalue()
 
@@ -45,7 +45,7 @@ def run(content: bytes, observations: Float32Array) -> Trial:
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)
-        module = th.jit.load(io.BytesIO(content), map_location="cpu")
+        module = th.jit.load(io.BytesIO(content), map_location="cpu")  # type: ignore[no-untyped-call]
 
     def call(rows: Float32Array) -> Any:
         with th.no_grad():
