@@ -109,5 +109,4 @@ def _by_numpy(text: str, observations: Float32Array, name: str, network: Network
     if found is None:
         raise ExportError("the C header cannot be checked: it holds no line from actions to rotors")
     value = np.float32(found[1]) + np.float32(found[2]) * np.clip(value, np.float32(-1), np.float32(1))
-    result = value if network.output == "thrusts" else np.sqrt(np.maximum(value, 0))
-    return np.asarray(result, dtype=np.float32)
+    return np.asarray(value if network.output == "thrusts" else np.sqrt(np.maximum(value, 0)), dtype=np.float32)
