@@ -156,12 +156,12 @@ def test_evaluate_policy_takes_an_expert():
     assert -10 < mean < -6
 
 
-def test_experts_by_name(tmp_path):
+def test_experts_by_name(tmp_path, monkeypatch):
     assert isinstance(resolve_expert("pid"), PIDExpert) and isinstance(resolve_expert("geometric"), GeometricExpert)
     module = types.ModuleType("my_experts")
     module.hover = lambda vehicle: lambda observation: np.zeros((len(observation), 4))
     module.broken = lambda vehicle: 1 / 0
-    sys.modules["my_experts"] = module
+    monkeypatch.setitem(sys.modules, "my_experts", module)
     assert resolve_expert("my_experts:hover")(np.zeros((3, 18))).shape == (3, 4)
     half_written = tmp_path / "half.zip"
     half_written.write_bytes(b"PK\x03\x04 and no more")

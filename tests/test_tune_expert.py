@@ -31,7 +31,8 @@ positive = st.floats(0.01, 1e3).map(lambda value: float(f"{value:.4g}"))
 @pytest.fixture(autouse=True)
 def little_to_fly(monkeypatch):
     monkeypatch.setattr(tune_expert, "FRESH_EPISODES", 16)
-    for name, steps in (("DESCENT", 250), ("WAY", 500), ("RECOVERY", 250)):
+    monkeypatch.setattr(tune_expert, "FRESH_SETS", 2)
+    for name, steps in (("DESCENT", 250), ("WAY", 450), ("RECOVERY", 150)):
         monkeypatch.setattr(expert_objective, name, steps)
 
 
@@ -106,7 +107,7 @@ def test_it_writes_a_vehicle_that_flies_and_goes_on_where_it_was_left(slow_itm, 
     assert main([*command, "-n", "3"]) == 0
     assert "3 gains tried" in capsys.readouterr().out
     first = load_vehicle(output).geometric_gains
-    assert first is not None and first.measured is not None and first.measured.recovery_episodes == 64
+    assert first is not None and first.measured is not None and first.measured.recovery_episodes == 32
     assert main([*command, "-n", "20"]) == 0  # over its own file, on from its own journal
     printed = capsys.readouterr().out
     assert "20 gains tried" in printed and "above 120°" in printed
