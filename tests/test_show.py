@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import os
 import shutil
 import subprocess
@@ -20,6 +20,7 @@ from sb3_quad.dynamics.state import POSITION, TARGET
 from sb3_quad.envs.backdrop import Camera
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.scenery import SUPERSAMPLING, Picture
+from sb3_quad.errors import ControllerError
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.show import framing, sequence
@@ -86,6 +87,12 @@ def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
         np.testing.assert_array_equal(first.state[:, 0], second.state[:, 0])
         assert not np.array_equal(first.state[:, -1], second.state[:, -1])
     assert not np.array_equal(episodes[0][0].state[:, 0], episodes[1][0].state[:, 0])
+
+
+def test_a_controller_that_fails_is_named():
+    setting = Setting.from_keywords({"task": "state_recovery"})
+    with pytest.raises(ControllerError, match=r"controller odd: .*shape"):
+        list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5, True))
 
 
 def test_a_course_has_all_its_targets():

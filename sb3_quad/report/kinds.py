@@ -30,7 +30,8 @@ FloatArray = npt.NDArray[np.float64]
 DRAWN_PATHS = 4  # flights of a controller in a 3-D figure of random episodes
 PATH_POINTS, LINE_POINTS = 300, 400  # that a flight is drawn with, at most
 ARROW = 0.16  # length of the longest force arrow, of the longest side of what is drawn
-ARROWS = 8  # along a path on which a force lasts
+ARROWS = 5  # along a path on which a force lasts throughout
+BRIEF = 10  # samples; a shorter push has one arrow
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,17 +117,18 @@ def _paths(scenario: Scenario, flown: Sequence[Flown]) -> PathFigure:
 
 
 def _arrows(track: Track) -> list[Arrow]:
-    """The forces met on a flight: one arrow for a short one, several for one that lasts; lengths in N."""
+    """The forces met on a flight: one arrow for a short one, several along the way for one that lasts; lengths in N."""
     force = track.wrench[:, :3]
-    pushed = np.flatnonzero(np.linalg.norm(force, axis=1) > 0)
+    size = np.linalg.norm(force, axis=1)
+    pushed = np.flatnonzero(size > 0)
     chosen: list[int] = []
     for part in np.split(pushed, np.flatnonzero(np.diff(pushed) > 1) + 1):
-        if part.size:
-            number = 1 if part.size < 10 else max(2, round(ARROWS * part.size / len(force)))
-            chosen += (
-                part[np.linspace(0, part.size - 1, number).round().astype(int)].tolist() if number > 1 else [int(part[0])]
-            )
-    size = np.linalg.norm(force, axis=1)
+        if part.size < BRIEF:
+            chosen += part[:1].tolist()
+            continue
+        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track.position[part], axis=0), axis=1))])
+        number = max(2, round(ARROWS * part.size / len(force)))
+        chosen += part[np.searchsorted(way, np.linspace(0.0, way[-1], number))].tolist()
     return [Arrow(track.position[k], force[k], f"{size[k]:.3g} N at {track.times[k]:.2f} s") for k in chosen]
 
 

@@ -73,7 +73,12 @@ def _legend(axes: Axes, picture: Picture, first: Sequence[str] = ()) -> None:
     handles, names = axes.get_legend_handles_labels()
     found = dict(zip(names, handles, strict=True))
     order = [*first, *(name for name in found if name not in first)]
-    picture.legend([found[name] for name in order], order, loc="outside upper left", ncols=min(len(order), 4))
+    picture.legend(
+        [found[name] for name in order],
+        order,
+        loc="outside upper left",
+        ncols=min(len(order), 4 if sum(map(len, order)) < 90 else 3),
+    )
 
 
 def _lines(figure: LineFigure) -> Picture:

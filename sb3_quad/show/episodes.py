@@ -14,7 +14,7 @@ from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
 from sb3_quad.envs.checks import vector
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.envs.tasks import resolve_tasks
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.errors import ConfigError, ControllerError, unknown
 from sb3_quad.evaluation.flights import Plan
 from sb3_quad.scenarios.draw import DrawnWrench, draw_episodes, wrench_changes
 from sb3_quad.scenarios.load import explain, load_suite
@@ -62,7 +62,8 @@ class Setting:
         """One episode.
 
         :param n_steps: control steps, at most.
-        :raises ConfigError: see :func:`~sb3_quad.show.recording.record`, as of ControllerError.
+        :raises ConfigError: keywords that the environment refuses.
+        :raises ControllerError: a controller that fails in flight.
         """
         if self.scenario is None:
             return record(name, controller, seed, n_steps, plan=self.plan, deterministic=deterministic, **self.keywords)
@@ -114,7 +115,8 @@ def fly_all(
 
     :param seed: of the first episode; the next has the next one.
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
-    :raises ConfigError: a number of steps below one; see also :meth:`Setting.fly`.
+    :raises ConfigError: a number of steps below one, keywords that the environment refuses.
+    :raises ControllerError: a controller that fails in flight; its name comes first.
     """
     left = setting.n_steps if n_timesteps is None else n_timesteps
     if left < 1:
@@ -122,10 +124,17 @@ def fly_all(
     number = 0
     while left > 0 and (number == 0 or n_timesteps is not None):
         steps = min(left, setting.n_steps)
-        episode = [setting.fly(name, each, seed + number, steps, deterministic) for name, each in controllers.items()]
+        episode = [_fly(setting, name, each, seed + number, steps, deterministic) for name, each in controllers.items()]
         yield episode
         left -= max(len(recording.times) - 1 for recording in episode)
         number += 1
+
+
+def _fly(setting: Setting, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:
+    try:
+        return setting.fly(name, controller, seed, n_steps, deterministic)
+    except ControllerError as error:
+        raise ControllerError(f"controller {name}: {error}") from error
 
 
 def _target(target: Sequence[float], vehicle: Vehicle) -> npt.NDArray[np.float64]:
