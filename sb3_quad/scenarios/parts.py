@@ -193,6 +193,8 @@ class VehicleChanges(Part):
 
         :raises ValueError: no such vehicle can fly, for example one too heavy for its rotors.
         """
+        if self == VehicleChanges():
+            return vehicle
         factors = (self.inertia,) * 3 if isinstance(self.inertia, float) else self.inertia
         low, high = vehicle.thrust_limits
         return vehicle.model_copy(
