@@ -27,7 +27,7 @@ EXAMPLES = """controllers:
 
 examples:
   sb3-quad evaluate pid geometric                              the thesis's chapter 4 for both experts
-  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/best_model.zip" --suite thesis -o evaluations/mine
+  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip" --suite thesis -o evaluations/mine
   sb3-quad evaluate pid agent.zip --suite quick                a look, in less than a minute
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   sb3-quad evaluate agent.zip --scaling adaptive --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10

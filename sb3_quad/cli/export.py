@@ -13,7 +13,7 @@ world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It 
 Scaling and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
 
 examples:
-  sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/best_model.zip --format onnx
+  sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --format onnx
   sb3-quad export agent.zip --format c -o firmware/agent.h --name agent     agent_policy(observation, thrust)
   sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml

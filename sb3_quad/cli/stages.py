@@ -80,9 +80,10 @@ def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
     from sb3_quad.training.trainer import FRESH_SEED
 
     keywords = {key: job.config.env_kwargs[key] for key in ("vehicle", "noise") if key in job.config.env_kwargs}
+    suite = load_suite("thesis")
     for task in ENVIRONMENTS.values():
         columns = fly_all(pilots, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
-        scenario = load_suite("thesis").scenario(TASK_SCENARIOS[task])
+        scenario = suite.scenario(TASK_SCENARIOS[task])
         title = f"{task}: {FRESH_EPISODES} fresh episodes, the same for all"
         console().print(comparison(title, columns, scenario, THESIS_PILOTS))
 
@@ -91,11 +92,7 @@ def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:
     """PPO alone on as many transitions as all stages had together."""
     from sb3_quad.training.config import load_config
 
-    given = first.config.env_kwargs
-    kept = {
-        "vec_env": first.config.vec_env,
-        "env_kwargs": {key: given[key] for key in ("vehicle", "noise", "observation_std") if key in given},
-    }
+    kept = {"vec_env": first.config.vec_env, "env_kwargs": first.config.flight_kwargs}
     config = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, {**kept, "n_timesteps": n_timesteps})
     return replace(first, config=config, trained_agent=None)
 

@@ -30,7 +30,7 @@ EXAMPLES = """examples:
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadStateRecovery-v0_1/trimmed_model.zip
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """

@@ -75,6 +75,11 @@ class TrainingConfig:
         """The quadcopter task, None for an environment that is not this package's."""
         return ENVIRONMENTS.get(self.env_id)
 
+    @property
+    def flight_kwargs(self) -> dict[str, Any]:
+        """What ``env_kwargs`` says of vehicle, noise and scaling: what an agent of this job must be flown with in any task."""
+        return {key: self.env_kwargs[key] for key in ("vehicle", "noise", "observation_std") if key in self.env_kwargs}
+
 
 def load_config(
     algo: str, env_id: str, conf_file: str | Path | None = None, overrides: dict[str, Any] | None = None

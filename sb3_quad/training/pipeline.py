@@ -265,8 +265,7 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
 def _trimmed(agent: Path, job: TrainingJob, kind: str, report: Callable[[str], None]) -> Path:
     """Trim the agent in a zip; the trimmed one lies beside it."""
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
-    given = job.config.env_kwargs
-    kept = {key: given[key] for key in ("vehicle", "noise", "observation_std") if key in given}
+    kept = job.config.flight_kwargs
     if kind == "hover":
         hover = trim_hover(model, job.seed + TRIM_SEED, **kept)
         done = f"action at the target {hover.before:.4f} from hover, now {hover.after:.4f}"
