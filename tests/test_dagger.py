@@ -13,7 +13,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sb3_quad.common.losses import actor_mean, gaussian_entropy, gaussian_nll, l2_loss, value_loss
+from sb3_quad.common.forward import actor_mean
+from sb3_quad.common.losses import gaussian_entropy, gaussian_nll, l2_loss, value_loss
 from sb3_quad.dagger import DAgger
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError

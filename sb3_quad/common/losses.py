@@ -9,19 +9,12 @@ import math
 from typing import Literal
 
 import torch as th
-from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.nn import functional as F
 
 CloningLoss = Literal["mse", "nll", "huber"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber")
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
-
-
-def actor_mean(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
-    """Mean of the policy's Gaussian, (b, a), by the actor alone; ``evaluate_actions`` would run the critic too."""
-    features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
-    mean: th.Tensor = policy.action_net(policy.mlp_extractor.forward_actor(features))
-    return mean
 
 
 def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -20,10 +20,10 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad.common.forward import actor_mean, critic_values
 from sb3_quad.common.labels import ExpertLabeller
 from sb3_quad.common.losses import (
     CloningLoss,
-    actor_mean,
     cloning_loss,
     gaussian_entropy,
     l2_loss,
@@ -305,7 +305,7 @@ class DAgger(OnPolicyAlgorithm):
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
         with th.no_grad():
             chunks = [
-                self.policy.predict_values(self._tensor(observations[i : i + _VALUE_CHUNK])).flatten()
+                critic_values(self.policy, self._tensor(observations[i : i + _VALUE_CHUNK]))
                 for i in range(0, len(observations), _VALUE_CHUNK)
             ]
         return np.asarray(th.cat(chunks).cpu().numpy(), dtype=np.float32)
@@ -337,7 +337,7 @@ class DAgger(OnPolicyAlgorithm):
             l2 = l2_loss(self.policy)
 
             index = th.from_numpy(rows)
-            values = self.policy.predict_values(flown[index].to(self.device)).flatten()
+            values = critic_values(self.policy, flown[index].to(self.device))
             v_loss = value_loss(values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf)
 
             loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
