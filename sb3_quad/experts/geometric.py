@@ -18,9 +18,10 @@ from sb3_quad.experts.protocol import Actions, Expert
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
 
-    The units are the lag τ from a command to its thrust (:func:`~sb3_quad.dynamics.authority.command_lag`); the greatest angular acceleration a_φ about
-    the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1), sideways
-    at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust limits in hover thrusts.
+    The units are the lag τ from a command to its thrust (:func:`~sb3_quad.dynamics.authority.command_lag`); the greatest
+    angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
+    upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
+    limits in hover thrusts.
     """
     least, most = vehicle.thrust_limits
     turn = float(np.min(greatest_moments(vehicle)[:2] / np.asarray(vehicle.inertia[:2])))

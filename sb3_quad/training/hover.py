@@ -7,9 +7,9 @@ offset and the hundredth balance. What its last layer W, b must change by, D = [
     min  mean_ψ |h̄(ψ) D + y(ψ)|² + λ mean_s |h(s) D|²
 
 with h the input of that layer and a 1, h̄(ψ) its mean over the observation noise at the target with heading ψ, y(ψ) the mean
-action there less that of hover, and s the states of flights: a change is cheap where the agent never is. The zip stays a stock one.
-The thesis cancels an offset by the position's mean in the observation's scaling instead (4.3.1; :mod:`.trim`), which fits one
-heading.
+action there less that of hover, and s the states of flights: a change is cheap where the agent never is. The zip stays a stock
+one. The thesis cancels an offset by the position's mean in the observation's scaling instead (4.3.1; :mod:`.trim`), which fits
+one heading.
 """
 
 from __future__ import annotations
