@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 FRESH_EPISODES = 960
 REFERENCE_ALGO, REFERENCE_ENV = "ppo", "QuadStateRecovery-v0"
+THESIS_VEHICLE = "itm"
 THESIS_PILOTS = ("expert", "IL-agent", "RL-agent", "PPO only")
 
 
@@ -72,7 +73,7 @@ def finish(result: PipelineResult, reference: bool, seconds: float, first: Train
 
 
 def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
-    """Both tasks, all pilots on the same fresh episodes, the thesis's figures beside."""
+    """Both tasks, all pilots on the same fresh episodes; beside ITM's the thesis's figures."""
     from sb3_quad.envs.registration import ENVIRONMENTS
     from sb3_quad.evaluation.summary import fly_all
     from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
@@ -85,7 +86,8 @@ def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
         columns = fly_all(pilots, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
         scenario = suite.scenario(TASK_SCENARIOS[task])
         title = f"{task}: {FRESH_EPISODES} fresh episodes, the same for all"
-        console().print(comparison(title, columns, scenario, THESIS_PILOTS))
+        beside = THESIS_PILOTS if _vehicle(job) == THESIS_VEHICLE else ()
+        console().print(comparison(title, columns, scenario, beside))
 
 
 def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.output import console
-from sb3_quad.cli.stages import is_pipeline_run, resume_stages, run_stages
+from sb3_quad.cli.stages import THESIS_VEHICLE, is_pipeline_run, resume_stages, run_stages
 from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -179,7 +179,8 @@ def _compare(result: TrainingResult) -> Any:
     agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
     scenario = load_suite("thesis").scenario(TASK_SCENARIOS[str(config.task)])
     title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
-    return comparison(title, columns, scenario, (agent, "expert"))
+    beside = (agent, "expert") if keywords.get("vehicle", THESIS_VEHICLE) == THESIS_VEHICLE else ()
+    return comparison(title, columns, scenario, beside)
 
 
 def _progress(options: argparse.Namespace) -> bool:
