@@ -49,9 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
     add("--episodes", type=whole, metavar="N", help="of every scenario, instead of its own number")
     add("--seed", type=whole, metavar="N", help="of the first episode of every scenario, instead of its own")
-    add(
-        "--vehicle", metavar="V", help="name or YAML file that flies all scenarios, instead of their own"
-    )
+    add("--vehicle", metavar="V", help="name or YAML file that flies all scenarios, instead of their own")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
