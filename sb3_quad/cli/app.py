@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, check_vehicle, enjoy, evaluate, export, plot, report, train, tune_expert
+from sb3_quad.cli import benchmark, check_vehicle, enjoy, evaluate, export, plot, publish, report, train, tune_expert
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
@@ -22,6 +22,7 @@ COMMANDS = {
     "report": report,
     "enjoy": enjoy,
     "export": export,
+    "publish": publish,
     "benchmark": benchmark,
     "plot": plot,
     "check-vehicle": check_vehicle,

@@ -25,7 +25,11 @@ ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags of ``export``."""
     add = parser.add_argument
-    add("model", metavar="MODEL.zip", help="an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy")
+    add(
+        "model",
+        metavar="MODEL.zip",
+        help="an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy, or a name such as itm-recovery",
+    )
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
     add("-o", metavar="FILE", dest="file", help="where it goes (beside the zip, ending in .onnx, .pt or .h)")
     add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
@@ -38,11 +42,12 @@ def run(options: argparse.Namespace) -> int:
     """Build, check, time, write. Returns the exit code."""
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
+    from sb3_quad.pretrained_policies import agent_path
     from sb3_quad.training.files import write_bytes
 
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
-    model, ending = Path(options.model), FORMATS[options.format]
+    model, ending = Path(agent_path(options.model)), FORMATS[options.format]
     if not model.is_file():
         raise ConfigError(f"model {model}: no such file")
     file = Path(options.file) if options.file else model.with_suffix(ending)

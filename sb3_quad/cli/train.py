@@ -14,6 +14,7 @@ from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.output import console
 from sb3_quad.cli.stages import THESIS_VEHICLE, is_pipeline_run, resume_stages, run_stages
 from sb3_quad.errors import ConfigError
+from sb3_quad.pretrained_policies import agent_path
 
 if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
@@ -53,7 +54,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--env-kwargs", nargs="+", metavar="K:V", help="keywords of the environment, such as noise:0")
     add("--eval-env-kwargs", nargs="+", metavar="K:V", help="the same, for the evaluation's environments only")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
-    add("-i", "--trained-agent", metavar="ZIP", help="agent to start from: policy and critic of an SB3 on-policy zip")
+    add(
+        "-i",
+        "--trained-agent",
+        metavar="ZIP",
+        help="agent to start from: an SB3 on-policy zip, or a name such as itm-recovery",
+    )
     add("--reference", action="store_true", help="with a pipeline: also train PPO alone on the same budget, for comparison")
     add("--resume", metavar="RUN_FOLDER", help="go on with an interrupted run; all its settings are kept")
     add("-f", "--log-folder", metavar="DIR", help="where run folders go (logs)")
@@ -132,6 +138,8 @@ def job_arguments(options: argparse.Namespace) -> dict[str, Any]:
     seed = 0 if options.seed is None else options.seed if options.seed >= 0 else random.SystemRandom().randrange(2**31)
     names = ("log_folder", "device", "trained_agent", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq")
     given = {name: getattr(options, name) for name in (*names, "log_interval", "tensorboard_log", "verbose")}
+    if options.trained_agent is not None:
+        given["trained_agent"] = agent_path(options.trained_agent)
     given["eval_env_kwargs"] = pairs(options.eval_env_kwargs, "--eval-env-kwargs") or None
     given |= {"seed": seed, "unique": options.uuid, "progress": _progress(options)}
     return {name: value for name, value in given.items() if value is not None}

@@ -19,6 +19,7 @@ from sb3_quad.evaluation.records import ControllerRecord
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.experts.models import saved_algorithm
 from sb3_quad.experts.resolve import EXPERTS, resolve_expert
+from sb3_quad.pretrained_policies import agent_path
 
 Scaling = Literal["none", "adaptive"]
 SCALINGS = ("none", "adaptive")
@@ -43,7 +44,7 @@ def parse_controllers(texts: Sequence[str], scaling: Scaling = "none") -> list[C
 
     :raises ConfigError: two controllers of the same label.
     """
-    given = [_split(text) for text in texts]
+    given = [_named(text) for text in texts]
     paths = [spec for label, spec in given if label is None and spec.endswith(".zip")]
     found = []
     for label, spec in given:
@@ -114,6 +115,12 @@ class _Function:
     def predict(self, observation: Any, deterministic: bool = True) -> tuple[Any, Any]:
         """The function's actions, and None."""
         return self._function(observation), None
+
+
+def _named(text: str) -> tuple[str | None, str]:
+    label, spec = _split(text)
+    path = agent_path(spec)
+    return (spec if label is None and path != spec else label), path
 
 
 def _split(text: str) -> tuple[str | None, str]:

@@ -10,6 +10,7 @@ from typing import Any
 from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
 from sb3_quad.errors import ConfigError, ExpertError, SB3QuadError, unknown
 from sb3_quad.experts.models import load_model
+from sb3_quad.pretrained_policies import agent_path, pretrained_names
 
 EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.experts.geometric:GeometricExpert"}
 
@@ -17,8 +18,9 @@ EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.exper
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model; ``"package.module:factory"``, where
-        ``factory(vehicle)`` returns an expert; or an expert itself, returned as it is.
+    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
+        with the package (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)`` returns an
+        expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for.
     :param kind: what messages call it.
     :raises ConfigError: an unknown name, a missing or unreadable file.
@@ -29,8 +31,9 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
     text = str(spec)
     if text in EXPERTS:
         return _factory(EXPERTS[text], kind)(load_vehicle(vehicle))
-    if text.endswith(".zip"):
-        return load_model(text)
+    path = agent_path(text)
+    if path.endswith(".zip"):
+        return load_model(path)
     if ":" in text:
         factory = _factory(text, kind)
         try:
@@ -39,7 +42,8 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
             raise
         except Exception as error:
             raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
-    raise ConfigError(unknown(kind, text, EXPERTS) + ", or path/to/model.zip, or package.module:factory")
+    valid = [*EXPERTS, *pretrained_names()]
+    raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
 
 
 def _factory(path: str, kind: str) -> Callable[[Vehicle], Any]:

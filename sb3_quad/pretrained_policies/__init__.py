@@ -1,0 +1,55 @@
+"""Trained policies that come with the package: for each ``NAME.zip``, for stock PPO, a card ``NAME.md``.
+
+The card says what it flies, how it was trained (command, seed, commit) and what was measured.
+``sb3-quad publish`` writes both.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sb3_quad.errors import ConfigError, unknown
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
+FOLDER = Path(__file__).parent
+
+
+def pretrained_names() -> list[str]:
+    """Names of the policies that come with the package."""
+    return sorted(path.stem for path in FOLDER.glob("*.zip"))
+
+
+def pretrained(name: str) -> Path:
+    """The zip of a policy that comes with the package, for ``PPO.load`` of Stable-Baselines3.
+
+    >>> import sb3_quad
+    >>> sb3_quad.pretrained("itm-recovery").name
+    'itm-recovery.zip'
+
+    :raises ConfigError: an unknown name.
+    """
+    path = FOLDER / f"{name}.zip"
+    if name not in pretrained_names():
+        raise ConfigError(unknown("pretrained policy", name, pretrained_names()))
+    return path
+
+
+def load_pretrained(name: str, **kwargs: Any) -> PPO:
+    """A policy that comes with the package, as a stock PPO model.
+
+    It reads the 18 features of :class:`~sb3_quad.envs.QuadcopterEnv`, scaled as there, and gives 4 actions in [-1, 1].
+
+    :param kwargs: of ``PPO.load``, such as ``env`` and ``device`` (here "cpu" unless told otherwise).
+    :raises ConfigError: an unknown name.
+    """
+    from stable_baselines3 import PPO
+
+    return PPO.load(pretrained(name), **{"device": "cpu", **kwargs})
+
+
+def agent_path(text: str) -> str:
+    """The path of a zip, from the name of a policy that comes with the package or from a path, which is returned as it is."""
+    return str(pretrained(text)) if text in pretrained_names() else text

@@ -1,0 +1,166 @@
+"""Policies that come with the package, and the command that makes them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import stable_baselines3
+from stable_baselines3 import PPO
+
+import sb3_quad
+from sb3_quad.cli import main
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.pretrained_policies import agent_path, pretrained_names
+
+VERSIONS = ("2.4.1", "2.7.1")  # beside the installed one; older ones do not fit gymnasium 1
+LOAD = """
+import json, sys, warnings
+sys.modules["sb3_quad"] = None  # importing it, or unpickling anything of it, fails
+warnings.simplefilter("error")
+import numpy as np
+import stable_baselines3
+from stable_baselines3 import PPO
+actions = [PPO.load(path, device="cpu").predict(np.load(sys.argv[1]), deterministic=True)[0].tolist() for path in sys.argv[2:]]
+json.dump([stable_baselines3.__version__, actions], sys.stdout)
+"""
+
+
+@pytest.fixture(scope="module")
+def observations(tmp_path_factory):
+    """The path of some observations, and they."""
+    env = QuadcopterVecEnv(32, task="state_recovery", seed=5)
+    path = tmp_path_factory.mktemp("observations") / "observations.npy"
+    seen = env.reset()
+    np.save(path, seen)
+    return path, seen
+
+
+def actions_elsewhere(observations, folder=None):
+    """Which SB3 a process without sb3_quad has, and what the policies do there."""
+    zips = [str(sb3_quad.pretrained(name)) for name in pretrained_names()]
+    insert = "" if folder is None else f"import sys; sys.path.insert(0, {str(folder)!r})\n"
+    command = [sys.executable, "-I", "-c", insert + LOAD, str(observations), *zips]
+    result = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    version, actions = json.loads(result.stdout)
+    return version, np.asarray(actions, dtype=np.float32)
+
+
+def actions_here(observations):
+    """What the policies do in this process."""
+    return [sb3_quad.load_pretrained(name).predict(observations, deterministic=True)[0] for name in pretrained_names()]
+
+
+def test_there_are_some_each_with_a_card_of_its_own():
+    assert {"itm-recovery", "itm-imitation"} <= set(pretrained_names())
+    for name in pretrained_names():
+        card = sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8")
+        assert card.startswith(f"# {name}\n")
+        for part in ("state recovery |", "targets 20 m away |", "| seed |", "| commit |", "sb3_quad.cli train"):
+            assert part in card, (name, part)
+        assert "and changes" not in card
+
+
+@pytest.mark.parametrize("name", pretrained_names())
+def test_each_flies_as_its_card_says(name):
+    vehicle = name.split("-")[0]
+    flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 240, 31_000_000, vehicle=vehicle)
+    assert flights.success.mean() > 0.97
+
+
+def test_stock_sb3_loads_them_where_sb3_quad_is_not_installed(observations):
+    version, actions = actions_elsewhere(observations[0])
+    assert version == stable_baselines3.__version__
+    np.testing.assert_array_equal(actions, actions_here(observations[1]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("version", VERSIONS)
+def test_other_versions_of_sb3_load_them(observations, version, tmp_path):
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--no-deps", "--target", str(tmp_path)]
+    if subprocess.run([*pip, f"stable-baselines3=={version}"], check=False, capture_output=True).returncode != 0:
+        pytest.skip(f"stable-baselines3 {version} cannot be downloaded here")
+    found, actions = actions_elsewhere(observations[0], tmp_path)
+    assert found == version
+    np.testing.assert_allclose(actions, actions_here(observations[1]), atol=1e-6)
+
+
+def test_names_stand_where_zips_do(capsys):
+    expert = resolve_expert("itm-recovery")
+    assert isinstance(expert, PPO)
+    assert agent_path("itm-recovery") == str(sb3_quad.pretrained("itm-recovery"))
+    assert agent_path("some/agent.zip") == "some/agent.zip"
+    assert main(["enjoy", "itm-recovery", "--no-render", "-n", "50"]) == 0
+    assert "itm-recovery" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match="did you mean 'itm-recovery'"):
+        sb3_quad.pretrained("itm-recovry")
+    assert main(["enjoy", "itm-recovry", "--no-render"]) == 2
+    assert "did you mean 'itm-recovery'" in capsys.readouterr().err
+    labels = {each.label: each.spec for each in parse_controllers(["itm-recovery", "mine=itm-recovery"])}
+    assert labels == dict.fromkeys(("itm-recovery", "mine"), str(sb3_quad.pretrained("itm-recovery")))
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """A short run of the command line, as `publish` expects one."""
+    logs = tmp_path_factory.mktemp("logs")
+    flags = ["--n-envs", "16", "-n", "1600", "--eval-episodes", "0", "--no-progress", "--seed", "3"]
+    command = ["train", "--algo", "dagger", "--env", "QuadStateRecovery-v0", "-f", str(logs)]
+    assert main([*command, *flags, "--hyperparams", "n_steps:50", "gradient_steps:2", "batch_size:64"]) == 0
+    return logs / "dagger" / "QuadStateRecovery-v0_1"
+
+
+def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folder, tmp_path, capsys, observations):
+    source = run_folder / "QuadStateRecovery-v0.zip"
+    command = ["publish", str(source), "--name", "mine", "--command", "typed so", "-o", str(tmp_path), "--episodes", "4"]
+    assert main(command) == 0
+    card = (tmp_path / "mine.md").read_text(encoding="utf-8")
+    for part in (
+        "# mine",
+        "typed so",
+        "| seed | 3 |",
+        "`dagger`, 1,600 transitions",
+        "16 fresh recoveries and 4 fresh targets",
+    ):
+        assert part in card
+    slim, whole = (PPO.load(path, device="cpu") for path in (tmp_path / "mine.zip", source))
+    for observation in (observations[1], -3.0 * observations[1]):
+        np.testing.assert_array_equal(
+            slim.predict(observation, deterministic=True)[0], whole.predict(observation, deterministic=True)[0]
+        )
+    assert (tmp_path / "mine.zip").stat().st_size < 0.5 * source.stat().st_size
+    before = (tmp_path / "mine.zip").read_bytes()
+    assert main(command) == 2
+    assert "--overwrite" in capsys.readouterr().err
+    assert (tmp_path / "mine.zip").read_bytes() == before
+
+
+def test_a_policy_can_be_trained_further():
+    model = sb3_quad.load_pretrained("itm-recovery", env=QuadcopterVecEnv(8, seed=0), n_steps=16)
+    before = model.policy.action_net.weight.detach().clone()
+    model.learn(128)
+    assert (model.policy.action_net.weight != before).any()
+
+
+def test_publish_refuses_what_it_cannot_describe(run_folder, tmp_path, capsys):
+    source = run_folder / "QuadStateRecovery-v0.zip"
+    elsewhere = tmp_path / "alone.zip"
+    elsewhere.write_bytes(source.read_bytes())
+    for arguments, message in (
+        ([str(tmp_path / "none.zip"), "--name", "x"], "no such file"),
+        ([str(elsewhere), "--name", "x"], "holds no run"),
+        ([str(source), "--name", "a/b"], "without folders"),
+        ([str(source), "--name", "x", "--episodes", "0"], "must be at least 1"),
+    ):
+        assert main(["publish", *arguments, "--command", "typed so", "-o", str(tmp_path / "out")]) == 2
+        assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists() or not list(Path(tmp_path / "out").iterdir())
