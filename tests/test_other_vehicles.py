@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from pathlib import Path
 
 import pytest
 import yaml
@@ -69,6 +71,15 @@ def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(vehicle, h
     agent = here / "logs" / "ppo_bc" / f"{ENV}_1" / "trimmed_model.zip"
     assert main(["export", str(agent), "--format", "c", "-o", "agent.h"]) == 0
     assert flown.name in (elsewhere / "agent.h").read_text()
+
+
+def test_the_file_that_the_documentation_writes_flies(here, capsys):
+    text = (Path(__file__).resolve().parent.parent / "docs" / "vehicles.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, flags=re.DOTALL)
+    (here / "mine.yaml").write_text(block)
+    assert main(["check-vehicle", "mine.yaml", "-n", "48"]) == 0
+    printed = capsys.readouterr().out
+    assert "unusual" not in printed and "0 of 48" in printed
 
 
 def test_a_vehicle_that_is_not_there_is_named_before_anything_is_trained(here, capsys):
