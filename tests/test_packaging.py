@@ -18,7 +18,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
-DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js"}
+DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 
@@ -183,6 +183,28 @@ print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs
     assert config == (ROOT / "zoo_configs" / "dagger.yml").read_text()
     assert "train" in run(installed / "sb3-quad", "--help", cwd=tmp_path)
     assert "--algo" in run(installed / "python", "-m", "sb3_quad.cli", "train", "--help", cwd=tmp_path)
+
+
+@pytest.mark.slow
+def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
+    """From another folder: what a newcomer does after ``pip install``."""
+    command, seed = installed / "sb3-quad", ("--seed", "0")
+    small = ("--hyperparams", "n_steps:50", "gradient_steps:5", "batch_size:256")
+    run(command, "train", "--algo", "dagger", "-n", "24000", "--eval-episodes", "0", *seed, *small, cwd=tmp_path)
+    model = tmp_path / "logs" / "dagger" / "QuadTargetTracking-v0_1" / "QuadTargetTracking-v0.zip"
+    fly = """
+import sys
+sys.modules["sb3_quad"] = None
+import numpy as np
+from stable_baselines3 import PPO
+print(PPO.load(sys.argv[1], device="cpu").predict(np.zeros(18, dtype=np.float32))[0].shape)
+"""
+    assert run(installed / "python", "-c", fly, model, cwd=tmp_path).strip() == "(4,)"
+    pretrained = "import sb3_quad; print(sb3_quad.load_pretrained('itm-recovery').num_timesteps)"
+    assert int(run(installed / "python", "-c", pretrained, cwd=tmp_path).splitlines()[-1]) > 0
+    for file_format, ending in (("onnx", ".onnx"), ("c", ".h")):
+        run(command, "export", model, "--format", file_format, cwd=tmp_path)
+        assert model.with_suffix(ending).stat().st_size > 10_000
 
 
 @pytest.mark.slow

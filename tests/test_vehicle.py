@@ -161,6 +161,7 @@ def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle: Vehicle
     for key, limits in (("rotor_thrust_limits", vehicle.thrust_range), ("rotor_speed_limits", vehicle.rotor_speed_range)):
         again = Vehicle.model_validate({**data, key: limits})
         np.testing.assert_allclose(again.thrust_limits, vehicle.thrust_limits, rtol=1e-12, atol=1e-15)
+        assert vehicle.model_copy(update={key: limits}).thrust_limits == again.thrust_limits
 
 
 @pytest.mark.parametrize("limits", [{"thrust_limits": [0.1, 0.9]}, {"rotor_thrust_limits": [0.1, 4.0], "thrust_limits": ...}])

@@ -109,7 +109,8 @@ class Vehicle(BaseModel):
         changes = dict(update or {})
         if changes.keys() - {"name"}:
             changes = {"geometric_gains": None, **changes}
-        return Vehicle.model_validate({**self.model_dump(), **changes})
+        own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & OTHER_LIMITS.keys() else None)
+        return Vehicle.model_validate({**own, **changes})
 
     @property
     def mixer(self) -> FloatArray:
