@@ -82,7 +82,7 @@ TASKS: Mapping[str, Task] = {
     "state_recovery": Task(name="state_recovery", random_attitude=True, velocity_std=2.0, body_rates_std=4.0),
     "recovery_and_tracking": Task(
         name="recovery_and_tracking",
-        target_distance=20.0,
+        target_distance=25.0,
         nearest_target=0.0,
         random_attitude=True,
         velocity_std=2.0,

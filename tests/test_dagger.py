@@ -14,7 +14,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad.common.forward import actor_mean
-from sb3_quad.common.losses import gaussian_entropy, gaussian_nll, l2_loss, value_loss
+from sb3_quad.common.losses import CLONING_LOSSES, gaussian_entropy, gaussian_nll, l2_loss, mean_errors, value_loss
 from sb3_quad.dagger import DAgger
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError
@@ -97,12 +97,24 @@ def test_it_learns_to_fly_from_the_true_state():
     assert np.median(flight.true_state().distance) < 5.0  # of the 10 m it began with; the expert's 2.9 m
 
 
-@pytest.mark.parametrize("bc_loss", ["mse", "nll", "huber"])
+@pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
 def test_an_sb3_model_teaches(bc_loss):
     teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")
     model = build(expert=teacher, bc_loss=bc_loss).learn(ROLLOUT)
     observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
     np.testing.assert_allclose(labels, teacher.predict(observations.numpy(), deterministic=True)[0], atol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["huber", "huber_mse"])
+def test_how_errors_count(kind):
+    """Zero where the actions agree, convex, as steep as promised: linear far out, and with a squared part steeper still."""
+    error = th.linspace(-2.0, 2.0, 801, dtype=th.float64)
+    loss = mean_errors(kind, error[:, None].repeat(1, 3), th.zeros(801, 3, dtype=th.float64))
+    assert loss.argmin() == 400 and loss.min() < 1e-12
+    th.testing.assert_close(loss, loss.flip(0))
+    slope = loss.diff() / error.diff()
+    assert (slope.diff() > -1e-9).all()
+    assert slope[-1] == pytest.approx(1.0 + (6.0 * 1.9975 if kind == "huber_mse" else 0.0))
 
 
 def test_without_a_value_term_only_the_actor_moves():

@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_quad.common.losses import CLONING_LOSSES
 from sb3_quad.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.ppo_bc.forward import evaluate
@@ -79,7 +80,7 @@ def test_labelling_alone_changes_nothing():
     assert th.equal(parameters(stock), parameters(ours))
 
 
-@pytest.mark.parametrize("bc_loss", ["nll", "mse", "huber"])
+@pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
 def test_cloning_pulls_towards_the_expert(bc_loss):
     def error(model):
         observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)

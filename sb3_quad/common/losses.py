@@ -12,9 +12,10 @@ import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from torch.nn import functional as F
 
-CloningLoss = Literal["mse", "nll", "huber"]
-CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber")
+CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
+CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
+MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
 
 
 def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -32,8 +33,8 @@ def cloning_loss(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions
     """L_BC: how far the policy is from the expert's ``actions`` (b, a), a scalar.
 
     ``"nll"`` is Eq. 3.12, the negative log-likelihood, which also shrinks the standard deviation towards the error that
-    is left. ``"mse"`` is the mean squared error of the mean over rows and dimensions, and leaves it alone; so does
-    ``"huber"``, see :func:`mean_errors`.
+    is left. ``"mse"`` is the mean squared error of the mean over rows and dimensions, and leaves it alone; so do
+    ``"huber"`` and ``"huber_mse"``, see :func:`mean_errors`.
     """
     if kind == "nll":
         return gaussian_nll(mean, log_std, actions).mean()
@@ -46,10 +47,13 @@ def mean_errors(kind: CloningLoss, mean: th.Tensor, actions: th.Tensor) -> th.Te
     ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. Where the expert's
     action cannot be told from a noisy observation, in a tumble, squared errors are large and have most of the gradient, though
     nothing can be learnt there; linear ones leave more of it to the approach and the hover, where a hundredth is centimetres.
+    ``"huber_mse"``: the former and three times the squared error, for policies that must do both.
     """
-    if kind == "huber":
-        return F.huber_loss(mean, actions, delta=HUBER_DELTA, reduction="none").mean(dim=1) / HUBER_DELTA
-    return (mean - actions).square().mean(dim=1)
+    squared = (mean - actions).square().mean(dim=1)
+    if kind == "mse":
+        return squared
+    huber = F.huber_loss(mean, actions, delta=HUBER_DELTA, reduction="none").mean(dim=1) / HUBER_DELTA
+    return huber if kind == "huber" else huber + MSE_WEIGHT * squared
 
 
 def value_loss(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range: float | None) -> th.Tensor:
