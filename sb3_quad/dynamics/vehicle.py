@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
-from pydantic_core import PydanticCustomError
 
 from sb3_quad.dynamics.gains import GeometricFigures, GeometricGains
 from sb3_quad.dynamics.quantities import Finite, Positive
@@ -31,6 +30,10 @@ PARAMETER_NAMES = (
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
 )
+
+
+class _HoverOutOfReach(ValueError):
+    """Thrust limits that hover is not between."""
 
 
 class Vehicle(BaseModel):
@@ -77,8 +80,8 @@ class Vehicle(BaseModel):
     def _consistent(self) -> Vehicle:
         low, high = self.thrust_limits
         if not low < 1.0 < high:
-            raise PydanticCustomError(
-                "cannot_hover", f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover"
+            raise _HoverOutOfReach(
+                f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover"
             )
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
             raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
@@ -230,7 +233,8 @@ def _parse_vehicle(content: str, where: str) -> Vehicle:
         return Vehicle.model_validate(data)
     except ValidationError as error:
         wrong = error.errors()
-        kind = CannotHover if all(item["type"] == "cannot_hover" for item in wrong) else ConfigError
+        only_weak = all(isinstance(item.get("ctx", {}).get("error"), _HoverOutOfReach) for item in wrong)
+        kind = CannotHover if only_weak else ConfigError
         raise kind(f"vehicle file {where}: {'; '.join(_explain(item) for item in wrong)}") from None
 
 
