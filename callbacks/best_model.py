@@ -44,8 +44,8 @@ class BestModel(BaseCallback):
     :param every: transitions between evaluations.
     :param n_episodes: episodes in each.
     :param seed: of the evaluation's episodes.
-    :param best_model: where the best model goes; a file there is replaced by the first evaluation, or on a training that goes
-        on by the first better one.
+    :param best_model: where the best model goes; a file there is replaced, but by none that is worse than those in
+        ``evaluations``.
     :param evaluations: where the figures go; a file that is there already is continued.
     :param report: told of each evaluation in one line.
     :param others: by name: further environments, such as those of another task, to evaluate in at the same times. They have no

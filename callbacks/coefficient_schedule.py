@@ -101,8 +101,8 @@ class CoefficientSchedule(BaseCallback):
     def _on_training_end(self) -> None:
         self.logger.output_formats.remove(self._logged)
         if self.follow != PROGRESS and self.follow not in self._logged.values:
-            known = unknown("metric", self.follow, self._logged.values)
-            warnings.warn(f"CoefficientSchedule: {self.coefficient} stayed as it was: {known}", stacklevel=2)
+            known = unknown("metric", self.follow, self._logged.values) if self._logged.values else "nothing was logged"
+            warnings.warn(f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {known}", stacklevel=2)
 
     def _update(self) -> None:
         measured = self._measured()

@@ -39,7 +39,7 @@ model = PPOBC(
 if arguments.agent:
     hand_over(arguments.agent, model)
 
-every = max(arguments.timesteps // 5, 1)
+every = max(arguments.timesteps // 5, 60_000)  # a rollout, at least
 recovery, tracking = (QuadcopterVecEnv(48, task) for task in ("state_recovery", "target_tracking"))
 best = BestModel(recovery, every, n_episodes=48, seed=1_000_000, report=print, others={"tracking": tracking}, expert=expert)
 less_cloning = CoefficientSchedule("bc_coef", start=5.0, final=1.0, follow="eval/success_rate", between=(0.5, 0.95))

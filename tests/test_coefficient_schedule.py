@@ -17,6 +17,9 @@ from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError, ExpertError
+from sb3_quad.training.config import build_config
+from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.trainer import train
 from sb3_quad.training.values import import_class, qualified_classes
 
 NUMBER = st.floats(-1e3, 1e3)
@@ -136,6 +139,21 @@ def test_a_configuration_file_can_name_it():
     ((path, keywords),) = qualified_classes([{"sb3_quad.callbacks.CoefficientSchedule": settings}], "callback")
     schedule = import_class(path, "callback")(**keywords)
     assert schedule.value_at(0.7) == pytest.approx(0.5)
+
+
+def test_a_run_of_a_configuration_file_follows_the_reward_against_the_expert(tmp_path):
+    schedule = {"coefficient": "beta", "start": 1.0, "final": 0.25, "follow": "eval/reward_against_expert"}
+    settings = {
+        **{"n_timesteps": 400, "n_envs": 8, "n_steps": 25, "batch_size": 100, "n_epochs": 1, "eval_expert": True},
+        "env_kwargs": {"max_episode_steps": 20},
+        "callback": [{"sb3_quad.callbacks.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
+    }
+    config = build_config("dagger", "QuadTargetTracking-v0", settings)
+    result = train(TrainingJob(config, str(tmp_path), eval_freq=200, eval_episodes=2), report=lambda line: None)
+    assert result.model.current_beta == 0.25
+    for wrong, message in (("yes", "true or false"), (True, "learns from no expert")):
+        with pytest.raises(ConfigError, match=message):
+            build_config("ppo", "QuadTargetTracking-v0", {"n_timesteps": 1, "eval_expert": wrong})
 
 
 @pytest.mark.parametrize(
