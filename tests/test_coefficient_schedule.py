@@ -144,7 +144,12 @@ def test_a_configuration_file_can_name_it():
 def test_a_run_of_a_configuration_file_follows_the_reward_against_the_expert(tmp_path):
     schedule = {"coefficient": "beta", "start": 1.0, "final": 0.25, "follow": "eval/reward_against_expert"}
     settings = {
-        **{"n_timesteps": 400, "n_envs": 8, "n_steps": 25, "batch_size": 100, "n_epochs": 1, "eval_expert": True},
+        "n_timesteps": 400,
+        "n_envs": 8,
+        "n_steps": 25,
+        "batch_size": 100,
+        "n_epochs": 1,
+        "eval_expert": True,
         "env_kwargs": {"max_episode_steps": 20},
         "callback": [{"sb3_quad.callbacks.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
     }
