@@ -216,6 +216,15 @@ class DAgger(OnPolicyAlgorithm):
         """β of the present rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
         return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
 
+    def set_beta(self, beta: float) -> None:
+        """Let the expert fly with probability ``beta`` from the next rollout on, whatever ``beta_decay`` says.
+
+        :raises ConfigError: no probability
+        """
+        if not 0.0 <= beta <= 1.0:
+            raise ConfigError(f"beta {beta}: a probability, from 0 to 1")
+        self.beta = self.beta_final = float(beta)
+
     def _generator(self, purpose: int) -> np.random.Generator:
         """Random numbers for this rollout (0) or update (1): no state to save, and the same again after a resume."""
         return np.random.default_rng([self._entropy if self.seed is None else self.seed, purpose, self._n_updates])

@@ -138,6 +138,7 @@ class PPOBC(PPO):
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
         self._n_rollouts_trained = 0
+        self._next_bc_coef: float | None = None
         self._labeller: ExpertLabeller | None = None
         self._labels: Any = None
 
@@ -159,6 +160,18 @@ class PPOBC(PPO):
         self.expert = expert
         self._labeller = None
 
+    def set_bc_coef(self, bc_coef: float) -> None:
+        """Weigh the cloning term with ``bc_coef`` from the next rollout on, instead of the schedule given before.
+
+        :raises ConfigError: a weight that is negative or not finite.
+        :raises ExpertError: a weight, and no expert.
+        """
+        if not 0.0 <= bc_coef < float("inf"):
+            raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
+        if bc_coef > 0.0 and self.expert is None:
+            raise ExpertError(f"bc_coef {bc_coef}: PPOBC needs an expert to clone, PPOBC(..., expert=PIDExpert())")
+        self._next_bc_coef = float(bc_coef)  # not now: the rollout that is under way was labelled, or not, by the old one
+
     def _current_bc_coef(self) -> float:
         return float(self.bc_coef(self._current_progress_remaining))  # type: ignore[operator]
 
@@ -176,6 +189,8 @@ class PPOBC(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
+        if self._next_bc_coef is not None:
+            self.bc_coef, self._next_bc_coef = FloatSchedule(self._next_bc_coef), None
         if self._labelling and self._labeller is not None and self._labeller.needs_state:
             observation: Any = self._last_obs
             self._labels = self._labeller.labels(observation)  # the first step's state, before it

@@ -161,7 +161,7 @@ def _learn(
     report: Report,
     timesteps: int,
 ) -> TrainingResult:
-    callbacks, last_good, best = _callbacks(job, run, eval_envs, signals, report)
+    callbacks, last_good, best = _callbacks(job, run, model, eval_envs, signals, report)
     start = time.perf_counter()
     try:
         model.learn(
@@ -215,7 +215,12 @@ def _finite(model: OnPolicyAlgorithm) -> bool:
 
 
 def _callbacks(
-    job: TrainingJob, run: RunFolder, eval_envs: dict[str | None, VecEnv], signals: StopSignals, report: Report
+    job: TrainingJob,
+    run: RunFolder,
+    model: OnPolicyAlgorithm,
+    eval_envs: dict[str | None, VecEnv],
+    signals: StopSignals,
+    report: Report,
 ) -> tuple[list[BaseCallback], LastGoodModel, BestModel | None]:
     from sb3_quad.callbacks.best_model import BestModel
     from sb3_quad.callbacks.checkpoint import Checkpoint
@@ -230,7 +235,9 @@ def _callbacks(
         every = job.eval_freq if job.eval_freq > 0 else 2**62
         seed = job.seed + EVALUATION_SEED
         others = {task: env for task, env in eval_envs.items() if task is not None}
-        best = BestModel(eval_envs[None], every, job.eval_episodes, seed, run.best_model, run.evaluations, report, others)
+        expert = getattr(model, "expert", None) if job.config.eval_expert else None
+        files = run.best_model, run.evaluations
+        best = BestModel(eval_envs[None], every, job.eval_episodes, seed, *files, report, others, expert)
         callbacks.append(best)
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
