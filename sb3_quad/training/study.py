@@ -74,18 +74,22 @@ def _open_storage(storage: str | Path | None) -> BaseStorage:
     return JournalStorage(JournalFileBackend(str(storage)))
 
 
+def check_names(sampler: str, pruner: str) -> None:
+    """:raises ConfigError: a sampler or a pruner that there is not."""
+    if sampler not in SAMPLERS:
+        raise ConfigError(unknown("sampler", sampler, SAMPLERS))
+    if pruner not in PRUNERS:
+        raise ConfigError(unknown("pruner", pruner, PRUNERS))
+
+
 def make_sampler(name: str, seed: int, n_startup_trials: int) -> BaseSampler:
     """One of :data:`SAMPLERS`. What it proposes for a trial depends on ``seed``, the trial's number and the trials known.
 
     So processes that share a study propose different trials, and a study that is resumed goes on as if never left.
 
     :param n_startup_trials: trials drawn at random first.
-    :raises ConfigError: an unknown name.
     """
     from optuna import samplers
-
-    if name not in SAMPLERS:
-        raise ConfigError(unknown("sampler", name, SAMPLERS))
 
     def fresh(number: int) -> samplers.BaseSampler:
         own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
@@ -126,12 +130,9 @@ def make_pruner(name: str, n_startup_trials: int, n_evaluations: int) -> BasePru
 
     :param n_startup_trials: trials that ``median`` lets finish first.
     :param n_evaluations: of a trial; ``median`` prunes none before a third of them.
-    :raises ConfigError: an unknown name.
     """
     from optuna import pruners
 
-    if name not in PRUNERS:
-        raise ConfigError(unknown("pruner", name, PRUNERS))
     if name == "halving":
         return pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
     if name == "median":
