@@ -80,8 +80,12 @@ def _slice(
         choices = [str(value) for value in dimension.values]
         panel.set_xticks(range(len(choices)), choices, fontsize="small")
         panel.set_xlim(-0.5, len(choices) - 0.5)
-    elif dimension.log:
-        panel.set_xscale("log")
+    else:
+        low, high = dimension.low, dimension.high
+        middle = math.sqrt(low * high) if dimension.log else (low + high) / 2
+        panel.set_xscale("log" if dimension.log else "linear")
+        panel.set_xticks([low, middle, high], [f"{value:.3g}" for value in (low, middle, high)])
+        panel.minorticks_off()
 
     def place(trial: FrozenTrial) -> float:
         value = trial.params[name]

@@ -13,11 +13,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_quad.errors import ConfigError, TrainingError
-from sb3_quad.training.config import build_config
+from sb3_quad.training.config import TrainingConfig, build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.signals import StopSignals
 from sb3_quad.training.study import check_names, make_pruner, make_sampler, open_study
-from sb3_quad.tuning.space import SearchSpace
+from sb3_quad.tuning.space import SearchSpace, current
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -67,11 +67,9 @@ class Search:
         if job.eval_episodes < 1:
             raise ConfigError(f"eval_episodes {job.eval_episodes}: must be at least 1, trials are judged by them")
         self.space, self.options = space, options
-        n_timesteps, count = job.config.n_timesteps, options.n_evaluations
-        # Never due with the last transition: that evaluation follows the last update.
-        self.job = replace(job, eval_freq=n_timesteps // count + 1 if count > 1 else -1)
+        self.job = job
         sampler = make_sampler(options.sampler, job.seed, options.n_startup_trials)
-        pruner = make_pruner(options.pruner, options.n_startup_trials, count)
+        pruner = make_pruner(options.pruner, options.n_startup_trials, options.n_evaluations)
         self.study, new = open_study(options.name, options.storage, sampler, "maximize", pruner)
         begun_with = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
         if new:
@@ -149,17 +147,19 @@ class Search:
         trial.set_user_attr(SETTINGS, json.dumps(settings))
         known = self.job.config
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
+        total, count = _transitions(config), self.options.n_evaluations
         scores: list[tuple[float, float]] = []
 
         def goes_on(success: float, reward: float) -> bool:
             scores.append((success, reward))
             trial.report(self.score(success, reward), len(scores))
-            return len(scores) >= self.options.n_evaluations or not trial.should_prune()
+            return len(scores) >= count or not trial.should_prune()
 
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
-                replace(self.job, config=config),
+                # Never due with the last transition: that evaluation follows the last update.
+                replace(self.job, config=config, eval_freq=total // count + 1 if count > 1 else -1),
                 report=lambda line: None,
                 started=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 goes_on=goes_on,
@@ -169,7 +169,7 @@ class Search:
         success, reward = scores[-1]
         trial.set_user_attr(SUCCESS, success)
         trial.set_user_attr(REWARD, reward)
-        if result.model.num_timesteps < config.n_timesteps:
+        if result.model.num_timesteps < total:
             return TrialState.PRUNED, None
         value = self.score(success, reward)
         if not math.isfinite(value):
@@ -225,6 +225,12 @@ def score(success: float, reward: float, n_episodes: int) -> float:
     :param reward: mean per episode.
     """
     return success + (1.0 + reward / (1.0 + abs(reward))) / (2 * n_episodes)
+
+
+def _transitions(config: TrainingConfig) -> int:
+    """How many a training makes: its last rollout is a whole one."""
+    rollout = int(current(config.algo, config.settings, "n_steps")) * config.n_envs
+    return math.ceil(config.n_timesteps / rollout) * rollout
 
 
 def _begun_with(study: Study) -> dict[str, str] | None:
