@@ -229,7 +229,7 @@ def score(success: float, reward: float, n_episodes: int) -> float:
 
 def _transitions(config: TrainingConfig) -> int:
     """How many a training makes: its last rollout is a whole one."""
-    rollout = int(current(config.algo, config.settings, "n_steps")) * config.n_envs
+    rollout = int(current(config.algo, config.hyperparams, "n_steps")) * config.n_envs
     return math.ceil(config.n_timesteps / rollout) * rollout
 
 
