@@ -107,15 +107,11 @@ def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
         n_eval_envs=options.n_eval_envs,
     )
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
-    study = StudyOptions(
-        options.study_name or f"{config.algo}_{config.env_id}",
-        folder / JOURNAL if options.storage is None else options.storage,
-        options.sampler,
-        options.pruner,
-        options.n_startup_trials,
-        options.n_evaluations,
-    )
+    storage = folder / JOURNAL if options.storage is None else options.storage
+    name = options.study_name or f"{config.algo}_{config.env_id}"
+    names = options.sampler, options.pruner
     try:
+        study = StudyOptions(name, storage, *names, options.n_startup_trials, options.n_evaluations)
         return Search(replace(job, log_folder=str(folder)), space, study), folder
     except SB3QuadError:
         with suppress(OSError):

@@ -68,10 +68,10 @@ class Search:
             raise ConfigError(f"eval_episodes {job.eval_episodes}: must be at least 1, trials are judged by them")
         self.space, self.options = space, options
         self.job = job
+        begun_with = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
         sampler = make_sampler(options.sampler, job.seed, options.n_startup_trials)
         pruner = make_pruner(options.pruner, options.n_startup_trials, options.n_evaluations)
         self.study, new = open_study(options.name, options.storage, sampler, "maximize", pruner)
-        begun_with = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
         if new:
             self.study.set_user_attr(BEGUN_WITH, begun_with)
             start = space.start()
@@ -88,7 +88,19 @@ class Search:
         :param max_total_trials: those of other processes and earlier sessions included, failed ones not.
         :param after_each: told of each trial that ended.
         :raises TrainingError: the first trials of all have failed.
+        :raises ConfigError: a storage that fails meanwhile.
         """
+        import optuna
+
+        try:
+            self._run(n_trials, max_total_trials, signals, after_each)
+        except (OSError, optuna.exceptions.OptunaError) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise ConfigError(f"storage {self.options.storage}: fails ({type(error).__name__}: {reason})") from error
+
+    def _run(
+        self, n_trials: int, max_total_trials: int | None, signals: StopSignals, after_each: Callable[[FrozenTrial], None]
+    ) -> None:
         failures = 0
         for number in range(n_trials):
             if signals.received is not None or (max_total_trials is not None and self._counted() >= max_total_trials):
