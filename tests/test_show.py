@@ -337,7 +337,7 @@ def test_record_video_films_the_agent_of_a_run(run_folder, tmp_path, capsys):
     side_by_side = ["-i", str(run_folder.best_model), "-o", str(tmp_path / "films"), "--n-envs", "2", "--seed", "4"]
     assert main(["record-video", "--env", "QuadStateRecovery-v0", *side_by_side, "-n", "10", "--size", "64x64"]) == 0
     output = capsys.readouterr().out
-    assert "best_model, seed 4: " in output and "best_model, seed 5: " in output
+    assert "seed 4, best_model: " in output and "seed 5, best_model: " in output
     (both,) = (tmp_path / "films").iterdir()
     widths = [next(iter(imageio.get_reader(path))).shape[1] for path in (film, both)]
     assert widths[1] >= 2 * widths[0]

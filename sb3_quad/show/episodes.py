@@ -133,7 +133,7 @@ def fly_all(
     while left > 0 and (number == 0 or n_timesteps is not None):
         steps = min(left, setting.n_steps)
         episode = [
-            _fly(setting, name if n_envs == 1 else f"{name}, seed {each}", controller, each, steps, deterministic)
+            _fly(setting, name if n_envs == 1 else f"seed {each}, {name}", controller, each, steps, deterministic)
             for name, controller in controllers.items()
             for each in range(seed + number, seed + number + n_envs)
         ]
