@@ -84,8 +84,11 @@ def _slice(
         low, high = dimension.low, dimension.high
         middle = math.sqrt(low * high) if dimension.log else (low + high) / 2
         panel.set_xscale("log" if dimension.log else "linear")
-        panel.set_xticks([low, middle, high], [f"{value:.3g}" for value in (low, middle, high)])
+        panel.set_xticks([low, middle, high], [f"{float(f'{value:.2g}'):g}" for value in (low, middle, high)])
         panel.minorticks_off()
+        ends = np.array([np.log(low), np.log(high)]) if dimension.log else np.array([low, high])
+        ends += 0.06 * (ends[1] - ends[0]) * np.array([-1.0, 1.0])
+        panel.set_xlim(*(np.exp(ends) if dimension.log else ends))
 
     def place(trial: FrozenTrial) -> float:
         value = trial.params[name]
