@@ -17,6 +17,8 @@ from sb3_quad.common.labels import ExpertLabeller
 from sb3_quad.errors import ConfigError
 from sb3_quad.training.files import save_model, write_bytes
 
+GoesOn = Callable[[float, float], bool]
+
 
 class BestModel(BaseCallback):
     """Evaluates the deterministic policy every ``every`` transitions, and whenever :meth:`evaluate` is called.
@@ -48,6 +50,7 @@ class BestModel(BaseCallback):
         ``evaluations``.
     :param evaluations: where the figures go; a file that is there already is continued.
     :param report: told of each evaluation in one line.
+    :param goes_on: asked after each evaluation, with its success rate and mean reward, whether the training goes on.
     :param others: by name: further environments, such as those of another task, to evaluate in at the same times. They have no
         say in which model is best; their figures go to ``evaluations_<name>.npz`` beside ``evaluations``.
     :param expert: as DAgger takes it; flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
@@ -67,6 +70,7 @@ class BestModel(BaseCallback):
         report: Callable[[str], None] = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
         expert: Any = None,
+        goes_on: GoesOn = lambda success, reward: True,
         verbose: int = 0,
     ) -> None:
         super().__init__(verbose)
@@ -79,6 +83,8 @@ class BestModel(BaseCallback):
         self._n_episodes, self._seed = n_episodes, seed
         self._best_model = best_model
         self._report = report
+        self._goes_on = goes_on
+        self.stopped = False  # by ``goes_on``
         self._start = 0.0
         self._figures = _Figures(evaluations)
         self._others = {
@@ -100,7 +106,7 @@ class BestModel(BaseCallback):
         if self.num_timesteps >= self._next:
             self._next += self._every
             self.evaluate()
-        return True
+        return not self.stopped
 
     def evaluate(self) -> None:
         """Evaluate the model as it is now, note the figures, and keep it if it is the best so far."""
@@ -114,6 +120,7 @@ class BestModel(BaseCallback):
             self.best = score
             save_model(self.model, self._best_model)
         self._report(line + (" (best so far)" if better else ""))
+        self.stopped = not self._goes_on(*score)
 
     def _fly(self, env: VecEnv, figures: _Figures, seconds: float, group: str) -> tuple[float, float]:
         successes: list[float] = []
