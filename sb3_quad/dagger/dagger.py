@@ -88,7 +88,7 @@ class DAgger(OnPolicyAlgorithm):
     :param beta_final: Where β stops falling
     :param bc_loss: ``"nll"``, Eq. 3.12, learns the standard deviation too; ``"mse"``, on the mean alone, leaves it to
         ``log_std_init`` and ``ent_coef``; so do ``"huber"``, squared up to 0.05 and linear beyond, which is more exact
-        where the expert is smooth, and ``"huber_mse"``, that and ten times the squared error
+        where the expert is smooth, and ``"huber_mse"``, that and three times the squared error
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains

@@ -43,7 +43,7 @@ class PPOBC(PPO):
         ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a mean over the action's
         dimensions; ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone;
-        ``"huber"``, that is linear beyond 0.05; or ``"huber_mse"``, that and ten times the squared error.
+        ``"huber"``, that is linear beyond 0.05; or ``"huber_mse"``, that and three times the squared error.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"negative_advantage"``, where the flown action did worse than
         the critic expected; ``"agreement"``, where expert and policy differ by less than 0.3 (root mean square over the
         action): an expert for small angles, such as the PID, then holds the agent on its way to the target and has no say
