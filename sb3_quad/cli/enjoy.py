@@ -125,6 +125,7 @@ def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
     from sb3_quad.experts.models import load_model
     from sb3_quad.show.agents import find_agent
     from sb3_quad.show.episodes import Setting, make_wrench, scenario_setting
+    from sb3_quad.training.algorithms import get_algorithm
 
     env_id = options.env or DEFAULT_ENV
     if env_id not in ENVIRONMENTS:
@@ -132,9 +133,8 @@ def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
     given = pairs(options.env_kwargs, "--env-kwargs")
     agents, kept = {}, {}
     if options.algo:
-        from sb3_quad.training.algorithms import get_algorithm
-
-        get_algorithm(options.algo)
+        if not (Path(options.folder) / options.algo).is_dir():
+            get_algorithm(options.algo)  # says so if there is none of that name
         which: str | int = "best" if options.load_best else "last checkpoint" if options.load_last_checkpoint else "result"
         which = which if options.load_checkpoint is None else options.load_checkpoint
         agent = find_agent(options.folder, options.algo, env_id, options.exp_id, which)
