@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import rl_zoo3.exp_manager
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.utils import LinearSchedule
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv, VecMonitor
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -52,6 +52,10 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     Its ``args.yml`` gives as ``env_kwargs`` what evaluations are flown with, which is what ``enjoy`` is to show.
     """
+
+    config: str
+    env_kwargs: Settings
+    vec_env_class: Callable[..., VecEnv]
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
@@ -117,10 +121,10 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if kind == "batch" and self._env_id not in ENVIRONMENTS:
             raise ConfigError(f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; use dummy or subproc")
         self._batched = kind == "batch"
-        if kind == "subproc":
-            self.vec_env_class = SubprocVecEnv
+        if kind != "batch":
+            self.vec_env_class = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[kind]
 
-    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> VecEnv:
+    def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
         """The environments of a training or an evaluation, with their wrappers."""
         if self._batched:
             kwargs = {"task": ENVIRONMENTS[self._env_id], **(self.eval_env_kwargs if eval_env else self.env_kwargs)}
