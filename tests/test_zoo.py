@@ -48,6 +48,7 @@ SETTINGS = {
     "ent_coef": "1e-4",
 }
 
+pytestmark = pytest.mark.timeout(900)
 with_zoo = pytest.mark.skipif(importlib.util.find_spec("rl_zoo3") is None, reason="needs rl_zoo3, the extra [zoo]")
 
 
