@@ -62,7 +62,8 @@ def agent_of_run(options: argparse.Namespace) -> Agent:
     from sb3_quad.show.agents import find_agent
     from sb3_quad.training.algorithms import get_algorithm
 
-    get_algorithm(options.algo)
+    if not (Path(options.folder) / options.algo).is_dir():
+        get_algorithm(options.algo)  # says so if there is none of that name
     which: str | int = "best" if options.load_best else "last checkpoint" if options.load_last_checkpoint else "result"
     which = which if options.load_checkpoint is None else options.load_checkpoint
     return find_agent(options.folder, options.algo, known_environment(options), options.exp_id, which)

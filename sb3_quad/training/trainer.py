@@ -71,7 +71,7 @@ def train(
         if job.trained_agent is not None:
             hand_over(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
-        run.write_yaml(config.settings, job.arguments())
+        run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": for_evaluation(job).env_kwargs})
         started(run)
         return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps, goes_on)
 
