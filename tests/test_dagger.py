@@ -383,6 +383,7 @@ def test_labels_that_are_not_finite_name_the_row():
         ({"dataset_capacity": 10}, "dataset_capacity"),
         ({"dataset_capacity": -1}, "dataset_capacity"),
         ({"clip_range_vf": -0.2}, "clip_range_vf"),
+        ({"policy_kwargs": {"use_sde": True}}, "use_sde"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

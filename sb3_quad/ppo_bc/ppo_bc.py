@@ -53,7 +53,7 @@ class PPOBC(PPO):
         ``clip_range_vf`` is given; False for stock PPO's clipped error.
     :param critic_warmup: for this many rollouts only the critic learns: a critic that comes from another task, or from
         another policy, would else spoil the actor with its first advantages.
-    :raises ConfigError: a value out of range or a name that is not known, when built.
+    :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite; the parameters are those of the step before.
     """
@@ -146,9 +146,16 @@ class PPOBC(PPO):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ConfigError(
+                f"observation space {self.observation_space}: PPOBC does not support Dict; wrap the environment in "
+                "gymnasium.wrappers.FlattenObservation"
+            )
         super()._setup_model()
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
+        if self.use_sde and self.bc_loss == "nll" and self._ever_clones():
+            raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse' or 'huber'")
         self.bc_coef = FloatSchedule(self.bc_coef)
 
     def _excluded_save_params(self) -> list[str]:
