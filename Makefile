@@ -2,20 +2,23 @@
 # Another interpreter: make PYTHON=python3.11 test. Arguments: make test ARGS="-m 'not slow'", make train ARGS="--seed 1".
 PYTHON ?= python3
 VENV ?= .venv
+ZOO_VENV ?= .venv-zoo
 ARGS ?=
 
 PY := $(VENV)/bin/python
 INSTALL := $(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 INSTALLED := $(VENV)/.installed
+ZOO_INSTALLED := $(ZOO_VENV)/.installed
 LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test lint format type commit-checks clean
+.PHONY: help install train test test-zoo lint format type commit-checks clean
 
 help:
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests"
+	@echo "make test-zoo       run the tests that need rl_zoo3, in an environment of its own"
 	@echo "make lint           check code style"
 	@echo "make format         put code into that style"
 	@echo "make type           check types"
@@ -29,6 +32,9 @@ train: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(PY) -m pytest $(ARGS)
+
+test-zoo: $(ZOO_INSTALLED)
+	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py $(ARGS)
 
 lint: $(INSTALLED)
 	$(PY) -m ruff check .
@@ -61,4 +67,13 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 	@echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."
 	@$(INSTALL) setuptools
 	@$(INSTALL) --no-build-isolation --editable '.[dev]'
+	@touch $@
+
+# rl_zoo3 needs older versions of some packages than ours: they come first in an environment that borrows all others.
+$(ZOO_INSTALLED): constraints-zoo.txt $(INSTALLED)
+	$(PY) -m venv --without-pip $(ZOO_VENV)
+	@$(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \
+		"$$($(ZOO_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
+	@$(PY) -m pip --python $(ZOO_VENV)/bin/python install --quiet --no-compile --disable-pip-version-check \
+		--no-deps --ignore-installed --requirement constraints-zoo.txt
 	@touch $@

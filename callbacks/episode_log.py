@@ -17,13 +17,22 @@ class EpisodeLog(BaseCallback):
     Reads ``info["episode"]``, so it costs nothing while episodes go on; ``load_results`` and rl-zoo's plots read the file.
     A file that is there already is continued.
 
+    >>> from stable_baselines3 import PPO
+    >>> from stable_baselines3.common.results_plotter import load_results
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
+    >>> _ = model.learn(800, callback=EpisodeLog("0.monitor.csv"))
+    >>> len(load_results("."))
+    16
+
     :param path: named ``<number>.monitor.csv``.
     :param env_id: noted in the file.
     """
 
-    def __init__(self, path: Path, env_id: str, verbose: int = 0) -> None:
+    def __init__(self, path: str | Path, env_id: str = "", verbose: int = 0) -> None:
         super().__init__(verbose)
-        self._path = path
+        self._path = Path(path)
         self._env_id = env_id
         self._file: TextIO | None = None
         self._start = 0.0

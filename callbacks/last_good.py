@@ -30,6 +30,15 @@ class Snapshot:
 class LastGoodModel(BaseCallback):
     """Takes a :class:`Snapshot` whenever a rollout starts.
 
+    >>> from stable_baselines3 import PPO
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> model = PPO("MlpPolicy", QuadcopterVecEnv(8, seed=0), n_steps=100, batch_size=400, device="cpu")
+    >>> last_good = LastGoodModel()
+    >>> _ = model.learn(1600, callback=last_good)
+    >>> import io
+    >>> last_good.snapshot.timesteps, PPO.load(io.BytesIO(last_good.snapshot.model), device="cpu").num_timesteps
+    (800, 800)
+
     :raises TrainingError: parameters that are no longer finite; the snapshot then is the one before that update.
     """
 

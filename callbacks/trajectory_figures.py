@@ -29,14 +29,15 @@ class TrajectoryFigures(BaseCallback):
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
-    >>> model = PPO("MlpPolicy", QuadcopterVecEnv(240, task="state_recovery"), n_steps=125, tensorboard_log="logs/tb")
-    >>> figures = TrajectoryFigures(every=1_000_000, task="state_recovery")
-    >>> model.learn(10_000_000, callback=figures)  # doctest: +SKIP
+    >>> env = QuadcopterVecEnv(8, "state_recovery", seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, tensorboard_log="tb", device="cpu")
+    >>> figures = TrajectoryFigures(every=800, n_flights=2, max_steps=50, task="state_recovery")
+    >>> _ = model.learn(800, callback=figures)
 
     In a configuration file, with ``-tb`` on the command line::
 
         callback:
-          - sb3_quad.callbacks.trajectory_figures.TrajectoryFigures: {every: 1000000, task: state_recovery}
+          - sb3_quad.callbacks.TrajectoryFigures: {every: 1000000, task: state_recovery}
 
     :param every: transitions between figures.
     :param n_flights: episodes in a figure.

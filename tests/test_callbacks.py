@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import random
+import signal
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from stable_baselines3 import A2C, PPO
+from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
@@ -19,8 +20,8 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.checkpoint import Checkpoint
 from sb3_quad.callbacks.episode_log import EpisodeLog
 from sb3_quad.callbacks.last_good import LastGoodModel, random_state, set_random_state
-from sb3_quad.callbacks.stop import StopWhen
-from sb3_quad.errors import TrainingError
+from sb3_quad.callbacks.stop import StopOnSignal, StopWhen
+from sb3_quad.errors import ConfigError, TrainingError
 
 
 class Walk(gymnasium.Env):
@@ -124,6 +125,31 @@ def test_checkpoints_are_whole_models_at_their_number_of_steps(tmp_path):
     assert PPO.load(tmp_path / "rl_model_150_steps.zip").num_timesteps == 150
 
 
+def test_the_expert_flies_the_same_episodes_once(tmp_path):
+    """Here the reward is the action, so an expert that always says 0.5 collects 5 in the ten steps."""
+    asked = []
+
+    def expert(observation):
+        asked.append(len(observation))
+        return np.full((len(observation), 1), 0.5)
+
+    best = make_best(tmp_path, every=40, expert=expert, others={"far": make_vec_env(Walk, 2)})
+    model = make_model()
+    seen = []
+    model.learn(80, callback=[best, StopWhen(lambda: seen.append(dict(model.logger.name_to_value)) is not None)])
+    (logged, *_) = [values for values in seen if "eval/mean_reward" in values]
+    for group in ("eval", "eval_far"):
+        assert logged[f"{group}/reward_against_expert"] == pytest.approx(logged[f"{group}/mean_reward"] - 5.0)
+    assert asked == [2] * 40  # four episodes of ten steps in two environments, for two groups, and never again
+
+
+def test_a_checkpoint_can_be_named_by_its_steps(tmp_path):
+    make_model().learn(80, callback=Checkpoint(40, str(tmp_path / "model_{steps}.zip")))
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["model_40.zip", "model_80.zip"]
+    with pytest.raises(ConfigError, match="steps"):
+        Checkpoint(40, "model.zip")
+
+
 def test_the_episode_log_is_a_monitor_file(tmp_path):
     for _ in range(2):
         make_model().learn(80, callback=EpisodeLog(tmp_path / "0.monitor.csv", "Walk-v0"))
@@ -138,6 +164,48 @@ def test_stopping_leaves_after_the_step():
     model = make_model()
     model.learn(1000, callback=StopWhen(lambda: model.num_timesteps >= 50))
     assert model.num_timesteps == 50
+
+
+class Signal(BaseCallback):
+    """Sends this process a signal at a step."""
+
+    def __init__(self, number, at):
+        super().__init__()
+        self.number, self.at = number, at
+
+    def _on_step(self):
+        if self.num_timesteps == self.at:
+            signal.raise_signal(self.number)
+        return True
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "number", "exit_code"), [(PPO, signal.SIGINT, 130), (A2C, signal.SIGTERM, 143), (SAC, signal.SIGINT, 130)]
+)
+def test_a_signal_ends_the_training_after_the_step_and_saves(tmp_path, capsys, algorithm, number, exit_code):
+    handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    if algorithm is SAC:
+        model = SAC("MlpPolicy", make_vec_env(Walk, 2), policy_kwargs={"net_arch": [4]}, device="cpu")
+    else:
+        model = make_model(algorithm)
+    stop = StopOnSignal(tmp_path / "model.zip")
+    model.learn(1000, callback=[Signal(number, 50), stop])
+    assert model.num_timesteps == 50 and (stop.signal, stop.exit_code) == (signal.Signals(number).name, exit_code)
+    assert f"{stop.signal} after 50 transitions" in capsys.readouterr().out
+    assert [entry.name for entry in tmp_path.iterdir()] == ["model.zip"]
+    saved = algorithm.load(tmp_path / "model.zip", device="cpu")
+    assert saved.num_timesteps == 50
+    for ours, theirs in zip(model.policy.parameters(), saved.policy.parameters(), strict=True):
+        assert torch.equal(ours, theirs)
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_without_a_signal_nothing_is_saved(tmp_path):
+    handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
+    stop = StopOnSignal(tmp_path / "model.zip")
+    make_model().learn(40, callback=stop)
+    assert (stop.signal, stop.exit_code) == ("", 0) and not list(tmp_path.iterdir())
+    assert [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
 def test_the_snapshot_is_of_the_last_rollout_start(tmp_path):

@@ -160,7 +160,7 @@ def test_help_has_examples_and_needs_no_torch():
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.count("examples:") == 2
+    assert result.stdout.count("examples:") == 3
     assert "exit codes:" in result.stdout
 
 

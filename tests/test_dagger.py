@@ -114,7 +114,7 @@ def test_how_errors_count(kind):
     th.testing.assert_close(loss, loss.flip(0))
     slope = loss.diff() / error.diff()
     assert (slope.diff() > -1e-9).all()
-    assert slope[-1] == pytest.approx(1.0 + (20.0 * 1.9975 if kind == "huber_mse" else 0.0))
+    assert slope[-1] == pytest.approx(1.0 + (6.0 * 1.9975 if kind == "huber_mse" else 0.0))
 
 
 def test_without_a_value_term_only_the_actor_moves():
@@ -383,6 +383,7 @@ def test_labels_that_are_not_finite_name_the_row():
         ({"dataset_capacity": 10}, "dataset_capacity"),
         ({"dataset_capacity": -1}, "dataset_capacity"),
         ({"clip_range_vf": -0.2}, "clip_range_vf"),
+        ({"policy_kwargs": {"use_sde": True}}, "use_sde"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
@@ -192,3 +194,18 @@ def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_co
 def test_bad_arguments_are_named(arguments):
     with pytest.raises(ConfigError, match=next(iter(arguments))):
         PPOBC("MlpPolicy", "Pendulum-v1", **arguments, **SMALL)
+
+
+def test_state_dependent_exploration_clones_by_the_mean_only():
+    with pytest.raises(ConfigError, match="bc_loss"):
+        PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, use_sde=True, **SMALL)
+    PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, use_sde=True, bc_loss="mse", **SMALL).learn(64)
+    PPOBC("MlpPolicy", "Pendulum-v1", use_sde=True, bc_coef=0.0, l2_coef=1e-3, **SMALL).learn(64)
+
+
+def test_dict_observations_are_refused():
+    class Nothing(gym.Env):
+        observation_space, action_space = spaces.Dict(a=spaces.Box(-1, 1, (2,))), spaces.Box(-1, 1, (1,))
+
+    with pytest.raises(ConfigError, match="FlattenObservation"):
+        PPOBC("MultiInputPolicy", Nothing(), expert=swing_back)

@@ -318,3 +318,63 @@ def test_flights_are_shown_in_a_window():
 def test_targets_and_positions_are_where_the_pictures_look_for_them(hit):
     np.testing.assert_array_equal(hit.state[np.r_[POSITION], 0], hit.path[0])
     np.testing.assert_array_equal(hit.state[np.r_[TARGET], 0], hit.targets[0])
+
+
+@pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
+def test_record_video_films_the_agent_of_a_run(run_folder, tmp_path, capsys):
+    import imageio.v2 as imageio
+
+    logs = str(run_folder.path.parent.parent)
+    asked = ["record-video", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "-n", "10", "--size", "64x64"]
+    assert main(asked) == 0
+    output = capsys.readouterr().out
+    film = run_folder.path / "videos" / "best_model-QuadStateRecovery-v0-seed-0-10-steps.mp4"
+    assert f"agent: {run_folder.best_model}" in output and f"saved {film}" in output
+    assert film.is_file()
+    before = film.read_bytes()
+    assert main(asked) == 2
+    assert "--overwrite" in capsys.readouterr().err and film.read_bytes() == before
+    side_by_side = ["-i", str(run_folder.best_model), "-o", str(tmp_path / "films"), "--n-envs", "2", "--seed", "4"]
+    assert main(["record-video", "--env", "QuadStateRecovery-v0", *side_by_side, "-n", "10", "--size", "64x64"]) == 0
+    output = capsys.readouterr().out
+    assert "seed 4, best_model: " in output and "seed 5, best_model: " in output
+    (both,) = (tmp_path / "films").iterdir()
+    widths = [next(iter(imageio.get_reader(path))).shape[1] for path in (film, both)]
+    assert widths[1] >= 2 * widths[0]
+
+
+def test_episodes_side_by_side_have_one_seed_after_the_other():
+    setting = Setting.from_keywords({"task": "state_recovery", "max_episode_steps": 5})
+    abreast = list(fly_all({"pid": PIDExpert()}, setting, 5, 10, True, n_envs=2))
+    alone = list(fly_all({"pid": PIDExpert()}, setting, 5, 20, True))
+    assert [len(episode) for episode in abreast] == [2, 2]
+    for ours, theirs in zip([each for episode in abreast for each in episode], alone, strict=True):
+        np.testing.assert_array_equal(ours.state, theirs[0].state)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "whose flight"),
+        (["--algo", "ppo", "-i", "agent.zip"], "one of both"),
+        (["-i", "nowhere.zip"], "nowhere.zip"),
+        (["--algo", "ppo", "-f", "nowhere"], "no run"),
+        (["--algo", "ppoo"], "did you mean 'ppo'"),
+        (["-i", "agent.zip", "--env", "Pendulum-v1"], "rl_zoo3"),
+        (["-i", "agent.zip", "--speed", "0"], "--speed"),
+        (["-i", "agent.zip", "--env-kwargs", "nois:0"], "nois"),
+        (["-i", "agent.zip", "--size", "big"], "640x480"),
+    ],
+)
+def test_record_video_names_what_is_wrong(arguments, message, capsys, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    assert main(["record-video", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_record_video_names_the_packages_it_misses(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert main(["record-video", "-i", "agent.zip"]) == 2
+    assert "pip install sb3_quad[video]" in capsys.readouterr().err

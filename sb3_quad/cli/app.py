@@ -5,11 +5,33 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, check_vehicle, enjoy, evaluate, export, plot, publish, report, train, tune_expert
+from sb3_quad.cli import (
+    benchmark,
+    check_vehicle,
+    enjoy,
+    evaluate,
+    export,
+    plot,
+    publish,
+    record_video,
+    report,
+    train,
+    tune,
+    tune_expert,
+)
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
-EXIT_CODES = """exit codes:
+EPILOG = """examples:
+  sb3-quad train                                                          both stages, imitation then PPO with cloning
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          one training
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30                     its hyperparameters
+  sb3-quad evaluate pid agent.zip --suite quick                           an agent beside an expert, in tables
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flight in a window
+  sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0 -f logs  or as a film
+  sb3-quad train --help                                                   all options of a command, with examples
+
+exit codes:
   0    done
   1    evaluated, but not every controller: a line on stderr for each that failed; or a vehicle that cannot hover
   2    bad input, or a training that cannot go on: one line on stderr says what
@@ -21,23 +43,31 @@ COMMANDS = {
     "evaluate": evaluate,
     "report": report,
     "enjoy": enjoy,
+    "record-video": record_video,
     "export": export,
     "publish": publish,
     "benchmark": benchmark,
     "plot": plot,
     "check-vehicle": check_vehicle,
+    "tune": tune,
     "tune-expert": tune_expert,
 }
+
+
+def make_parser() -> Parser:
+    """The parser of all commands."""
+    parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
+    subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=command.HELP, description=command.HELP, epilog=command.EXAMPLES)
+        command.add_arguments(subparser)
+    return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
-    parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EXIT_CODES)
-    subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
-    for name, command in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=command.HELP, description=command.HELP, epilog=command.EXAMPLES)
-        command.add_arguments(subparser)
+    parser = make_parser()
     try:
         if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
             raise ConfigError(unknown("command", arguments[0], COMMANDS))

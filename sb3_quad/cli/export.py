@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
 EXAMPLES = """The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
@@ -27,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add(
         "model",
+        type=agent_path,
         metavar="MODEL.zip",
         help="an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy, or a name such as itm-recovery",
     )
@@ -42,12 +44,11 @@ def run(options: argparse.Namespace) -> int:
     """Build, check, time, write. Returns the exit code."""
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
-    from sb3_quad.pretrained_policies import agent_path
     from sb3_quad.training.files import write_bytes
 
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
-    model, ending = Path(agent_path(options.model)), FORMATS[options.format]
+    model, ending = Path(options.model), FORMATS[options.format]
     if not model.is_file():
         raise ConfigError(f"model {model}: no such file")
     file = Path(options.file) if options.file else model.with_suffix(ending)

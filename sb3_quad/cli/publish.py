@@ -17,8 +17,8 @@ EXAMPLES = """The zip holds the weights and plain numbers only, so that other ve
 the card it is flown over fresh episodes: 3,840 recoveries, 960 targets at each of 10, 15 and 20 m.
 
 examples:
-  sb3-quad publish logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name itm-recovery \\
-      --command "python -m sb3_quad.cli train --seed 0" -o published/
+  sb3-quad publish logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent --command "sb3-quad train --seed 0"
+  sb3-quad publish agent.zip --name my-agent --command "python my_script.py" -o published --episodes 240
 """
 
 

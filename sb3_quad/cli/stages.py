@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.cli.compare import THESIS_VEHICLE
 from sb3_quad.cli.output import console
 from sb3_quad.errors import ConfigError
 
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
 
 FRESH_EPISODES = 960
 REFERENCE_ALGO, REFERENCE_ENV = "ppo", "QuadStateRecovery-v0"
-THESIS_VEHICLE = "itm"
 THESIS_PILOTS = ("expert", "IL-agent", "RL-agent", "PPO only")
 
 

@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import importlib
-import random
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sb3_quad.cli.arguments import pairs, whole
+from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console
-from sb3_quad.cli.stages import THESIS_VEHICLE, is_pipeline_run, resume_stages, run_stages
+from sb3_quad.cli.settings import add_settings, make_config, make_overrides, make_seed, prepare, say, shows_progress
+from sb3_quad.cli.stages import is_pipeline_run, resume_stages, run_stages
 from sb3_quad.errors import ConfigError
-from sb3_quad.pretrained_policies import agent_path
 
 if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
@@ -35,31 +33,13 @@ EXAMPLES = """examples:
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
-FRESH_EPISODES = 240
 DEFAULT_PIPELINE = "geometric/two_stage.yml"
-DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags of rl-zoo's ``train.py``, with their meanings."""
+    add_settings(parser)
     add = parser.add_argument
-    add("--algo", help=f"algorithm: dagger, ppo_bc or ppo ({DEFAULT_ALGO})")
-    add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
-    add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
-    add("-n", "--n-timesteps", type=whole, metavar="N", help="transitions to train on")
-    add("--n-envs", type=whole, metavar="N", help="environments side by side")
-    add("--vec-env", metavar="KIND", help="batch (compiled), dummy (PyBullet, one process) or subproc (one process each)")
-    add("--expert", metavar="SPEC", help="pid, geometric, path/to/model.zip or package.module:factory")
-    add("-params", "--hyperparams", nargs="+", metavar="K:V", help="settings to change, such as n_steps:500")
-    add("--env-kwargs", nargs="+", metavar="K:V", help="keywords of the environment, such as noise:0")
-    add("--eval-env-kwargs", nargs="+", metavar="K:V", help="the same, for the evaluation's environments only")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
-    add(
-        "-i",
-        "--trained-agent",
-        metavar="ZIP",
-        help="agent to start from: an SB3 on-policy zip, or a name such as itm-recovery",
-    )
     add("--reference", action="store_true", help="with a pipeline: also train PPO alone on the same budget, for comparison")
     add("--resume", metavar="RUN_FOLDER", help="go on with an interrupted run; all its settings are kept")
     add("-f", "--log-folder", metavar="DIR", help="where run folders go (logs)")
@@ -79,35 +59,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Train, compare, tell where everything is. Returns the exit code."""
-    for package in options.gym_packages:
-        try:
-            importlib.import_module(package)
-        except ImportError as error:
-            raise ConfigError(f"--gym-packages {package}: cannot be imported ({error})") from None
-    if options.num_threads is not None:
-        _set_threads(options.num_threads)
+    prepare(options)
     if options.resume is not None:
         folder = Path(options.resume)
         changes = _changes(options)
         if is_pipeline_run(folder):
-            return resume_stages(folder, changes, options.reference, _say)
+            return resume_stages(folder, changes, options.reference, say)
         from sb3_quad.training.trainer import resume
 
-        result = resume(options.resume, _say, **changes)
+        result = resume(options.resume, say, **changes)
     else:
         from sb3_quad.training.job import describe
         from sb3_quad.training.pipeline import is_pipeline
 
         conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
         if conf_file is not None and is_pipeline(conf_file):
-            return run_stages(options, conf_file, make_overrides(options), job_arguments(options), _say)
+            return run_stages(options, conf_file, make_overrides(options), job_arguments(options), say)
         if options.reference:
             raise ConfigError("--reference goes with a pipeline, such as train without --algo and --env")
         job = make_job(options)
         from sb3_quad.training.trainer import train
 
-        _say(describe(job))
-        result = train(job, _say)
+        say(describe(job))
+        result = train(job, say)
     if result.exit_code == 0:
         _finish(result)
     return result.exit_code
@@ -115,33 +89,17 @@ def run(options: argparse.Namespace) -> int:
 
 def make_job(options: argparse.Namespace) -> TrainingJob:
     """The job that a command line describes."""
-    from sb3_quad.training.config import load_config
     from sb3_quad.training.job import TrainingJob
 
-    config = load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, make_overrides(options))
-    return TrainingJob(config, **job_arguments(options))
-
-
-def make_overrides(options: argparse.Namespace) -> dict[str, Any]:
-    """The settings that a command line changes."""
-    overrides = pairs(options.hyperparams, "--hyperparams")
-    for name in ("n_timesteps", "n_envs", "vec_env", "expert"):
-        if getattr(options, name) is not None:
-            overrides[name] = getattr(options, name)
-    if options.env_kwargs is not None:
-        overrides["env_kwargs"] = pairs(options.env_kwargs, "--env-kwargs")
-    return overrides
+    return TrainingJob(make_config(options), **job_arguments(options))
 
 
 def job_arguments(options: argparse.Namespace) -> dict[str, Any]:
     """The arguments of a job that a command line gives, beside its settings."""
-    seed = 0 if options.seed is None else options.seed if options.seed >= 0 else random.SystemRandom().randrange(2**31)
     names = ("log_folder", "device", "trained_agent", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq")
     given = {name: getattr(options, name) for name in (*names, "log_interval", "tensorboard_log", "verbose")}
-    if options.trained_agent is not None:
-        given["trained_agent"] = agent_path(options.trained_agent)
     given["eval_env_kwargs"] = pairs(options.eval_env_kwargs, "--eval-env-kwargs") or None
-    given |= {"seed": seed, "unique": options.uuid, "progress": _progress(options)}
+    given |= {"seed": make_seed(options), "unique": options.uuid, "progress": shows_progress(options)}
     return {name: value for name, value in given.items() if value is not None}
 
 
@@ -153,55 +111,15 @@ def _changes(options: argparse.Namespace) -> dict[str, Any]:
             raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
     names = ("device", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq", "log_interval", "verbose")
     changes = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    return {**changes, "progress": _progress(options)}
+    return {**changes, "progress": shows_progress(options)}
 
 
 def _finish(result: TrainingResult) -> None:
     config = result.job.config
     if config.task is not None:
         start = time.perf_counter()
-        table = _compare(result)
-        console().print(table)
-        _say(f"trained in {result.seconds:.1f} s, flown for this table in {time.perf_counter() - start:.1f} s")
+        console().print(agent_and_expert(result.job, result.model))
+        say(f"trained in {result.seconds:.1f} s, flown for this table in {time.perf_counter() - start:.1f} s")
     else:
-        _say(f"trained in {result.seconds:.1f} s")
-    _say(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
-
-
-def _compare(result: TrainingResult) -> Any:
-    """The table of agent and expert over the same fresh episodes."""
-    from sb3_quad.evaluation.summary import fly_all
-    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
-    from sb3_quad.experts.resolve import resolve_expert
-    from sb3_quad.scenarios.load import load_suite
-    from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
-
-    config = for_evaluation(result.job)
-    given = config.env_kwargs
-    keywords: dict[str, Any] = {key: given[key] for key in ("vehicle", "noise", "task_kwargs") if key in given}
-    if "max_episode_steps" in given:
-        keywords["max_steps"] = given["max_episode_steps"]
-    expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
-    pilots = {"agent": result.model, "expert": expert}
-    columns = fly_all(pilots, config.task, FRESH_EPISODES, result.job.seed + FRESH_SEED, **keywords)
-    agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
-    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[str(config.task)])
-    title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
-    beside = (agent, "expert") if keywords.get("vehicle", THESIS_VEHICLE) == THESIS_VEHICLE else ()
-    return comparison(title, columns, scenario, beside)
-
-
-def _progress(options: argparse.Namespace) -> bool:
-    return sys.stderr.isatty() if options.progress is None else bool(options.progress)
-
-
-def _set_threads(number: int) -> None:
-    import torch
-
-    if number < 1:
-        raise ConfigError(f"--num-threads {number}: must be at least 1")
-    torch.set_num_threads(number)
-
-
-def _say(line: str) -> None:
-    print(line, flush=True)
+        say(f"trained in {result.seconds:.1f} s")
+    say(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")

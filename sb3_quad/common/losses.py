@@ -15,7 +15,7 @@ from torch.nn import functional as F
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
-MSE_WEIGHT = 10.0  # of the squared error in "huber_mse"
+MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
 
 
 def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -47,7 +47,7 @@ def mean_errors(kind: CloningLoss, mean: th.Tensor, actions: th.Tensor) -> th.Te
     ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. Where the expert's
     action cannot be told from a noisy observation, in a tumble, squared errors are large and have most of the gradient, though
     nothing can be learnt there; linear ones leave more of it to the approach and the hover, where a hundredth is centimetres.
-    ``"huber_mse"``: the former and ten times the squared error, for policies that must do both.
+    ``"huber_mse"``: the former and three times the squared error, for policies that must do both.
     """
     squared = (mean - actions).square().mean(dim=1)
     if kind == "mse":

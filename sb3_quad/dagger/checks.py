@@ -31,6 +31,8 @@ def check_arguments(model: DAgger) -> None:
         raise ConfigError(f"beta {model.beta}: is below beta_final {model.beta_final}; lower beta_final with it")
     if isinstance(model.clip_range_vf, (float, int)) and model.clip_range_vf <= 0:
         raise ConfigError(f"clip_range_vf {model.clip_range_vf}: must be positive, or None for no clipping")
+    if (model.policy_kwargs or {}).get("use_sde"):
+        raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
     if model.bc_loss not in CLONING_LOSSES:
         raise ConfigError(unknown("bc_loss", model.bc_loss, CLONING_LOSSES))
     rollout = model.n_steps * model.n_envs

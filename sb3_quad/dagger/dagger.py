@@ -88,7 +88,7 @@ class DAgger(OnPolicyAlgorithm):
     :param beta_final: Where β stops falling
     :param bc_loss: ``"nll"``, Eq. 3.12, learns the standard deviation too; ``"mse"``, on the mean alone, leaves it to
         ``log_std_init`` and ``ent_coef``; so do ``"huber"``, squared up to 0.05 and linear beyond, which is more exact
-        where the expert is smooth, and ``"huber_mse"``, that and ten times the squared error
+        where the expert is smooth, and ``"huber_mse"``, that and three times the squared error
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
@@ -215,6 +215,15 @@ class DAgger(OnPolicyAlgorithm):
     def current_beta(self) -> float:
         """β of the present rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
         return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
+
+    def set_beta(self, beta: float) -> None:
+        """Let the expert fly with probability ``beta`` from the next rollout on, whatever ``beta_decay`` says.
+
+        :raises ConfigError: no probability
+        """
+        if not 0.0 <= beta <= 1.0:
+            raise ConfigError(f"beta {beta}: a probability, from 0 to 1")
+        self.beta = self.beta_final = float(beta)
 
     def _generator(self, purpose: int) -> np.random.Generator:
         """Random numbers for this rollout (0) or update (1): no state to save, and the same again after a resume."""

@@ -9,6 +9,7 @@ from typing import Any
 from sb3_quad.errors import ConfigError
 from sb3_quad.training.config import read_yaml
 from sb3_quad.training.literals import parse_mapping
+from sb3_quad.training.zoo_yaml import ZooLoader
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ def trained_with(path: str | Path) -> TrainedWith:
     if len(files) > 1:
         raise ConfigError(f"{path}: several settings lie beside it ({', '.join(map(str, files))}); copy the zip elsewhere")
     try:
-        content = read_yaml(files[0].read_text(encoding="utf-8"), str(files[0]))
-    except (OSError, UnicodeDecodeError, ConfigError) as error:  # rl_zoo3's own files hold tags that are no plain YAML
+        content = read_yaml(files[0].read_text(encoding="utf-8"), str(files[0]), ZooLoader)
+    except (OSError, UnicodeDecodeError, ConfigError) as error:
         raise ConfigError(f"{files[0]}: cannot be read ({error}); copy the zip elsewhere to export it without") from None
     if not isinstance(content, dict):
         raise ConfigError(f"{files[0]}: holds no settings; copy the zip elsewhere to export it without")

@@ -43,7 +43,7 @@ class PPOBC(PPO):
         ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a mean over the action's
         dimensions; ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone;
-        ``"huber"``, that is linear beyond 0.05; or ``"huber_mse"``, that and ten times the squared error.
+        ``"huber"``, that is linear beyond 0.05; or ``"huber_mse"``, that and three times the squared error.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"negative_advantage"``, where the flown action did worse than
         the critic expected; ``"agreement"``, where expert and policy differ by less than 0.3 (root mean square over the
         action): an expert for small angles, such as the PID, then holds the agent on its way to the target and has no say
@@ -53,7 +53,7 @@ class PPOBC(PPO):
         ``clip_range_vf`` is given; False for stock PPO's clipped error.
     :param critic_warmup: for this many rollouts only the critic learns: a critic that comes from another task, or from
         another policy, would else spoil the actor with its first advantages.
-    :raises ConfigError: a value out of range or a name that is not known, when built.
+    :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite; the parameters are those of the step before.
     """
@@ -138,6 +138,7 @@ class PPOBC(PPO):
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
         self._n_rollouts_trained = 0
+        self._next_bc_coef: float | None = None
         self._labeller: ExpertLabeller | None = None
         self._labels: Any = None
 
@@ -145,9 +146,16 @@ class PPOBC(PPO):
             self._setup_model()
 
     def _setup_model(self) -> None:
+        if isinstance(self.observation_space, spaces.Dict):
+            raise ConfigError(
+                f"observation space {self.observation_space}: PPOBC does not support Dict; wrap the environment in "
+                "gymnasium.wrappers.FlattenObservation"
+            )
         super()._setup_model()
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
+        if self.use_sde and self.bc_loss == "nll" and self._ever_clones():
+            raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse' or 'huber'")
         self.bc_coef = FloatSchedule(self.bc_coef)
 
     def _excluded_save_params(self) -> list[str]:
@@ -158,6 +166,18 @@ class PPOBC(PPO):
         """Give the expert to a model that was loaded without one."""
         self.expert = expert
         self._labeller = None
+
+    def set_bc_coef(self, bc_coef: float) -> None:
+        """Weigh the cloning term with ``bc_coef`` from the next rollout on, instead of the schedule given before.
+
+        :raises ConfigError: a weight that is negative or not finite.
+        :raises ExpertError: a weight, and no expert.
+        """
+        if not 0.0 <= bc_coef < float("inf"):
+            raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
+        if bc_coef > 0.0 and self.expert is None:
+            raise ExpertError(f"bc_coef {bc_coef}: PPOBC needs an expert to clone, PPOBC(..., expert=PIDExpert())")
+        self._next_bc_coef = float(bc_coef)  # not now: the rollout that is under way was labelled, or not, by the old one
 
     def _current_bc_coef(self) -> float:
         return float(self.bc_coef(self._current_progress_remaining))  # type: ignore[operator]
@@ -176,6 +196,8 @@ class PPOBC(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
+        if self._next_bc_coef is not None:
+            self.bc_coef, self._next_bc_coef = FloatSchedule(self._next_bc_coef), None
         if self._labelling and self._labeller is not None and self._labeller.needs_state:
             observation: Any = self._last_obs
             self._labels = self._labeller.labels(observation)  # the first step's state, before it

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.errors import ConfigError
-from sb3_quad.training.config import build_config
+from sb3_quad.training.literals import parse_mapping
 from sb3_quad.training.runs import RunFolder, find_run, latest_checkpoint
 
 # Of the settings of an environment, those that a flight to be shown can have.
@@ -42,11 +42,22 @@ def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: 
         raise ConfigError(
             f"{path}: no such file; the run holds {', '.join(sorted(each.name for each in run.path.glob('*.zip')))}"
         )
-    settings, _ = run.read_yaml()
-    config = build_config(algo, env_id, settings, str(run.config))
-    if config.env_wrapper or config.vec_env_wrapper:
-        raise ConfigError(f"{run.path}: was trained behind wrappers, which enjoy does not put around the environment")
-    return Agent(f"{algo} {run.path.name}", path, {**config.env_kwargs, **config.eval_env_kwargs})
+    return Agent(f"{algo} {run.path.name}", path, _env_kwargs(run))
+
+
+def _env_kwargs(run: RunFolder) -> dict[str, Any]:
+    """What the run's agent is to be flown with.
+
+    :raises ConfigError: settings that cannot be read, or that put more around the environment than a flight to be shown has.
+    """
+    settings, arguments = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
+    if arguments.get("env_kwargs") is not None:
+        return parse_mapping(arguments["env_kwargs"], f"{run.arguments}: env_kwargs")
+    given = [parse_mapping(settings.get(key), f"{run.config}: {key}") for key in ("env_kwargs", "eval_env_kwargs")]
+    return {**given[0], **given[1]}
 
 
 def check_keywords(env_kwargs: dict[str, Any]) -> None:

@@ -109,25 +109,37 @@ def make_wrench(
 
 
 def fly_all(
-    controllers: Mapping[str, Any], setting: Setting, seed: int, n_timesteps: int | None, deterministic: bool
+    controllers: Mapping[str, Any],
+    setting: Setting,
+    seed: int,
+    n_timesteps: int | None,
+    deterministic: bool,
+    n_envs: int = 1,
 ) -> Iterator[list[Recording]]:
     """Episodes one after the other, each flown by all controllers.
 
     :param seed: of the first episode; the next has the next one.
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
-    :raises ConfigError: a number of steps below one, keywords that the environment refuses.
+    :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
+    :raises ConfigError: a number of steps or of episodes below one, keywords that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
     left = setting.n_steps if n_timesteps is None else n_timesteps
     if left < 1:
         raise ConfigError(f"--n-timesteps {left}: must be at least 1")
+    if n_envs < 1:
+        raise ConfigError(f"--n-envs {n_envs}: must be at least 1")
     number = 0
     while left > 0 and (number == 0 or n_timesteps is not None):
         steps = min(left, setting.n_steps)
-        episode = [_fly(setting, name, each, seed + number, steps, deterministic) for name, each in controllers.items()]
+        episode = [
+            _fly(setting, name if n_envs == 1 else f"seed {each}, {name}", controller, each, steps, deterministic)
+            for name, controller in controllers.items()
+            for each in range(seed + number, seed + number + n_envs)
+        ]
         yield episode
         left -= max(len(recording.times) - 1 for recording in episode)
-        number += 1
+        number += n_envs
 
 
 def _fly(setting: Setting, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:

@@ -9,6 +9,7 @@ vec_env               batch (default for this package's environments), dummy (de
 env_kwargs            keywords of the environment's constructor
 eval_env_kwargs       put over them in the evaluation's environments
 eval_tasks            further tasks to evaluate on, for the curves; the environment's own decides which model is best
+eval_expert           whether evaluations fly the expert too, once, for ``eval/reward_against_expert`` (false)
 policy                name of a policy, MlpPolicy by default
 policy_kwargs         mapping, or a string such as "dict(net_arch=[64, 64], activation_fn=nn.Tanh)"
 expert                pid, geometric, path/to/model.zip or package.module:factory, for algorithms that learn from one
@@ -41,8 +42,8 @@ from sb3_quad.training.values import convert, positive_whole, qualified_classes
 VEC_ENVS = ("batch", "dummy", "subproc")
 CONFIG_FOLDERS = ("geometric", "thesis")  # with further settings files, inside zoo_configs
 _JOB_KEYS = (
-    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "eval_tasks", "policy"),
-    *("policy_kwargs", "expert", "callback", "env_wrapper", "vec_env_wrapper", "normalize"),
+    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "eval_tasks", "eval_expert"),
+    *("policy", "policy_kwargs", "expert", "callback", "env_wrapper", "vec_env_wrapper", "normalize"),
 )
 _ENV_KEYS = ("env_kwargs", "eval_env_kwargs")
 # What env_kwargs may give to a quadcopter environment, batched or not.
@@ -63,6 +64,7 @@ class TrainingConfig:
     env_kwargs: dict[str, Any]
     eval_env_kwargs: dict[str, Any]
     eval_tasks: tuple[str, ...]
+    eval_expert: bool
     policy: str
     policy_kwargs: dict[str, Any]
     expert: Any
@@ -138,6 +140,10 @@ def build_config(
     learns = takes_expert(algorithm)
     if settings.get("expert") is not None and not learns:
         raise ConfigError(f"{at('expert')}: {algo} learns from no expert; leave it away")
+    if not isinstance(settings.get("eval_expert", False), bool):
+        raise ConfigError(f"{at('eval_expert')} is {settings['eval_expert']!r}, must be true or false")
+    if settings.get("eval_expert") and not learns:
+        raise ConfigError(f"{at('eval_expert')}: {algo} learns from no expert to compare with; leave it away")
     return TrainingConfig(
         algo=algo,
         env_id=env_id,
@@ -147,6 +153,7 @@ def build_config(
         env_kwargs=_env_kwargs(settings.get("env_kwargs"), env_id, at("env_kwargs")),
         eval_env_kwargs=_env_kwargs(settings.get("eval_env_kwargs"), env_id, at("eval_env_kwargs")),
         eval_tasks=_eval_tasks(settings.get("eval_tasks"), env_id, at("eval_tasks")),
+        eval_expert=settings.get("eval_expert", False),
         policy=_known(settings.get("policy", "MlpPolicy"), algorithm.policy_aliases, at("policy")),
         policy_kwargs=parse_mapping(settings.get("policy_kwargs"), at("policy_kwargs")),
         expert=settings.get("expert") or ("pid" if learns else None),
@@ -186,10 +193,10 @@ def config_names() -> list[str]:
     ]
 
 
-def read_yaml(text: str, where: str) -> Any:
+def read_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
     """:raises ConfigError: text that is not YAML, in one line."""
     try:
-        return yaml.safe_load(text)
+        return yaml.load(text, Loader=loader)
     except yaml.YAMLError as error:
         raise ConfigError(f"{where}: not valid YAML ({' '.join(str(error).split())})") from None
 

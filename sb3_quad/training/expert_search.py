@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from sb3_quad.dynamics.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.errors import ConfigError
 from sb3_quad.training.expert_objective import Cost, ExpertObjective
+from sb3_quad.training.study import open_study, require_optuna
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -45,7 +45,10 @@ class ExpertSearch:
     ) -> None:
         self.vehicle, self.first = vehicle, first
         self._sizes = {"starts": starts, "targets": targets, "seed": seed}
-        self.study = _study(journal, seed)
+        require_optuna("tune-expert")
+        from optuna.samplers import CmaEsSampler
+
+        self.study, _ = open_study("geometric_gains", journal, CmaEsSampler(seed=seed, popsize=16), "minimize")
         plain = vehicle.model_dump(mode="json", exclude={"geometric_gains"})
         settings = json.dumps([plain, first.model_dump(mode="json", exclude={"measured"}), self._sizes], sort_keys=True)
         known = self.study.user_attrs.get(SETTINGS)
@@ -111,29 +114,6 @@ class ExpertSearch:
     def _gains(self, values: dict[str, float]) -> GeometricGains:
         rounded = {name: float(f"{value:.4g}") for name, value in values.items()}
         return GeometricGains.model_validate({**self.first.model_dump(exclude={"measured"}), **rounded})
-
-
-def _study(journal: Path | None, seed: int) -> Study:
-    try:
-        import cmaes  # noqa: F401  (Optuna imports it only when it first samples)
-        import optuna
-        from optuna.storages import InMemoryStorage, JournalStorage
-        from optuna.storages.journal import JournalFileBackend
-    except ImportError as error:
-        raise ConfigError(f"tune-expert needs Optuna and cmaes ({error}): pip install 'sb3_quad[tune]'") from None
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        try:
-            if journal is not None:
-                journal.parent.mkdir(parents=True, exist_ok=True)
-            storage = InMemoryStorage() if journal is None else JournalStorage(JournalFileBackend(str(journal)))
-            sampler = optuna.samplers.CmaEsSampler(seed=seed, popsize=16)
-            return optuna.create_study(
-                storage=storage, sampler=sampler, study_name="geometric_gains", direction="minimize", load_if_exists=True
-            )
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise ConfigError(f"journal {journal}: cannot be used ({type(error).__name__}: {error})") from None
 
 
 def _completed(study: Study) -> list[Any]:

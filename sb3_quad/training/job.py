@@ -67,7 +67,7 @@ class TrainingJob:
         :raises ConfigError: an argument that no job has, or of another type.
         """
         names = {entry.name for entry in fields(TrainingJob)} - {"config"}
-        given = {key: value for key, value in arguments.items() if key not in ("algo", "env")}
+        given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs")}
         for key in given:
             if key not in names:
                 raise ConfigError(f"{where}: {unknown('argument', key, names)}")

@@ -10,7 +10,7 @@ rl_model_<N>_steps.zip      checkpoints (``--save-freq``)
 evaluations.npz             every evaluation, as SB3's EvalCallback writes it
 0.monitor.csv               every training episode, as SB3's Monitor writes it
 <Env>/config.yml            the settings
-<Env>/args.yml              the command line's arguments
+<Env>/args.yml              the command line's arguments; as env_kwargs what the agent is judged with, for rl_zoo3's enjoy
 resume.npz, dataset.npz     an interrupted run's random numbers, environments and dataset (``--resume``)
 ==========================  =========================================================================
 """
@@ -28,6 +28,7 @@ import yaml
 from sb3_quad.errors import ConfigError
 from sb3_quad.training.config import read_yaml
 from sb3_quad.training.files import write_text
+from sb3_quad.training.zoo_yaml import ZooLoader
 
 
 @dataclass(frozen=True)
@@ -89,14 +90,14 @@ class RunFolder:
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
     def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """config.yml and args.yml.
+        """config.yml and args.yml, also of a run of rl_zoo3's.
 
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
         contents = []
         for path in (self.config, self.arguments):
             try:
-                content = read_yaml(path.read_text(encoding="utf-8"), str(path))
+                content = read_yaml(path.read_text(encoding="utf-8"), str(path), ZooLoader)
             except (OSError, UnicodeDecodeError) as error:
                 raise ConfigError(f"{path}: cannot be read ({error})") from None
             if not isinstance(content, dict):

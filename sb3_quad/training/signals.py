@@ -13,7 +13,8 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 class StopSignals:
     """Within its ``with`` block, the first SIGINT or SIGTERM is only noted; a second one raises KeyboardInterrupt.
 
-    Outside the main thread, where Python allows no handlers, signals act as ever.
+    Outside the main thread, where Python allows no handlers, signals act as ever. Blocks may be nested: the outer one learns
+    of what the inner one received.
     """
 
     def __init__(self) -> None:
@@ -38,6 +39,9 @@ class StopSignals:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
+        outer = getattr(self._previous.get(self.received or 0), "__self__", None)
+        if isinstance(outer, StopSignals):
+            outer.received = self.received
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self.received is not None:

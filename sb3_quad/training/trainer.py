@@ -32,6 +32,7 @@ EVALUATION_SEED = 2**18  # added to the seed for the evaluations along the way; 
 FRESH_SEED = 2**19  # added to the seed for the figures at the end: episodes that nothing before has seen
 
 Report = Callable[[str], None]
+GoesOn = Callable[[float, float], bool]
 
 
 @dataclass(frozen=True)
@@ -51,11 +52,17 @@ class TrainingResult:
     exit_code: int = 0
 
 
-def train(job: TrainingJob, report: Report = print, started: Callable[[RunFolder], None] = lambda run: None) -> TrainingResult:
+def train(
+    job: TrainingJob,
+    report: Report = print,
+    started: Callable[[RunFolder], None] = lambda run: None,
+    goes_on: GoesOn = lambda success, reward: True,
+) -> TrainingResult:
     """Train as ``job`` says, in a run folder of its own.
 
     :param report: told of each event in one line.
     :param started: told of the run folder before the training begins.
+    :param goes_on: asked after each evaluation, with its success rate and mean reward, whether the training goes on.
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
@@ -64,9 +71,9 @@ def train(job: TrainingJob, report: Report = print, started: Callable[[RunFolder
         if job.trained_agent is not None:
             hand_over(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
-        run.write_yaml(config.settings, job.arguments())
+        run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": for_evaluation(job).env_kwargs})
         started(run)
-        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps)
+        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps, goes_on)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -160,8 +167,9 @@ def _learn(
     signals: StopSignals,
     report: Report,
     timesteps: int,
+    goes_on: GoesOn = lambda success, reward: True,
 ) -> TrainingResult:
-    callbacks, last_good, best = _callbacks(job, run, eval_envs, signals, report)
+    callbacks, last_good, best = _callbacks(job, run, model, eval_envs, signals, report, goes_on)
     start = time.perf_counter()
     try:
         model.learn(
@@ -172,7 +180,7 @@ def _learn(
             reset_num_timesteps=model.num_timesteps == 0,
             progress_bar=job.progress,
         )
-        if best is not None and signals.received is None:
+        if best is not None and signals.received is None and not best.stopped:
             best.evaluate()
     except (Exception, KeyboardInterrupt) as error:
         if signals.received is None:
@@ -215,7 +223,13 @@ def _finite(model: OnPolicyAlgorithm) -> bool:
 
 
 def _callbacks(
-    job: TrainingJob, run: RunFolder, eval_envs: dict[str | None, VecEnv], signals: StopSignals, report: Report
+    job: TrainingJob,
+    run: RunFolder,
+    model: OnPolicyAlgorithm,
+    eval_envs: dict[str | None, VecEnv],
+    signals: StopSignals,
+    report: Report,
+    goes_on: GoesOn,
 ) -> tuple[list[BaseCallback], LastGoodModel, BestModel | None]:
     from sb3_quad.callbacks.best_model import BestModel
     from sb3_quad.callbacks.checkpoint import Checkpoint
@@ -230,7 +244,9 @@ def _callbacks(
         every = job.eval_freq if job.eval_freq > 0 else 2**62
         seed = job.seed + EVALUATION_SEED
         others = {task: env for task, env in eval_envs.items() if task is not None}
-        best = BestModel(eval_envs[None], every, job.eval_episodes, seed, run.best_model, run.evaluations, report, others)
+        expert = getattr(model, "expert", None) if job.config.eval_expert else None
+        files = run.best_model, run.evaluations
+        best = BestModel(eval_envs[None], every, job.eval_episodes, seed, *files, report, others, expert, goes_on)
         callbacks.append(best)
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))

@@ -45,11 +45,17 @@ def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
         return value
     if not math.isfinite(value):
         raise ConfigError(f"{where} is {value}, must be finite")
-    if numeric == {"int"} and not kinds & {"Schedule", "Any"}:
+    if takes_whole(parameter):
         if value != int(value):
             raise ConfigError(f"{where} is {value}, must be a whole number")
         return int(value)
     return value
+
+
+def takes_whole(parameter: inspect.Parameter) -> bool:
+    """Whether a constructor's parameter takes whole numbers and no other."""
+    kinds = _kinds(parameter)
+    return kinds & {"int", "float"} == {"int"} and not kinds & {"Schedule", "Any"}
 
 
 def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:

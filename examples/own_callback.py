@@ -1,0 +1,46 @@
+"""A callback of one's own, and a schedule that follows what it logs: the expert flies less as crashes get rare.
+
+    python examples/own_callback.py
+
+The callbacks that come with sb3_quad: docs/callbacks.md.
+"""
+
+import argparse
+
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_quad import DAgger, GeometricExpert
+from sb3_quad.callbacks import CoefficientSchedule, ObservationStatistics
+from sb3_quad.envs import QuadcopterVecEnv
+
+
+class CrashRate(BaseCallback):
+    """Logs the share of the episodes that ended on the ground, rollout by rollout."""
+
+    def _on_rollout_start(self):
+        self.episodes = self.crashes = 0
+
+    def _on_step(self):
+        for info in self.locals["infos"]:  # empty but where an episode ends
+            if "collision" in info:
+                self.episodes += 1
+                self.crashes += info["collision"]
+        return True  # False would end the training
+
+    def _on_rollout_end(self):
+        if self.episodes:
+            self.logger.record("my/crash_rate", self.crashes / self.episodes)
+            print(f"{self.num_timesteps:>9,} transitions: {self.crashes} of {self.episodes} episodes crashed, "
+                  f"beta {self.model.current_beta:.2f}")  # fmt: skip
+
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+arguments = parser.parse_args()
+
+env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=300, seed=0)
+model = DAgger("MlpPolicy", env, GeometricExpert(), n_steps=125, batch_size=4096, gradient_steps=30, n_epochs=2,
+               learning_rate=2e-3, seed=0, device="cpu")  # fmt: skip
+less_expert = CoefficientSchedule("beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05))
+sigma = ObservationStatistics(verbose=1)  # prints what Table A.2 of the thesis rounds
+model.learn(arguments.timesteps, callback=[CrashRate(), less_expert, sigma])

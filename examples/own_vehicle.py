@@ -1,0 +1,33 @@
+"""A vehicle of one's own: its parameters in a YAML file; the experts derive their gains, an agent learns to fly it.
+
+    python examples/own_vehicle.py
+    python examples/own_vehicle.py --vehicle path/to/yours.yaml
+
+The same by command: `sb3-quad train --env-kwargs vehicle:examples/my_quadcopter.yaml`.
+"""
+
+import argparse
+from pathlib import Path
+
+from sb3_quad import DAgger, GeometricExpert, PIDExpert
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
+
+parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+parser.add_argument("--vehicle", default=str(Path(__file__).with_name("my_quadcopter.yaml")), help="a name or a YAML file")
+parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+arguments = parser.parse_args()
+
+vehicle = load_vehicle(arguments.vehicle)  # checked: a value that no vehicle can have is refused with its name
+low, high = vehicle.thrust_range
+print(f"{vehicle.name}: rotors from {low:.2f} to {high:.2f} N, hover at {vehicle.hover_rotor_speed:.0f} rad/s")
+
+expert = GeometricExpert(vehicle)
+env = QuadcopterVecEnv(240, task="state_recovery", vehicle=vehicle, max_episode_steps=500, seed=0)
+model = DAgger("MlpPolicy", env, expert, n_steps=125, batch_size=4096, gradient_steps=30, n_epochs=2,
+               learning_rate=2e-3, seed=0, device="cpu")  # fmt: skip
+model.learn(arguments.timesteps)
+for name, controller in (("PID", PIDExpert(vehicle)), ("geometric", expert), ("agent", model)):
+    flights = fly(controller, "state_recovery", n_episodes=48, seed=1_000_000, vehicle=vehicle, max_steps=500)
+    print(f"{name}: recovers {flights.success.mean():.1%}")

@@ -1,0 +1,41 @@
+"""One agent and its expert in a table."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from sb3_quad.training.job import TrainingJob
+
+FRESH_EPISODES = 240
+THESIS_VEHICLE = "itm"
+
+
+def agent_and_expert(job: TrainingJob, model: Any) -> Table:
+    """The table of the agent of a job and of its expert over the same episodes, which no training has seen.
+
+    The thesis's figures stand beside those of its own vehicle only.
+
+    :param job: of an environment of this package.
+    """
+    from sb3_quad.evaluation.summary import fly_all
+    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
+    from sb3_quad.experts.resolve import resolve_expert
+    from sb3_quad.scenarios.load import load_suite
+    from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
+
+    config = for_evaluation(job)
+    given = config.env_kwargs
+    keywords: dict[str, Any] = {key: given[key] for key in ("vehicle", "noise", "task_kwargs") if key in given}
+    if "max_episode_steps" in given:
+        keywords["max_steps"] = given["max_episode_steps"]
+    expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
+    pilots = {"agent": model, "expert": expert}
+    columns = fly_all(pilots, config.task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
+    agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
+    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[str(config.task)])
+    title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
+    beside = (agent, "expert") if keywords.get("vehicle", THESIS_VEHICLE) == THESIS_VEHICLE else ()
+    return comparison(title, columns, scenario, beside)

@@ -1,0 +1,26 @@
+"""Bridge to rl_zoo3: importing this makes our algorithms, settings files and batched environment known to it.
+
+Extra ``[zoo]``. In the same process, rl_zoo3's ``train`` and ``enjoy`` then take ``--algo dagger`` and ``--algo ppo_bc``::
+
+    import sb3_quad.zoo
+    from rl_zoo3.train import train
+
+On the command line, ``python -m sb3_quad.zoo train …`` is ``rl_zoo3 train …`` with this import before it. For the plain
+command, rl_zoo3 itself imports a module ``custom_envs`` if there is one: a file ``custom_envs.py`` that holds
+``import sb3_quad.zoo``, in a folder on ``PYTHONPATH``, is enough.
+
+Never imported by the rest of this package: rl_zoo3 replaces Gymnasium's ``TimeLimit`` when it is imported.
+
+:raises ImportError: rl_zoo3 is not installed.
+"""
+
+from __future__ import annotations
+
+try:
+    import rl_zoo3  # noqa: F401
+except ImportError as error:
+    raise ImportError(f"rl_zoo3 cannot be imported ({error}); install it by: pip install 'sb3_quad[zoo]'") from error
+
+from sb3_quad.zoo.registration import register
+
+register()

@@ -1,0 +1,55 @@
+"""Every public callback shows how it is used, and the example does what it says."""
+
+from __future__ import annotations
+
+import doctest
+import importlib
+import re
+from pathlib import Path
+
+import pytest
+
+from sb3_quad import callbacks
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_every_callback_is_public():
+    modules = [path.stem for path in (ROOT / "callbacks").glob("*.py") if path.stem != "__init__"]
+    for module in modules:
+        text = (ROOT / "callbacks" / f"{module}.py").read_text(encoding="utf-8")
+        assert set(re.findall(r"^class (\w+)\(BaseCallback\)", text, flags=re.MULTILINE)) <= set(callbacks.__all__)
+
+
+@pytest.mark.parametrize("name", callbacks.__all__)
+def test_the_example_runs(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    callback = getattr(callbacks, name)
+    (test,) = doctest.DocTestFinder(recurse=False).find(callback, name, globs={name: callback, "Path": Path})
+    assert [example for example in test.examples if "model.learn(" in example.source], "shows no training"
+    assert not [example for example in test.examples if example.options.get(doctest.SKIP)]
+    report: list[str] = []
+    doctest.DocTestRunner().run(test, out=report.append)
+    assert not report, "".join(report)
+
+
+def test_the_page_lists_every_callback_and_its_settings_are_read():
+    from sb3_quad.training.config import build_config, read_yaml
+    from sb3_quad.training.values import import_class
+
+    page = (ROOT / "docs" / "callbacks.md").read_text(encoding="utf-8")
+    assert set(callbacks.__all__) <= set(re.findall(r"^\| `(\w+)`", page, flags=re.MULTILINE))
+    blocks = [read_yaml(text, "page") for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)]
+    settings = {"n_timesteps": 100, **blocks[0]}
+    config = build_config("ppo_bc", "QuadStateRecovery-v0", settings)
+    assert config.callback
+    for path, keywords in config.callback:
+        import_class(path, "callback")(**keywords)
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "callbacks").glob("*.py")))
+def test_no_callback_needs_the_imitation_package(name):
+    module = "sb3_quad.callbacks" if name == "__init__" else f"sb3_quad.callbacks.{name}"
+    importlib.import_module(module)
+    text = (ROOT / "callbacks" / f"{name}.py").read_text(encoding="utf-8")
+    assert not re.search(r"^\s*(import|from) imitation", text, flags=re.MULTILINE)

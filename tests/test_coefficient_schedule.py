@@ -1,0 +1,188 @@
+"""CoefficientSchedule: where the coefficient is, for any course of what it follows, and what it leaves in the model."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_quad import PPOBC, DAgger, PIDExpert
+from sb3_quad.callbacks import CoefficientSchedule
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError, ExpertError
+from sb3_quad.training.config import build_config
+from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.trainer import train
+from sb3_quad.training.values import import_class, qualified_classes
+
+NUMBER = st.floats(-1e3, 1e3)
+
+
+def make(algorithm, **kwargs):
+    env = QuadcopterVecEnv(2, max_episode_steps=10, seed=0)
+    size = {"learning_starts": 5, "batch_size": 4} if algorithm is SAC else {"n_steps": 10, "batch_size": 20, "n_epochs": 1}
+    expert = {} if algorithm in (PPO, SAC) else {"expert": PIDExpert()}
+    policy_kwargs = {"net_arch": [4]}
+    return algorithm("MlpPolicy", env, **{**size, **expert, **kwargs}, policy_kwargs=policy_kwargs, seed=0, device="cpu")
+
+
+class Course(BaseCallback):
+    """Logs a metric of a given course, one number a rollout, and notes the coefficient each rollout is flown with."""
+
+    def __init__(self, course, read):
+        super().__init__()
+        self.course, self.read, self.seen = iter(course), read, []
+
+    def _on_rollout_start(self):
+        self.seen.append(self.read(self.model))
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        value = next(self.course)
+        if value is not None:
+            self.logger.record("my/metric", value)
+
+
+@given(start=NUMBER, final=NUMBER, first=NUMBER, last=NUMBER, measured=NUMBER)
+def test_the_coefficient_is_linear_between_its_ends_and_constant_beyond(start, final, first, last, measured):
+    if first == last:
+        with pytest.raises(ConfigError, match="must differ"):
+            CoefficientSchedule("beta", start, final, between=(first, last))
+        return
+    schedule = CoefficientSchedule("beta", start, final, between=(first, last))
+    expected = np.interp(measured, *((first, last), (start, final)) if first < last else ((last, first), (final, start)))
+    assert schedule.value_at(measured) == pytest.approx(expected, rel=1e-6, abs=1e-6)
+
+
+@pytest.mark.parametrize(("one_way", "last"), [(True, 0.25), (False, 0.75)])
+def test_beta_follows_a_metric_from_the_next_rollout_on(one_way, last):
+    model = make(DAgger, beta=0.5, beta_decay=0.1, beta_final=0.2)
+    schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="my/metric", between=(10.0, 14.0), one_way=one_way)
+    course = Course([None, 12.0, float("nan"), 13.0, 11.0, 11.0], lambda model: model.current_beta)
+    model.learn(120, callback=[course, schedule])
+    assert course.seen == [1.0, 1.0, 0.5, 0.5, 0.25, last]
+    assert model.current_beta == last
+
+
+def test_the_cloning_weight_can_rise_from_nothing_and_every_cloned_row_is_labelled():
+    model = make(PPOBC, bc_coef=0.0, bc_loss="mse")
+    schedule = CoefficientSchedule("bc_coef", 0.0, 1.0, follow="my/metric")
+    course = Course([0.0, 0.5, 1.0, 1.0], lambda model: model._current_bc_coef())
+    losses = []
+
+    class Note(BaseCallback):
+        def _on_step(self):
+            return True
+
+        def _on_rollout_end(self):
+            losses.append((model._current_bc_coef(), np.abs(model.rollout_buffer.expert_actions).sum(axis=2).min()))
+
+    model.learn(80, callback=[course, schedule, Note()])
+    assert course.seen == [0.0, 0.0, 0.5, 1.0]
+    assert [(weight > 0.0) == (label > 0.0) for weight, label in losses] == [True] * 4
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "name", "kwargs", "read"),
+    [
+        (PPO, "ent_coef", {"ent_coef": 0.1}, lambda model: model.ent_coef),
+        (PPO, "clip_range", {}, lambda model: model.clip_range(1.0)),
+        (PPO, "learning_rate", {}, lambda model: model.policy.optimizer.param_groups[0]["lr"]),
+        (SAC, "tau", {}, lambda model: model.tau),
+        (DAgger, "ent_coef", {"ent_coef": 0.1}, lambda model: model.ent_coef),
+    ],
+)
+def test_any_algorithms_coefficients_follow_the_progress(algorithm, name, kwargs, read):
+    model = make(algorithm, **kwargs)
+    model.learn(40, callback=CoefficientSchedule(name, 0.5, 0.25))
+    assert read(model) == pytest.approx(0.25, abs=1e-9)
+
+
+def test_a_training_that_goes_on_starts_where_it_stopped(tmp_path):
+    model = make(DAgger)
+    model.learn(40, callback=[Course([0.5, 0.5], lambda model: 0), CoefficientSchedule("beta", 1.0, 0.0, "my/metric")])
+    assert model.current_beta == 0.5
+    model.save(tmp_path / "model.zip")
+    again = DAgger.load(tmp_path / "model.zip", env=model.env, expert=PIDExpert())
+    course = Course([None, 0.75], lambda model: model.current_beta)
+    again.learn(40, callback=[course, CoefficientSchedule("beta", 1.0, 0.0, "my/metric")], reset_num_timesteps=False)
+    assert course.seen == [0.5, 0.5] and again.current_beta == 0.25
+
+
+def test_stock_sb3_loads_what_was_trained_with_a_schedule(tmp_path):
+    model = make(PPOBC, bc_coef=1.0)
+    model.learn(40, callback=CoefficientSchedule("bc_coef", 1.0, 0.0))
+    model.save(tmp_path / "model.zip")
+    code = """
+import json, sys
+sys.modules["sb3_quad"] = None
+from stable_baselines3 import PPO
+print(json.dumps(PPO.load(sys.argv[1], device="cpu").num_timesteps))
+"""
+    command = [sys.executable, "-W", "error", "-c", code, str(tmp_path / "model.zip")]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert result.returncode == 0, result.stderr
+    assert json.loads(result.stdout) == 40
+
+
+def test_a_configuration_file_can_name_it():
+    settings = {"coefficient": "beta", "start": "1e0", "final": 0, "follow": "rollout/success_rate", "between": [0.5, 0.9]}
+    ((path, keywords),) = qualified_classes([{"sb3_quad.callbacks.CoefficientSchedule": settings}], "callback")
+    schedule = import_class(path, "callback")(**keywords)
+    assert schedule.value_at(0.7) == pytest.approx(0.5)
+
+
+def test_a_run_of_a_configuration_file_follows_the_reward_against_the_expert(tmp_path):
+    schedule = {"coefficient": "beta", "start": 1.0, "final": 0.25, "follow": "eval/reward_against_expert"}
+    settings = {
+        "n_timesteps": 400,
+        "n_envs": 8,
+        "n_steps": 25,
+        "batch_size": 100,
+        "n_epochs": 1,
+        "eval_expert": True,
+        "env_kwargs": {"max_episode_steps": 20},
+        "callback": [{"sb3_quad.callbacks.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
+    }
+    config = build_config("dagger", "QuadTargetTracking-v0", settings)
+    result = train(TrainingJob(config, str(tmp_path), eval_freq=200, eval_episodes=2), report=lambda line: None)
+    assert result.model.current_beta == 0.25
+    for wrong, message in (("yes", "true or false"), (True, "learns from no expert")):
+        with pytest.raises(ConfigError, match=message):
+            build_config("ppo", "QuadTargetTracking-v0", {"n_timesteps": 1, "eval_expert": wrong})
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "arguments", "message"),
+    [
+        (DAgger, ("bta", 1.0, 0.0), "did you mean 'beta'"),
+        (DAgger, ("beta", 1.0, -0.5), "a probability"),
+        (DAgger, ("n_steps", 1.0, 0.0), "n_steps of DAgger is 10, which is no float"),
+        (PPO, ("bc_coef", 1.0, 0.0), "unknown coefficient of PPO 'bc_coef'"),
+        (PPOBC, ("bc_coef", 1.0, -1.0), "at least 0"),
+    ],
+)
+def test_what_cannot_be_set_is_refused_when_training_begins(algorithm, arguments, message):
+    model = make(algorithm)
+    with pytest.raises(ConfigError, match=message):
+        model.learn(20, callback=CoefficientSchedule(*arguments))
+    assert model.num_timesteps == 0
+
+
+def test_cloning_needs_an_expert():
+    with pytest.raises(ExpertError, match="needs an expert"):
+        make(PPOBC, expert=None, bc_coef=0.0).learn(20, callback=CoefficientSchedule("bc_coef", 0.0, 1.0))
+
+
+def test_a_metric_that_is_never_logged_is_warned_about():
+    with pytest.warns(UserWarning, match="did you mean 'rollout/success_rate'"):
+        make(DAgger).learn(40, callback=CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/succes_rate"))

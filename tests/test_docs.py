@@ -1,0 +1,143 @@
+"""The Python of the README and of docs/ runs as it stands there."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+import sb3_quad
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.resolve import resolve_expert
+
+ROOT = Path(__file__).resolve().parent.parent
+ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or by what it is
+    ("docs/evaluate.md", 0): "reads the folder of a whole evaluation",
+    ("docs/experts.md", 0): "flies 13,440 episodes",
+    ("docs/experts.md", 1): "a module, flown below",
+    ("docs/export.md", 0): "tests/test_export.py",
+    ("docs/export.md", 1): "tests/test_export.py",
+}
+
+
+def python_blocks(page: str) -> list[str]:
+    """The code of a page's Python blocks, in order, each on the lines that it has in the page."""
+    text = (ROOT / page).read_text(encoding="utf-8")
+    found = re.finditer(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    return ["\n" * text.count("\n", 0, match.start(1)) + match.group(1) for match in found]
+
+
+NAMES = ["README.md", *sorted(f"docs/{path.name}" for path in ROOT.glob("docs/*.md"))]
+PAGES = {page: python_blocks(page) for page in NAMES}
+
+
+TO_RUN = [page for page, blocks in PAGES.items() if any((page, number) not in ELSEWHERE for number in range(len(blocks)))]
+
+
+def run(page: str) -> dict[str, object]:
+    """Run a page's blocks in order, in one namespace, in the present folder; the namespace."""
+    scope: dict[str, object] = {"__name__": page}
+    for number, code in enumerate(PAGES[page]):
+        if (page, number) not in ELSEWHERE:
+            exec(compile(code, str(ROOT / page), "exec"), scope)
+    return scope
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def shorten_trainings(monkeypatch):
+    """Trainings end after their first rollout."""
+    learn = OnPolicyAlgorithm.learn
+
+    def short(self, total_timesteps, *args, **kwargs):
+        return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args, **{**kwargs, "progress_bar": False})
+
+    monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
+
+
+def check_readme(scope):
+    assert scope["info"].keys() >= {"is_success", "distance"}
+    assert PPO.load("agent.zip", device="cpu").num_timesteps == 240 * 250
+
+
+def check_dagger(scope):
+    assert scope["agent"] > scope["expert"] - 1.0  # mean rewards of 48 episodes
+    assert len(scope["model"].dataset) == scope["model"].num_timesteps
+
+
+def check_ppo_bc(scope):
+    assert scope["after"] > -6.0  # mean reward of 48 recoveries; one that crashes costs a third of a point
+    first, last = (PPO.load(path, device="cpu").policy.state_dict()["action_net.weight"] for path in scope["zips"])
+    assert not np.array_equal(first, last)
+
+
+def check_dynamics(scope):
+    assert len(scope["difference"]) == 5 and 0.0 < max(scope["difference"].values()) < 1e-9
+    assert scope["observed"] < 1e-6 and scope["fastest"] > 20.0
+
+
+CHECKS = {
+    "README.md": check_readme,
+    "docs/dagger.md": check_dagger,
+    "docs/dynamics.md": check_dynamics,
+    "docs/ppo_bc.md": check_ppo_bc,
+}
+
+
+@pytest.mark.parametrize("page", TO_RUN)
+def test_a_page_runs(page, folder, monkeypatch):
+    if page == "README.md":
+        shorten_trainings(monkeypatch)
+        agent = folder / "logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip"
+        agent.parent.mkdir(parents=True)
+        shutil.copy(sb3_quad.pretrained("itm-recovery"), agent)
+    scope = run(page)
+    if page in CHECKS:
+        CHECKS[page](scope)
+
+
+def test_exceptions_and_checks_belong_to_pages():
+    for page, blocks in PAGES.items():
+        for code in blocks:
+            compile(code, page, "exec")
+    assert all(number < len(PAGES.get(page, ())) for page, number in ELSEWHERE)
+    assert CHECKS.keys() <= set(TO_RUN)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_links_lead_to_files_and_headings(page):
+    text = re.sub(r"^```.*?^```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\((?!https?:)([^)]+)\)", text):
+        file, _, heading = target.partition("#")
+        path = (ROOT / page).parent / file if file else ROOT / page
+        assert path.exists(), target
+        if heading:
+            titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
+            assert heading in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
+
+
+@pytest.fixture
+def module_folder(folder, monkeypatch):
+    (folder / "my_experts.py").write_text(PAGES["docs/experts.md"][1])
+    monkeypatch.syspath_prepend(str(folder))
+    yield folder
+    sys.modules.pop("my_experts", None)
+
+
+def test_the_worked_expert_flies_to_targets(module_folder):
+    expert = resolve_expert("my_experts:lqr", "itm")
+    flights = fly(expert, "target_tracking", 96, 5)
+    assert flights.success.all() and np.isfinite(flights.time_to[0.1]).all()
+    assert flights.final_error.max() < 0.02
+    noisy = fly(lambda observation: expert.predict(observation)[0], "target_tracking", 16, 5)
+    assert noisy.success.all()

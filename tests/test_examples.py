@@ -1,0 +1,68 @@
+"""The scripts in examples/, run as a newcomer would run them, but for a short while."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from stable_baselines3 import PPO
+
+from sb3_quad.training.literals import parse_number
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+SHORT = ("--timesteps", "100")  # a single rollout
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def run_script(name, *arguments):
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run_script
+
+
+def test_every_script_is_run_here_and_says_how_it_is_started():
+    tests = Path(__file__).read_text(encoding="utf-8")
+    for path in EXAMPLES.glob("*.py"):
+        assert f'"{path.name}"' in tests
+        assert f"python examples/{path.name}" in path.read_text(encoding="utf-8")
+
+
+def test_imitation_then_stage_two_then_stock_sb3(run, tmp_path):
+    assert "agent: " in run("train_dagger.py", *SHORT)
+    output = run("train_ppo_bc.py", "dagger.zip", *SHORT)
+    assert "tracking: success" in output and "saved to ppo_bc.zip" in output
+    assert (tmp_path / "best_model.zip").is_file() and (tmp_path / "evaluations_tracking.npz").is_file()
+    first, second = (PPO.load(name, device="cpu").policy.state_dict() for name in ("dagger.zip", "ppo_bc.zip"))
+    # One rollout of stage two only warms up the critic: the actor is the one that was handed over.
+    assert np.array_equal(first["action_net.weight"], second["action_net.weight"])
+    assert not np.array_equal(first["value_net.weight"], second["value_net.weight"])
+    flown = run("load_in_plain_sb3.py", "ppo_bc.zip", "--episodes", "2")
+    assert flown.count("from the target at the end") == 2
+
+
+@pytest.mark.parametrize("name", ["own_expert.py", "own_vehicle.py"])
+def test_own_experts_and_vehicles_recover(run, name):
+    output = run(name, *SHORT)
+    shares = dict(line.split(": recovers ") for line in output.splitlines() if ": recovers " in line)
+    percent = {key: parse_number(share.removesuffix("%")) for key, share in shares.items()}
+    teacher = percent["own expert" if name == "own_expert.py" else "geometric"]
+    assert teacher > 90.0 and teacher > percent["PID"] and "agent" in percent
+
+
+def test_own_reward(run):
+    output = run("own_reward.py", *SHORT)
+    before, after = (float(line.rsplit(" ", 1)[1]) for line in output.splitlines())
+    assert before != after
+
+
+def test_own_callback(run):
+    output = run("own_callback.py", "--timesteps", "100000")  # the first episodes end in the third rollout
+    assert "episodes crashed, beta 0.80" in output and "Table A.2" in output

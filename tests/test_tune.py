@@ -1,0 +1,300 @@
+"""The search for hyperparameters: trials that are trainings, in a study that is shared, resumed and never lost."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import optuna
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_quad.cli import main
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.config import build_config, load_config
+from sb3_quad.tuning import search as search_module
+from sb3_quad.tuning.search import score
+from sb3_quad.tuning.space import load_space
+
+ENV = "QuadTargetTracking-v0"
+SMALL = {
+    "n_timesteps": 800,
+    "n_envs": 8,
+    "n_steps": 50,
+    "batch_size": 100,
+    "learning_rate": "lin_1e-3",
+    "dataset_capacity": 2000,
+    "policy_kwargs": "dict(net_arch=[8])",
+    "env_kwargs": {"max_episode_steps": 60},
+}
+SPACE = {"learning_rate": {"around": 4}, "bc_loss": ["mse", "huber"], "policy_kwargs.log_std_init": {"low": -3, "high": 0}}
+FEW = ["--eval-episodes", "4", "--n-evaluations", "2", "--no-progress", "--sampler", "random"]
+
+
+@pytest.fixture
+def command(tmp_path, monkeypatch):
+    """A search in an empty folder, of a few hundred transitions a trial; the settings and the space are files there."""
+    monkeypatch.chdir(tmp_path)
+    Path("small.yml").write_text(yaml.safe_dump({ENV: SMALL}))
+    Path("space.yml").write_text(yaml.safe_dump(SPACE))
+    return ["tune", "--algo", "dagger", "--conf-file", "small.yml", "--search-space", "space.yml", *FEW]
+
+
+def folder(number=1):
+    return Path("logs", "tune", "dagger", f"{ENV}_{number}")
+
+
+def trials(number=1):
+    with (folder(number) / "trials.csv").open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def one_line_of_error(capsys):
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("sb3_quad: compiling")]
+    assert len(lines) == 1 and lines[0].startswith("error: "), lines
+    return lines[0]
+
+
+VARIED = ("learning_rate", "bc_loss", "policy_kwargs.log_std_init")
+
+
+def varied(row):
+    return tuple(row[name] for name in VARIED)
+
+
+def test_a_search_leaves_settings_that_train_takes_and_goes_on_where_it_was_left(command, capsys):
+    assert main([*command, "--n-trials", "2", "--seed", "3"]) == 0
+    output = capsys.readouterr().out
+    assert "2 finished" in output and "fresh episodes" in output and str(folder() / "best.yml") in output
+    files = {path.name for path in folder().iterdir()}
+    assert files == {"best.yml", "trials.csv", "trials.png", "study.log", "dagger"}
+
+    rows = trials()
+    assert [row["state"] for row in rows] == ["COMPLETE"] * 2 and [row["evaluations"] for row in rows] == ["2"] * 2
+    best = max(rows, key=lambda row: float(row["value"]))
+    content = yaml.safe_load((folder() / "best.yml").read_text())[ENV]
+    assert content["learning_rate"] == best["learning_rate"] and content["learning_rate"].startswith("lin_")
+    assert len(content["learning_rate"]) <= len("lin_0.0001234")
+    assert str(content["policy_kwargs"]["log_std_init"]) == best["policy_kwargs.log_std_init"]
+    assert content["policy_kwargs"]["net_arch"] == [8] and content["n_timesteps"] == 800
+    assert PPO.load(Path(best["run"]) / f"{ENV}.zip").num_timesteps == 800
+    with np.load(Path(best["run"]) / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [408, 800]
+        assert float(best["value"]) == score(file["successes"][-1].mean(), file["results"][-1].mean(), 4)
+
+    assert main(["train", "--algo", "dagger", "--conf-file", str(folder() / "best.yml"), "--eval-episodes", "0"]) == 0
+    trained = PPO.load(Path("logs", "dagger", f"{ENV}_1", f"{ENV}.zip"))
+    assert trained.policy.net_arch == [8] and trained.policy_kwargs["log_std_init"] == content["policy_kwargs"]["log_std_init"]
+
+    before = {path: path.read_bytes() for path in folder().rglob("*") if path.is_file() and path.name != "study.log"}
+    resumed = [*command, "--n-trials", "1", "--seed", "3", "--storage", str(folder() / "study.log")]
+    assert main(resumed) == 0
+    assert main([*command, "--n-trials", "3", "--seed", "3"]) == 0
+    assert all(path.read_bytes() == content for path, content in before.items())
+    assert [varied(row) for row in trials(2)] == [varied(row) for row in trials(3)]  # as if it had never been left
+    assert [row["value"] for row in trials(2)] == [row["value"] for row in trials(3)]
+    assert len({varied(row) for row in trials(3)}) == 3
+
+    capsys.readouterr()
+    assert main([*resumed, "--n-evaluations", "3", "--hyperparams", "n_epochs:2"]) == 2
+    error = one_line_of_error(capsys)
+    assert "n_epochs, n_evaluations" in error and "--study-name" in error
+    assert not folder(4).exists()
+
+
+def test_the_first_trial_has_the_settings_as_they_are(command):
+    settings = {**SMALL, "policy_kwargs": "dict(net_arch=[8], log_std_init=-1.5)", "bc_loss": "huber"}
+    Path("small.yml").write_text(yaml.safe_dump({ENV: settings}))
+    assert main([*command, "--n-trials", "1"]) == 0
+    assert varied(trials()[0]) == ("lin_0.001", "huber", "-1.5")
+
+
+def test_two_processes_share_a_study(command):
+    shared = [*command, "--n-trials", "2", "--storage", "shared.log"]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent.parent)}
+    arguments = [sys.executable, "-m", "sb3_quad.cli", *shared]
+    other = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    assert main(shared) == 0
+    output, errors = other.communicate(timeout=120)
+    assert other.returncode == 0, errors
+    assert "Traceback" not in errors and "saved in" in output
+    rows = max((trials(number) for number in (1, 2)), key=len)  # of whoever ended last
+    assert [int(row["number"]) for row in rows] == [0, 1, 2, 3]
+    assert len({varied(row) for row in rows}) == 4
+    assert len({row["run"] for row in rows}) == 4
+    assert main([*command, "--max-total-trials", "5", "--storage", "shared.log"]) == 0
+    assert len(trials(3)) == 5
+
+
+def test_pruned_trials_end_early_and_are_never_the_best(command, monkeypatch, capsys):
+    monkeypatch.setattr(search_module, "make_pruner", lambda *arguments: optuna.pruners.ThresholdPruner(lower=10.0))
+    assert main([*command, "--n-trials", "2"]) == 0
+    assert "pruned after 1 evaluations" in capsys.readouterr().out
+    rows = trials()
+    assert [(row["state"], row["evaluations"], row["value"]) for row in rows] == [("PRUNED", "1", "")] * 2
+    assert PPO.load(Path(rows[0]["run"]) / f"{ENV}.zip").num_timesteps == 408
+    assert not (folder() / "best.yml").exists()
+
+
+def test_a_trial_that_fails_is_told_and_the_others_go_on(command, capsys):
+    Path("space.yml").write_text(yaml.safe_dump({**SPACE, "batch_size": [100, 0]}))
+    assert main([*command, "--n-trials", "5", "--seed", "1"]) == 0
+    output, rows = capsys.readouterr().out, trials()
+    failed = [row for row in rows if row["state"] == "FAIL"]
+    assert failed and len(failed) < 5
+    assert all(row["batch_size"] == "0" and "batch_size 0" in row["error"] for row in failed)
+    assert all(row["state"] == "COMPLETE" for row in rows if row["batch_size"] == "100")
+    assert f"trial {failed[0]['number']} failed: ConfigError: batch_size 0" in output
+    assert f"{len(failed)} failed" in output
+
+    Path("space.yml").write_text(yaml.safe_dump({"batch_size": [0, -1]}))
+    capsys.readouterr()
+    assert main([*command, "--study-name", "hopeless"]) == 2
+    assert "the first 5 trials failed" in one_line_of_error(capsys)
+    assert len(trials(2)) == 5
+
+
+class InterruptSecond(BaseCallback):
+    """Sends this process Ctrl-C in the second training that it is part of."""
+
+    made = 0
+
+    def __init__(self) -> None:
+        super().__init__()
+        InterruptSecond.made += 1
+        self.number = InterruptSecond.made
+
+    def _on_step(self) -> bool:
+        if self.number == 2 and self.num_timesteps == 600:
+            os.kill(os.getpid(), signal.SIGINT)
+        return True
+
+
+def test_ctrl_c_keeps_what_is_finished_and_the_rest_is_tried_again(command, capsys):
+    settings = {**SMALL, "callback": "test_tune.InterruptSecond"}
+    Path("small.yml").write_text(yaml.safe_dump({ENV: settings}))
+    InterruptSecond.made = 0
+    assert main([*command, "--n-trials", "9"]) == 130
+    assert "1 finished, 1 failed" in capsys.readouterr().out
+    assert [(row["state"], row["error"]) for row in trials()] == [("COMPLETE", ""), ("FAIL", "interrupted")]
+    assert (folder() / "best.yml").is_file() and (folder() / "trials.png").is_file()
+    assert main([*command, "--n-trials", "1", "--storage", str(folder() / "study.log")]) == 0
+    assert [row["state"] for row in trials(2)] == ["COMPLETE", "FAIL", "COMPLETE"]
+    assert varied(trials(2)[2]) == varied(trials(2)[1])
+
+
+def test_a_database_and_another_environment(command, capsys):
+    pendulum = {"n_timesteps": 128, "n_envs": 2, "n_steps": 32, "batch_size": 32}
+    Path("small.yml").write_text(yaml.safe_dump({"Pendulum-v1": pendulum}))
+    Path("space.yml").write_text("n_minibatches: {low: 1, high: 4}\n")
+    known = ["--env", "Pendulum-v1", "--storage", "sqlite:///study.db", "--study-name", "swing", "--n-evaluations", "1"]
+    assert main([*command, "--algo", "ppo", *known, "--n-trials", "2", "--eval-episodes", "1"]) == 0
+    with Path("logs/tune/ppo/Pendulum-v1_1/trials.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["value"] for row in rows] == [row["mean_reward"] for row in rows]  # no success there: as in rl-zoo
+    study = optuna.load_study(study_name="swing", storage="sqlite:///study.db")
+    assert len(study.trials) == 2
+    sizes = [yaml.safe_load((Path(row["run"]) / "Pendulum-v1" / "config.yml").read_text())["batch_size"] for row in rows]
+    assert sizes == [-(-64 // int(row["n_minibatches"])) for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--sampler", "tpee"], "did you mean 'tpe'"),
+        (["--pruner", "medain"], "did you mean 'median'"),
+        (["--n-trials", "-1"], "--n-trials"),
+        (["--max-total-trials", "0"], "--max-total-trials"),
+        (["--n-evaluations", "0"], "n_evaluations"),
+        (["--n-startup-trials", "-1"], "n_startup_trials"),
+        (["--eval-episodes", "0"], "eval_episodes"),
+        (["--algo", "dager"], "did you mean 'dagger'"),
+        (["--env", "QuadTargetTraking-v0"], "did you mean 'QuadTargetTracking-v0'"),
+        (["--storage", "broken.log"], "storage broken.log: cannot be used"),
+        (["--storage", "mysql+nothing://x/y"], "storage mysql+nothing://x/y: cannot be used"),
+        (["--search-space", "nowhere.yml"], "nowhere.yml"),
+        (["--search-space", "broken.log"], "must hold settings with their ranges"),
+        (["-i", "nowhere.zip"], "nowhere.zip"),
+        (["--num-threads", "0"], "at least 1"),
+        (["--n-trails", "3"], "did you mean '--n-trials'"),
+        (["--hyperparams", "n_setps:3"], "did you mean 'n_steps'"),
+    ],
+)
+def test_bad_input_is_one_line(command, arguments, message, capsys):
+    Path("broken.log").write_text("no journal\n")
+    assert main([*command, *arguments]) == 2
+    assert message in one_line_of_error(capsys)
+    assert not folder().exists()
+
+
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ({"learning_rat": {"around": 2}}, "did you mean 'learning_rate'"),
+        ({"learning_rate": {"around": 0.5}}, "greater than 1"),
+        ({"ent_coef": {"around": 2}}, "give low and high"),
+        ({"beta": {"low": 1, "high": 0}}, "below high"),
+        ({"beta": {"low": 0, "high": 1, "log": True}}, "above 0"),
+        ({"beta": {"low": 0}}, "high"),
+        ({"beta": {"low": 0, "high": 1, "step": 2}}, "step"),
+        ({"n_steps": {"low": 1.5, "high": 20}}, "whole"),
+        ({"bc_loss": []}, "empty"),
+        ({"bc_loss": "mse"}, "list"),
+        ({"n_minibatches": [2], "batch_size": [2]}, "leave one"),
+        ({}, "must hold"),
+    ],
+)
+def test_spaces_that_are_none_are_refused(tmp_path, space, message):
+    path = tmp_path / "space.yml"
+    path.write_text(yaml.safe_dump(space))
+    with pytest.raises(ConfigError, match=message) as caught:
+        load_space(build_config("dagger", ENV, SMALL), path)
+    assert "space.yml" in str(caught.value)
+
+
+def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    assert main(command) == 2
+    assert "pip install 'sb3_quad[tune]'" in one_line_of_error(capsys)
+
+
+@pytest.mark.parametrize(
+    ("algo", "file"),
+    [
+        *(("dagger", name) for name in ("dagger.yml", "geometric/dagger.yml", "thesis/dagger.yml")),
+        *(("ppo_bc", name) for name in ("ppo_bc.yml", "geometric/ppo_bc.yml", "thesis/ppo_bc.yml")),
+        *(("ppo", name) for name in ("ppo.yml", "thesis/ppo.yml")),
+    ],
+)
+def test_the_shipped_spaces_fit_the_shipped_settings(algo, file):
+    config = load_config(algo, "QuadStateRecovery-v0" if algo != "dagger" else ENV, file)
+    space = load_space(config)
+    study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
+    for _ in range(20):
+        settings = space.suggest(study.ask())
+        assert yaml.safe_load(yaml.safe_dump(settings)) == settings
+        drawn = build_config(algo, config.env_id, settings)
+        assert drawn.policy_kwargs["net_arch"] == config.policy_kwargs["net_arch"]
+        assert 0 < drawn.hyperparams["gamma"] < 1
+    if "thesis" not in file:
+        assert space.start() is not None
+
+
+rewards = st.floats(-1e4, 1e4).map(lambda value: round(value, 3))
+
+
+@given(st.integers(1, 1000), st.data())
+@settings(max_examples=200)
+def test_more_success_outweighs_any_reward_and_reward_decides_between_equals(n, data):
+    first, second = (data.draw(st.tuples(st.integers(0, n), rewards)) for _ in range(2))
+    values = [score(successes / n, reward, n) for successes, reward in (first, second)]
+    assert (values[0] > values[1]) == (first > second)

@@ -1,0 +1,309 @@
+"""rl_zoo3 and this package: the table of docs/zoo.md, and the bridge in rl_zoo3's own environment (``make test-zoo``).
+
+rl_zoo3 patches Gymnasium where it is imported, so everything of it runs in processes of its own; skipped where it is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import os
+import re
+import subprocess
+import sys
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from stable_baselines3 import SAC
+
+from sb3_quad.cli import main
+from sb3_quad.cli.app import COMMANDS
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.errors import ConfigError
+from sb3_quad.training.config import read_yaml
+from sb3_quad.training.runs import open_run
+from sb3_quad.training.zoo_yaml import ZooLoader
+
+ROOT = Path(__file__).resolve().parent.parent
+ENV = "QuadStateRecovery-v0"
+OURS = {"train": "train", "enjoy": "enjoy", "plot_from_file": "plot", "plot_train": "plot", "all_plots": "plot"}
+OURS |= {"record_video": "record-video", "benchmark": "evaluate"}
+SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file", "record_video", "record_training", "benchmark")
+ARRIVING = {"tune", "record-video"} - set(COMMANDS)
+SETTINGS = {
+    "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.Tanh)",
+    "policy": "MlpPolicy",
+    "n_timesteps": 800,
+    "n_envs": 8,
+    "env_kwargs": {"task": {"state_recovery": 0.5, "target_tracking": 0.5}, "max_episode_steps": 30},
+    "eval_env_kwargs": {"task": "state_recovery", "max_episode_steps": 20},
+    "expert": "geometric",
+    "n_steps": 50,
+    "batch_size": 100,
+    "learning_rate": "lin_1e-3",
+    "ent_coef": "1e-4",
+}
+
+pytestmark = pytest.mark.timeout(900)
+with_zoo = pytest.mark.skipif(importlib.util.find_spec("rl_zoo3") is None, reason="needs rl_zoo3, the extra [zoo]")
+
+
+def table():
+    """From a script of rl_zoo3 to its rows: option strings, status, remark."""
+    sections = re.split(r"^## ", (ROOT / "docs" / "zoo.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    found = {}
+    for section in sections:
+        name = section.split("\n", 1)[0].strip()
+        if name in SCRIPTS:
+            rows = re.findall(r"^\| (`-[^|]*) \| (\w+) \|([^\n]*)\|$", section, flags=re.MULTILINE)
+            found[name] = [(re.findall(r"`([^`]+)`", flags), status, remark) for flags, status, remark in rows]
+    return found
+
+
+def our_flags(command):
+    parser = argparse.ArgumentParser()
+    COMMANDS[command].add_arguments(parser)
+    return {flag for action in parser._actions for flag in action.option_strings} - {"-h", "--help"}
+
+
+def test_the_table_is_true_of_ours():
+    """What is the same has all its spellings here, what is missing has none, what is elsewhere is there."""
+    tables = table()
+    assert set(tables) == set(SCRIPTS) and all(len(rows) > 8 for rows in tables.values())
+    for script, rows in tables.items():
+        for flags, status, remark in rows:
+            assert status in ("same", "other", "missing"), (script, flags)
+            command = OURS.get(script)
+            if command is not None and command not in ARRIVING:
+                there = our_flags(command)
+                assert status != "same" or set(flags) <= there, (script, flags)
+                assert status != "missing" or not {flag for flag in flags if flag.startswith("--")} & there, (script, flags)
+            for elsewhere, flag in re.findall(r"`sb3-quad ([\w-]+) (--[\w-]+)`", remark):
+                assert elsewhere in ARRIVING or flag in our_flags(elsewhere), (script, flags, remark)
+
+
+ZOO_FLAGS = """
+import argparse, importlib, json, runpy, sys
+class Seen(Exception): pass
+def seen(parser, *arguments): raise Seen([action.option_strings for action in parser._actions])
+argparse.ArgumentParser.parse_args = seen
+found = {}
+for script in sys.argv[1:]:
+    plot = "plot" in script
+    try:
+        if plot or script in ("train", "enjoy"):
+            getattr(importlib.import_module(("rl_zoo3.plots." if plot else "rl_zoo3.") + script), script)()
+        else:
+            runpy.run_module("rl_zoo3." + script, run_name="__main__")
+    except Seen as caught:
+        found[script] = [options for options in caught.args[0] if "--help" not in options]
+json.dump(found, open("flags.json", "w"))
+"""
+
+
+def run(*arguments, cwd, **environment):
+    """Output of a command of this interpreter that must succeed."""
+    given = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", **environment}
+    command = [sys.executable, *map(str, arguments)]
+    result = subprocess.run(command, cwd=cwd, env=given, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
+    return result.stdout
+
+
+@with_zoo
+def test_the_table_lists_every_flag_of_rl_zoo3(tmp_path):
+    run("-c", ZOO_FLAGS, *SCRIPTS, cwd=tmp_path)
+    theirs = json.loads((tmp_path / "flags.json").read_text())
+    listed = {script: [flags for flags, _, _ in rows] for script, rows in table().items()}
+    assert {name: sorted(map(sorted, flags)) for name, flags in theirs.items()} == {
+        name: sorted(map(sorted, flags)) for name, flags in listed.items()
+    }
+
+
+# Several commands of one process: importing rl_zoo3 takes longer than what they do.
+SESSION = """
+import json, runpy, sys
+for arguments in json.load(open("commands.json")):
+    print("COMMAND", *arguments[:3], flush=True)
+    sys.argv = ["zoo", *arguments]
+    try:
+        runpy.run_module("sb3_quad.zoo", run_name="__main__")
+    except SystemExit as leaving:
+        assert not leaving.code, (arguments, leaving.code)
+"""
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory):
+    """A folder where rl_zoo3 trained, searched and flew our algorithms, and flew a run of ours; and what it said."""
+    folder = tmp_path_factory.mktemp("zoo")
+    (folder / "small.yml").write_text(yaml.safe_dump({ENV: SETTINGS}))
+    ours = ["train", "--algo", "ppo_bc", "--env", ENV, "-conf", folder / "small.yml", "-f", folder / "ours"]
+    assert main([str(part) for part in [*ours, "--eval-episodes", "2", "--env-kwargs", "noise:0"]]) == 0
+    common = ["--env", ENV, "-conf", "small.yml", "-f", "logs", "--device", "cpu", "--seed", "1", "--verbose", "1"]
+    evaluation = ["--eval-freq", "400", "--eval-episodes", "2"]
+    dagger = ["train", "--algo", "dagger", *common, *evaluation, "--save-freq", "400", "-params", "dataset_capacity:1000"]
+    agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
+    commands = [
+        [*dagger, "--env-kwargs", "noise:0.1"],
+        ["train", "--algo", "ppo_bc", *common, "--eval-freq", "-1", "-i", agent, "-params", "vec_env:'dummy'", "n_envs:2"],
+        *([*dagger, "-optimize", "--n-trials", "1", "--storage", "study.log", "--study-name", "s", "--no-optim-plots"],),
+        ["enjoy", "--algo", "dagger", "--env", ENV, "-f", "logs", "--no-render", "-n", "40", "--load-best"],
+        ["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", "ours", "--no-render", "-n", "40"],
+        ["plot_train", "-a", "dagger", "-e", ENV, "-f", "logs", "-y", "success", "-w", "2"],
+    ]
+    (folder / "commands.json").write_text(json.dumps(commands))
+    parts = run("-c", SESSION, cwd=folder).split("COMMAND")[1:]
+    assert len(parts) == len(commands)
+    return folder, parts
+
+
+@with_zoo
+def test_rl_zoo3_trains_with_our_settings(session):
+    folder, _ = session
+    path = folder / "logs" / "dagger" / f"{ENV}_1"
+    assert {f"{ENV}.zip", "best_model.zip", "rl_model_400_steps.zip", "evaluations.npz", "0.monitor.csv"} <= {
+        entry.name for entry in path.iterdir()
+    }
+    settings, arguments = open_run(path).read_yaml()
+    assert settings == {**SETTINGS, "env_kwargs": {**SETTINGS["env_kwargs"], "noise": 0.1}, "dataset_capacity": 1000}
+    assert arguments["env_kwargs"] == {**settings["env_kwargs"], **SETTINGS["eval_env_kwargs"]}
+    assert arguments["algo"] == "dagger" and arguments["env"] == ENV
+    with np.load(path / "evaluations.npz") as file:
+        assert (file["ep_lengths"] <= 20).all()  # eval_env_kwargs, not env_kwargs
+    lines = (path / "0.monitor.csv").read_text().splitlines()
+    assert lines[1].split(",") == ["r", "l", "t", "is_success"]
+    assert len(lines) > 10 and all(int(line.split(",")[1]) <= 30 for line in lines[2:])
+
+
+@with_zoo
+def test_its_zips_need_neither_rl_zoo3_nor_us(session):
+    folder, _ = session
+    code = """
+import sys, warnings
+sys.modules["sb3_quad"] = sys.modules["rl_zoo3"] = None
+from stable_baselines3 import PPO
+warnings.simplefilter("error")
+for path in sys.argv[1:]:
+    PPO.load(path, device="cpu")
+"""
+    run("-c", code, *sorted(folder.glob("logs/*/*/*.zip")), cwd=folder)
+
+
+@with_zoo
+def test_a_second_stage_starts_from_the_first(session):
+    folder, (_, said, *_) = session
+    path = folder / "logs" / "ppo_bc" / f"{ENV}_1"
+    settings, _ = open_run(path).read_yaml()
+    assert settings["vec_env"] == "dummy" and "Using 2 environments" in said
+    assert (path / "0.monitor.csv").read_text().splitlines()[1] == "r,l,t,is_success"
+
+
+@with_zoo
+def test_its_search_goes_through_our_spaces(session):
+    folder, (_, _, said, *_) = session
+    assert "Number of finished trials:  1" in said and "gradient_steps:" in said
+    assert (folder / "study.log").is_file() and list((folder / "logs" / "dagger").glob("report_*.csv"))
+
+
+@with_zoo
+@pytest.mark.parametrize("which", [3, 4])
+def test_it_shows_its_runs_and_ours(session, which):
+    """As they are judged: in episodes of 20 steps, two in 40."""
+    assert "Episode Length 20" in session[1][which] and "2 Episodes" in session[1][which]
+
+
+@with_zoo
+def test_ours_shows_its_runs(session, capsys):
+    folder, _ = session
+    assert main(["enjoy", "--algo", "dagger", "--env", ENV, "-f", str(folder / "logs"), "--no-render", "--load-best"]) == 0
+    assert "after 0.20 s" in capsys.readouterr().out
+
+
+@with_zoo
+def test_the_plain_command_knows_us_by_custom_envs(tmp_path):
+    (tmp_path / "custom_envs.py").write_text("import sb3_quad.zoo\n")
+    code = "import sys; sys.argv = ['rl_zoo3', 'train', '--help']; from rl_zoo3.cli import main; main()"
+    assert "dagger,ppo_bc" in "".join(run("-c", code, cwd=tmp_path).split())
+
+
+def test_without_rl_zoo3_the_bridge_says_what_is_missing(tmp_path):
+    code = "import runpy, sys; sys.modules['rl_zoo3'] = None; sys.argv[1:] = ['train']; runpy.run_module('sb3_quad.zoo')"
+    given = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", code.replace("'sb3_quad.zoo')", "'sb3_quad.zoo', run_name='__main__')")]
+    result = subprocess.run(command, cwd=tmp_path, env=given, capture_output=True, text=True, check=False)
+    assert result.returncode != 0 and "pip install 'sb3_quad[zoo]'" in result.stderr
+
+
+TAGGED = """!!python/object/apply:collections.OrderedDict
+- - - env_kwargs
+    - task: state_recovery
+  - - policy_kwargs
+    - activation_fn: !!python/name:torch.nn.modules.activation.Tanh ''
+      net_arch: !!python/tuple [64, 64]
+"""
+
+
+def test_yaml_of_rl_zoo3_is_read_without_running_it():
+    assert read_yaml(TAGGED, "config.yml", ZooLoader) == {
+        "env_kwargs": {"task": "state_recovery"},
+        "policy_kwargs": {"activation_fn": "nn.Tanh", "net_arch": [64, 64]},
+    }
+    with pytest.raises(ConfigError):
+        read_yaml(TAGGED, "my.yml")  # settings files of users stay plain
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "!!python/object/apply:os.system ['true']",
+        "!!python/name:os.system ''",
+        "!!python/object/apply:collections.OrderedDict 3",
+        "!!python/object/apply:collections.OrderedDict [[[1, 2, 3]]]",
+        "!!python/object/apply:collections.OrderedDict []",
+        "!!python/tuple 3",
+    ],
+)
+def test_other_tags_are_refused(text):
+    with pytest.raises(ConfigError, match=r"config\.yml: not valid YAML"):
+        read_yaml(text, "config.yml", ZooLoader)
+
+
+@pytest.fixture
+def foreign_run(tmp_path):
+    """A folder as rl_zoo3 leaves it, of an algorithm that we do not train."""
+    path = tmp_path / "logs" / "sac" / f"{ENV}_1"
+    (path / ENV).mkdir(parents=True)
+    SAC("MlpPolicy", QuadcopterVecEnv(1), buffer_size=1, device="cpu").save(path / f"{ENV}.zip")
+    settings = {"env_kwargs": {"max_episode_steps": 30}, "n_timesteps": 1000.0, "train_freq": 1, "normalize": False}
+    (path / ENV / "config.yml").write_text(yaml.dump(OrderedDict(settings)))
+    (path / ENV / "args.yml").write_text(yaml.dump(OrderedDict(algo="sac", env=ENV, env_kwargs=None)))
+    return path
+
+
+def enjoy_sac(path):
+    return main(["enjoy", "--algo", "sac", "--env", ENV, "-f", str(path.parent.parent), "--no-render"])
+
+
+def test_ours_shows_runs_of_other_algorithms(foreign_run, capsys):
+    assert enjoy_sac(foreign_run) == 0
+    assert "after 0.30 s" in capsys.readouterr().out
+
+
+def test_what_rl_zoo3_was_told_on_its_command_line_counts(foreign_run, capsys):
+    """It keeps env_kwargs in args.yml then, and lets them stand for all."""
+    (foreign_run / ENV / "args.yml").write_text(
+        yaml.dump(OrderedDict(algo="sac", env=ENV, env_kwargs={"max_episode_steps": 10}))
+    )
+    assert enjoy_sac(foreign_run) == 0
+    assert "after 0.10 s" in capsys.readouterr().out
+
+
+def test_a_run_behind_vec_normalize_is_refused(foreign_run, capsys):
+    (foreign_run / ENV / "config.yml").write_text(yaml.dump(OrderedDict(normalize=True)))
+    assert enjoy_sac(foreign_run) == 2
+    assert "normalize" in capsys.readouterr().err

@@ -1,0 +1,1 @@
+"""What ``tune`` varies, a file per algorithm."""
