@@ -47,7 +47,8 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     ## Action Space
 
     `Box(-1, 1, (4,), float32)`: the commanded thrust of each rotor, as (0.5 a + 1) m g / 4 (Eq. 3.18; the limits are the
-    vehicle's), so that 0 is hover. Numbers outside [-1, 1] are clipped; ones that are not finite are refused.
+    vehicle's, and 0 the middle between them: hover for the default vehicle, `vehicle.hover_action` is it for any). Numbers
+    outside [-1, 1] are clipped; ones that are not finite are refused.
 
     | Num | Rotor (default vehicle) | Min | Max | Thrust (N) |
     |-----|-------------------------|-----|-----|------------|

@@ -17,6 +17,10 @@ class ConfigError(SB3QuadError, ValueError):
     """A file, key or value that does not fit: says which one, what is wrong and what is allowed."""
 
 
+class CannotHover(ConfigError):
+    """A vehicle whose rotors cannot give hover thrust: too weak, or unable to give as little."""
+
+
 class ExpertError(SB3QuadError, ValueError):
     """An expert that cannot label this environment, or whose labels are not finite actions of the right shape."""
 

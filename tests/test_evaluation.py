@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from sb3_quad.dynamics.vehicle import vehicle_names
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
@@ -18,6 +19,8 @@ from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import comparison
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.load import load_suite
+
+BACKENDS = ("batch", "pybullet")
 
 
 def fall(observation):
@@ -37,9 +40,11 @@ def same(a: Flights, b: Flights) -> None:
         np.testing.assert_allclose(a.time_to[tolerance], b.time_to[tolerance], atol=1e-9)
 
 
+@pytest.mark.parametrize("vehicle", vehicle_names())
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
-def test_pybullet_gives_the_same_flights(task):
-    flights = [fly(PIDExpert(), task, 3, seed=11, backend=backend, max_steps=400) for backend in ("batch", "pybullet")]
+def test_pybullet_gives_the_same_flights(task, vehicle):
+    expert = PIDExpert(vehicle)
+    flights = [fly(expert, task, 3, seed=11, vehicle=vehicle, backend=backend, max_steps=400) for backend in BACKENDS]
     same(*flights)
 
 

@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3 import PPO
 
 from sb3_quad.dynamics.state import QuadcopterState
+from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.envs.observation import DEFAULT_STD
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError
@@ -40,6 +41,16 @@ def test_the_agent_hovers_at_its_target_with_every_heading(model):
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after).mean() < 0.1 * np.square(before).mean()
     assert result.before == pytest.approx(np.sqrt(np.square(before).mean()), rel=0.05) and result.after < result.before
+
+
+def test_hover_of_a_vehicle_whose_middle_thrust_is_another(model):
+    observations = at_target(np.linspace(-np.pi, np.pi, 50))
+    hover = load_vehicle("hummingbird").hover_action
+    assert hover < -0.2
+    result = trim_hover(model, seed=3, noise=0.0, vehicle="hummingbird")
+    after = model.predict(observations, deterministic=True)[0]
+    assert np.square(after - hover).mean() < 0.1 * np.square(after).mean()
+    assert result.after == pytest.approx(np.sqrt(np.square(after - hover).mean()), abs=0.02)
 
 
 def test_only_the_last_layer_changes_and_the_zip_stays_stock(model, tmp_path):

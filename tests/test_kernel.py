@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from sb3_quad.dynamics.kernel import control_step
 from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle, vehicle_names
 
 URDF = """<robot name="body"><link name="base"><inertial><mass value="{m!r}"/>
 <inertia ixx="{i[0]!r}" iyy="{i[1]!r}" izz="{i[2]!r}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
@@ -137,6 +137,18 @@ def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
     if np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, BODY_RATES]).max() > 60.0:
         return  # where PyBullet cuts velocities at 100 rad/s rounding grows fast; another test is about that
     assert worst_difference(vehicle, folder, state, actions, wrench).max() < 1e-9
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+@pytest.mark.parametrize("seed", range(3))
+def test_flight_of_the_shipped_vehicles_is_pybullets(name, seed, tmp_path):
+    """Full deflection for 0.1 s at most at a time: longer, and a small vehicle spins faster than PyBullet is exact at."""
+    vehicle, rng = load_vehicle(name), np.random.default_rng(seed)
+    state = random_state(rng, vehicle)
+    actions = np.clip(random_actions(rng, 200)[::2] * rng.choice([-1.0, 1.0], size=(100, 4)), -1, 1).astype(np.float32)
+    wrench = np.zeros(12)
+    assert np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, BODY_RATES]).max() < 60.0
+    assert worst_difference(vehicle, tmp_path, state, actions, wrench).max() < 1e-9
 
 
 @pytest.mark.parametrize("physics_step", [0.001, 0.005, 0.01])

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from sb3_quad.dynamics.vehicle import PARAMETER_NAMES, Vehicle, load_vehicle, vehicle_names
-from sb3_quad.errors import ConfigError
+from sb3_quad.dynamics.vehicle import PARAMETER_NAMES, Vehicle, is_vehicle_file, load_vehicle, vehicle_names
+from sb3_quad.errors import CannotHover, ConfigError
 
 ITM = load_vehicle("itm")
 GAINS = ITM.model_dump(mode="json")["geometric_gains"]
@@ -49,7 +49,7 @@ def write(path: Path, **changes: Any) -> Path:
 
 
 def test_default_vehicle_is_the_specified_one() -> None:
-    assert vehicle_names() == ["itm"]
+    assert vehicle_names() == ["crazyflie", "hummingbird", "itm"]
     assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (1.727, (0.006687, 0.0101, 0.00996), 0.016)
     assert (ITM.thrust_coefficient, ITM.motor_gain, ITM.gravity) == (8.54858e-6, 20.0, 9.81)
     assert (ITM.physics_step, ITM.control_step, ITM.substeps, ITM.delay) == (0.0025, 0.01, 4, 1)
@@ -141,9 +141,52 @@ def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
     assert load_vehicle(path).thrust_coefficient == 8e-6
 
 
+@pytest.mark.parametrize("name", vehicle_names())
+def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
+    vehicle = load_vehicle(name)
+    assert vehicle.name == name and vehicle.geometric_gains is not None
+    assert vehicle.geometric_gains.measured is not None
+    assert float(vehicle.action_to_thrust(np.array(vehicle.hover_action))) == pytest.approx(vehicle.hover_thrust)
+
+
+def test_published_limits_are_kept() -> None:
+    crazyflie, hummingbird = load_vehicle("crazyflie"), load_vehicle("hummingbird")
+    np.testing.assert_allclose(crazyflie.thrust_range, (0.02, 0.1125))
+    np.testing.assert_allclose(hummingbird.rotor_speed_range, (157.08, 785.40))
+
+
+@given(vehicles())
+def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle: Vehicle) -> None:
+    data = vehicle.model_dump(exclude={"thrust_limits"})
+    for key, limits in (("rotor_thrust_limits", vehicle.thrust_range), ("rotor_speed_limits", vehicle.rotor_speed_range)):
+        again = Vehicle.model_validate({**data, key: limits})
+        np.testing.assert_allclose(again.thrust_limits, vehicle.thrust_limits, rtol=1e-12, atol=1e-15)
+        assert vehicle.model_copy(update={key: limits}).thrust_limits == again.thrust_limits
+
+
+@pytest.mark.parametrize("limits", [{"thrust_limits": [0.1, 0.9]}, {"rotor_thrust_limits": [0.1, 4.0], "thrust_limits": ...}])
+def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, limits: dict[str, Any]) -> None:
+    with pytest.raises(CannotHover, match="hover"):
+        load_vehicle(write(tmp_path / "weak.yaml", **limits))
+    with pytest.raises(ConfigError) as caught:
+        load_vehicle(write(tmp_path / "worse.yaml", mas=1.0, **limits))
+    assert not isinstance(caught.value, CannotHover)
+
+
+def test_files_are_told_from_names() -> None:
+    assert is_vehicle_file("my.yaml") and is_vehicle_file("here/my") and is_vehicle_file(Path("my"))
+    assert not is_vehicle_file("itm")
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give only one"),
+        ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise.* N"),
+        ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits: must be two numbers .*rad/s"),
+        ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: Field required"),
+        ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "thrust_coefficient": "x"}, "thrust_coefficient: "),
+        ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),
         ({"mas": 1.0}, "'mas': did you mean 'mass'"),
         ({"thrust_limit": [0.5, 1.5]}, "did you mean 'thrust_limits'"),
         ({"mass": ...}, "mass: Field required"),

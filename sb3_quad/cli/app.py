@@ -5,7 +5,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from sb3_quad.cli import benchmark, enjoy, evaluate, export, plot, publish, record_video, report, train, tune, tune_expert
+from sb3_quad.cli import (
+    benchmark,
+    check_vehicle,
+    enjoy,
+    evaluate,
+    export,
+    plot,
+    publish,
+    record_video,
+    report,
+    train,
+    tune,
+    tune_expert,
+)
 from sb3_quad.cli.arguments import Parser
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
@@ -20,7 +33,7 @@ EPILOG = """examples:
 
 exit codes:
   0    done
-  1    evaluated, but not every controller: a line on stderr for each that failed
+  1    evaluated, but not every controller: a line on stderr for each that failed; or a vehicle that cannot hover
   2    bad input, or a training that cannot go on: one line on stderr says what
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
@@ -36,6 +49,7 @@ COMMANDS = {
     "benchmark": benchmark,
     "plot": plot,
     "tune": tune,
+    "check-vehicle": check_vehicle,
     "tune-expert": tune_expert,
 }
 

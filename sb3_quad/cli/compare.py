@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
 
 FRESH_EPISODES = 240
+THESIS_VEHICLE = "itm"  # beside another one the thesis has no figures
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
@@ -25,7 +26,9 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
 
     config = for_evaluation(job)
     given = config.env_kwargs
-    keywords: dict[str, Any] = {key: given[key] for key in ("vehicle", "noise", "task_kwargs") if key in given}
+    keywords: dict[str, Any] = dict(config.flight_kwargs)
+    if "task_kwargs" in given:
+        keywords["task_kwargs"] = given["task_kwargs"]
     if "max_episode_steps" in given:
         keywords["max_steps"] = given["max_episode_steps"]
     expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
@@ -34,4 +37,5 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
     scenario = load_suite("thesis").scenario(TASK_SCENARIOS[str(config.task)])
     title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
-    return comparison(title, columns, scenario, (agent, "expert"))
+    beside = (agent, "expert") if keywords.get("vehicle", THESIS_VEHICLE) == THESIS_VEHICLE else ()
+    return comparison(title, columns, scenario, beside)

@@ -33,6 +33,7 @@ examples:
   sb3-quad evaluate agent.zip --scaling adaptive --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
+  sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
 
 Results lie in a folder: the same command again flies only what is missing, further controllers join those that are there.
 """
@@ -48,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
     add("--episodes", type=whole, metavar="N", help="of every scenario, instead of its own number")
     add("--seed", type=whole, metavar="N", help="of the first episode of every scenario, instead of its own")
+    add("--vehicle", metavar="V", help="name or YAML file that flies all scenarios, instead of their own")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
@@ -65,7 +67,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.scaling not in SCALINGS:
         raise ConfigError(unknown("scaling", options.scaling, SCALINGS))
-    suite = with_changes(load_suite(options.suite), options.scenario, options.episodes, options.seed)
+    suite = with_changes(load_suite(options.suite), options.scenario, options.episodes, options.seed, options.vehicle)
     controllers = parse_controllers(options.controllers, options.scaling)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
     start = time.perf_counter()

@@ -47,7 +47,7 @@ def rotor_wrenches(state, queue, action, wrench, vehicles, physics_step, out):
             thrust = thrust_coefficient * speed * speed
             out[step, 0, 2] += thrust
             for axis in range(3):
-                out[step, 1, axis] += vehicles[P_ARM + 4 * axis + j, 0] * thrust  # Eq. 2.7, X layout
+                out[step, 1, axis] += vehicles[P_ARM + 4 * axis + j, 0] * thrust  # Eq. 2.7, any layout
         state[13 + j, 0] = speed
     for axis in range(3):
         if wrench[axis, 0] != 0.0 or wrench[6 + axis, 0] != 0.0:

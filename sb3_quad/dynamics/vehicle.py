@@ -16,7 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from sb3_quad.dynamics.gains import GeometricFigures, GeometricGains
 from sb3_quad.dynamics.quantities import Finite, Positive
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.dynamics.rotor_limits import DEFAULT_GRAVITY, OTHER_LIMITS, in_hover_thrusts
+from sb3_quad.errors import CannotHover, ConfigError, unknown
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -31,8 +32,16 @@ PARAMETER_NAMES = (
 )
 
 
+class _HoverOutOfReach(ValueError):
+    """Thrust limits that hover is not between."""
+
+
 class Vehicle(BaseModel):
     """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
+
+    The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover thrusts,
+    ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. They become ``thrust_limits``, which a copy with another
+    mass keeps.
 
     Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises :class:`ConfigError`
     through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
@@ -50,7 +59,7 @@ class Vehicle(BaseModel):
     moment_thrust_ratio: Positive = Field(description="kM / kF, m")
     thrust_coefficient: Positive = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
     motor_gain: Positive = Field(description="k_m, 1/s (Eq. 4.1)")
-    gravity: Positive = Field(default=9.81, description="g, m/s^2")
+    gravity: Positive = Field(default=DEFAULT_GRAVITY, description="g, m/s^2")
     thrust_limits: tuple[Annotated[Finite, Field(ge=0)], Positive] = Field(
         description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
     )
@@ -62,11 +71,18 @@ class Vehicle(BaseModel):
         default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
     )
 
+    @model_validator(mode="before")
+    @classmethod
+    def _limits(cls, data: Any) -> Any:
+        return in_hover_thrusts(data) if isinstance(data, Mapping) else data
+
     @model_validator(mode="after")
     def _consistent(self) -> Vehicle:
         low, high = self.thrust_limits
         if not low < 1.0 < high:
-            raise ValueError(f"thrust_limits {list(self.thrust_limits)}: hover (1.0) must lie between them")
+            raise _HoverOutOfReach(
+                f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover"
+            )
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
             raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
         ixx, iyy, izz = self.inertia
@@ -96,7 +112,8 @@ class Vehicle(BaseModel):
         changes = dict(update or {})
         if changes.keys() - {"name"}:
             changes = {"geometric_gains": None, **changes}
-        return Vehicle.model_validate({**self.model_dump(), **changes})
+        own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & OTHER_LIMITS.keys() else None)
+        return Vehicle.model_validate({**own, **changes})
 
     @property
     def mixer(self) -> FloatArray:
@@ -131,6 +148,11 @@ class Vehicle(BaseModel):
     def hover_rotor_speed(self) -> float:
         """Speed of one rotor in hover, rad/s."""
         return math.sqrt(self.hover_thrust / self.thrust_coefficient)
+
+    @property
+    def hover_action(self) -> float:
+        """The action of each rotor in hover; 0 where hover is in the middle of the thrust limits."""
+        return float(self.thrust_to_action(np.array(self.hover_thrust)))
 
     @property
     def substeps(self) -> int:
@@ -174,15 +196,21 @@ def vehicle_names() -> list[str]:
     return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
 
 
+def is_vehicle_file(source: str | Path) -> bool:
+    """Whether :func:`load_vehicle` takes it for the path of a file rather than for a name."""
+    return isinstance(source, Path) or source.endswith((".yaml", ".yml")) or "/" in source
+
+
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
 
+    :raises CannotHover: all is well with the file but that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
     """
     if isinstance(source, Vehicle):
         return source
     text = str(source)
-    if isinstance(source, Path) or text.endswith((".yaml", ".yml")) or "/" in text:
+    if is_vehicle_file(source if isinstance(source, Path) else text):
         try:
             content = Path(text).read_text(encoding="utf-8")
         except (OSError, UnicodeDecodeError) as error:
@@ -204,7 +232,10 @@ def _parse_vehicle(content: str, where: str) -> Vehicle:
     try:
         return Vehicle.model_validate(data)
     except ValidationError as error:
-        raise ConfigError(f"vehicle file {where}: {'; '.join(_explain(item) for item in error.errors())}") from None
+        wrong = error.errors()
+        only_weak = all(isinstance(item.get("ctx", {}).get("error"), _HoverOutOfReach) for item in wrong)
+        kind = CannotHover if only_weak else ConfigError
+        raise kind(f"vehicle file {where}: {'; '.join(_explain(item) for item in wrong)}") from None
 
 
 def _explain(item: Any) -> str:
@@ -212,7 +243,7 @@ def _explain(item: Any) -> str:
     *blocks, name = item["loc"] or ("",)
     where, fields = _fields_at(tuple(blocks))
     if item["type"] == "extra_forbidden":
-        return where + unknown("key", name, fields)
+        return where + unknown("key", name, fields if where else [*fields, *OTHER_LIMITS])
     message = item["msg"].removeprefix("Value error, ")
     field = fields.get(str(name)) or Vehicle.model_fields.get(key.split(".")[0])
     meaning = f" ({field.description})" if field and field.description else ""

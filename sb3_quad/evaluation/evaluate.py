@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
+from pydantic import ValidationError
+
+from sb3_quad.dynamics.vehicle import is_vehicle_file, load_vehicle
 from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.evaluation.controllers import ControllerSpec, describe, measured
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.folder import ResultFolder
 from sb3_quad.evaluation.jobs import Job, make_job, run_jobs
 from sb3_quad.evaluation.records import ControllerRecord, Failure, Results
+from sb3_quad.scenarios.load import explain
 from sb3_quad.scenarios.scenario import Scenario, Suite
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
@@ -64,11 +69,19 @@ def evaluate(
     return results
 
 
-def with_changes(suite: Suite, names: Sequence[str] = (), episodes: int | None = None, seed: int | None = None) -> Suite:
-    """A suite with some of its scenarios, or other numbers of episodes or seeds.
+def with_changes(
+    suite: Suite,
+    names: Sequence[str] = (),
+    episodes: int | None = None,
+    seed: int | None = None,
+    vehicle: str | None = None,
+) -> Suite:
+    """A suite with some of its scenarios, other numbers of episodes or seeds, or another vehicle.
 
     :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
-    :raises ConfigError: an unknown name, a number out of range.
+    :param vehicle: name, or path of a YAML file, that flies all scenarios; forces and torques stay what they are, in N and
+        N m, and reference figures, which are of another vehicle, go.
+    :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible for the vehicle.
     """
     known = [name for scenario in suite.scenarios for name in (scenario.name, scenario.group) if name is not None]
     for name in names:
@@ -78,7 +91,10 @@ def with_changes(suite: Suite, names: Sequence[str] = (), episodes: int | None =
         raise ConfigError(f"episodes {episodes}, seed {seed}: at least one episode, a seed of 0 to {2**32 - 1}")
     changes = {key: value for key, value in (("episodes", episodes), ("seed", seed)) if value is not None}
     kept = [each for each in suite.scenarios if not names or each.name in names or each.group in names]
-    return suite.model_copy(update={"scenarios": tuple(_changed(scenario, changes) for scenario in kept)})
+    scenarios = tuple(_changed(scenario, changes) for scenario in kept)
+    if vehicle is not None:
+        scenarios = tuple(_flown_by(vehicle, scenario) for scenario in scenarios)
+    return suite.model_copy(update={"scenarios": scenarios})
 
 
 def _changed(scenario: Scenario, changes: dict[str, int]) -> Scenario:
@@ -86,6 +102,15 @@ def _changed(scenario: Scenario, changes: dict[str, int]) -> Scenario:
     if search is not None and "episodes" in changes:
         search = search.model_copy(update={"episodes": min(search.episodes, changes["episodes"])})
     return scenario.model_copy(update={**changes, "hit_search": search})
+
+
+def _flown_by(vehicle: str, scenario: Scenario) -> Scenario:
+    load_vehicle(vehicle)  # whatever is wrong with it
+    name = str(Path(vehicle).absolute()) if is_vehicle_file(vehicle) else vehicle
+    try:
+        return Scenario.model_validate({**scenario.model_dump(), "vehicle": name, "reference": {}})
+    except ValidationError as error:
+        raise ConfigError(f"scenario {scenario.name}, flown by {vehicle}: {explain(error, Scenario)}") from None
 
 
 def _load(controllers: Sequence[ControllerSpec], vehicle: str) -> tuple[dict[str, ControllerRecord], list[Failure]]:

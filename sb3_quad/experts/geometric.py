@@ -8,6 +8,7 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.dynamics.authority import command_lag, greatest_moments
 from sb3_quad.dynamics.gains import GeometricGains
 from sb3_quad.dynamics.state import QuadcopterState
 from sb3_quad.dynamics.vehicle import Vehicle
@@ -17,14 +18,13 @@ from sb3_quad.experts.protocol import Actions, Expert
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
 
-    The units are the lag τ from a command to its thrust (:func:`command_lag`); the greatest angular acceleration a_φ about
-    the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1), sideways
-    at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust limits in hover thrusts.
+    The units are the lag τ from a command to its thrust (:func:`~sb3_quad.dynamics.authority.command_lag`); the greatest
+    angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
+    upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
+    limits in hover thrusts.
     """
     least, most = vehicle.thrust_limits
-    low, high = vehicle.thrust_range
-    moments = np.abs(vehicle.mixer[1:3]).sum(axis=1) * (high - low) / 2
-    turn = float(np.min(moments / np.asarray(vehicle.inertia[:2])))
+    turn = float(np.min(greatest_moments(vehicle)[:2] / np.asarray(vehicle.inertia[:2])))
     lag = command_lag(vehicle)
     rate = min(1.0 / (lag + 1.0 / math.sqrt(turn)), 0.438 / lag)
     sideways = math.sqrt(most**2 - 1.0)
@@ -43,11 +43,6 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
         yaw_rate=0.110 / lag,
         descent_deceleration=0.408 * vehicle.gravity * (most - 1.0),
     )
-
-
-def command_lag(vehicle: Vehicle) -> float:
-    """τ, s, from a command to its thrust: the delay, half of the control step it is held for, and the motors (Eq. 4.1)."""
-    return (vehicle.delay + 0.5) * vehicle.control_step + 1.0 / vehicle.motor_gain
 
 
 class GeometricExpert(Expert):

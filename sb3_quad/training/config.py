@@ -31,6 +31,7 @@ from typing import Any
 import gymnasium
 import yaml
 
+from sb3_quad.dynamics.vehicle import is_vehicle_file
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.tasks import TASKS
 from sb3_quad.errors import ConfigError, unknown
@@ -44,6 +45,7 @@ _JOB_KEYS = (
     *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "eval_tasks", "eval_expert"),
     *("policy", "policy_kwargs", "expert", "callback", "env_wrapper", "vec_env_wrapper", "normalize"),
 )
+_ENV_KEYS = ("env_kwargs", "eval_env_kwargs")
 # What env_kwargs may give to a quadcopter environment, batched or not.
 QUADCOPTER_KEYWORDS = (
     *("task", "task_kwargs", "vehicle", "noise", "observation_mean", "observation_std", "max_episode_steps"),
@@ -121,6 +123,7 @@ def build_config(
     """
     algorithm = get_algorithm(algo)
     check_environment(env_id)
+    settings = {key: with_vehicle_path(value) if key in _ENV_KEYS else value for key, value in settings.items()}
     parameters = constructor_parameters(algorithm)
 
     def at(key: str) -> str:
@@ -160,6 +163,14 @@ def build_config(
         hyperparams={key: convert(value, parameters[key], at(key)) for key, value in settings.items() if key in parameters},
         settings=dict(settings),
     )
+
+
+def with_vehicle_path(value: Any) -> Any:
+    """``env_kwargs`` whose vehicle file, if they name one, can be found from any folder: runs are flown and resumed later."""
+    vehicle = value.get("vehicle") if isinstance(value, dict) else None
+    if not isinstance(vehicle, (str, Path)) or not is_vehicle_file(vehicle):
+        return value
+    return {**value, "vehicle": str(Path(vehicle).absolute())}
 
 
 def check_environment(env_id: str) -> None:

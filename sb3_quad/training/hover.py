@@ -7,9 +7,9 @@ offset and the hundredth balance. What its last layer W, b must change by, D = [
     min  mean_ψ |h̄(ψ) D + y(ψ)|² + λ mean_s |h(s) D|²
 
 with h the input of that layer and a 1, h̄(ψ) its mean over the observation noise at the target with heading ψ, y(ψ) the mean
-action there (0 is hover), and s the states of flights: a change is cheap where the agent never is. The zip stays a stock one.
-The thesis cancels an offset by the position's mean in the observation's scaling instead (4.3.1; :mod:`.trim`), which fits one
-heading.
+action there less that of hover, and s the states of flights: a change is cheap where the agent never is. The zip stays a stock
+one. The thesis cancels an offset by the position's mean in the observation's scaling instead (4.3.1; :mod:`.trim`), which fits
+one heading.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.envs.observation import DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.errors import ConfigError
@@ -38,7 +39,7 @@ N_FLIGHTS, STEPS, EVERY = 240, 300, 3  # flights whose states must not see a cha
 class HoverTrim:
     """What the correction did.
 
-    :param before: root mean square, over headings and rotors, of the mean action at the target; hover is 0.
+    :param before: root mean square, over headings and rotors, of the mean action at the target less that of hover.
     :param after: the same, after it.
     """
 
@@ -62,15 +63,16 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, noise: float = 0.05, **e
     at_target = _features(model, _at_target(noise, std, np.random.default_rng(seed)))
     at_target = at_target.reshape(N_HEADINGS, N_DRAWS, -1).mean(dim=1)
     flown = _features(model, _flown(model, seed, noise, env_kwargs))
+    hover = load_vehicle(env_kwargs.get("vehicle", "itm")).hover_action
     with th.no_grad():
         weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()  # (inputs + 1, actions)
-        action = at_target @ weights
+        action = at_target @ weights - hover
         metric = at_target.T @ at_target / len(at_target) + STIFFNESS * flown.T @ flown / len(flown)
         metric += 1e-6 * th.eye(len(metric), dtype=metric.dtype)
         weights -= th.linalg.solve(metric, at_target.T @ action / len(at_target))
         layer.weight.copy_(weights[:-1].T)
         layer.bias.copy_(weights[-1])
-    return HoverTrim(_size(action), _size(at_target @ weights))
+    return HoverTrim(_size(action), _size(at_target @ weights - hover))
 
 
 def _size(action: th.Tensor) -> float:

@@ -40,7 +40,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sb3_quad.errors import ConfigError, TrainingError, unknown
 from sb3_quad.training.algorithms import get_algorithm
-from sb3_quad.training.config import load_config, read_settings
+from sb3_quad.training.config import load_config, read_settings, with_vehicle_path
 from sb3_quad.training.files import save_model, write_text
 from sb3_quad.training.hover import trim_hover
 from sb3_quad.training.job import TrainingJob, describe
@@ -148,6 +148,8 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
         settings = {**stage.settings, **changes}
         if "env_kwargs" in stage.settings and "env_kwargs" in changes:
             settings["env_kwargs"] = {**stage.settings["env_kwargs"], **changes["env_kwargs"]}
+        if "env_kwargs" in settings:
+            settings["env_kwargs"] = with_vehicle_path(settings["env_kwargs"])
         stages.append(stage.model_copy(update={"settings": settings}))
     return Pipeline(stages=tuple(stages))
 

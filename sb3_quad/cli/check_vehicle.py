@@ -1,0 +1,78 @@
+"""``check-vehicle``: whether a vehicle's file describes something that flies, and how the experts fly it."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import TYPE_CHECKING
+
+from sb3_quad.cli.arguments import whole
+from sb3_quad.cli.output import console
+from sb3_quad.errors import CannotHover, ConfigError
+
+if TYPE_CHECKING:
+    from sb3_quad.dynamics.vehicle import Vehicle
+
+HELP = "Say whether a vehicle can hover, what authority it has, and how the experts fly it."
+EXAMPLES = """examples:
+  sb3-quad check-vehicle my.yaml            a vehicle of your own
+  sb3-quad check-vehicle crazyflie          one that comes with the package: crazyflie, hummingbird, itm
+  sb3-quad check-vehicle my.yaml -n 0       by its parameters alone, nothing is flown
+
+exit code 1: its rotors cannot give hover thrust. What a vehicle's file holds: docs/vehicles.md
+"""
+FRESH_SEED = 1_000_000  # as tune-expert: episodes that no search and no training has seen
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The flags of ``check-vehicle``."""
+    parser.add_argument("vehicle", metavar="VEHICLE", help="name or YAML file")
+    parser.add_argument(
+        "-n", "--episodes", type=whole, default=480, metavar="N", help="flown of each task by each expert, true state (480)"
+    )
+    parser.add_argument("--seed", type=whole, default=0, help=f"episode k is drawn from seed + {FRESH_SEED} + k (0)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
+    if options.episodes < 0 or not 0 <= options.seed < 2**31:
+        raise ConfigError(f"--episodes {options.episodes}, --seed {options.seed}: must be at least 0")
+    from sb3_quad.dynamics.authority import authority
+    from sb3_quad.dynamics.vehicle import load_vehicle
+    from sb3_quad.evaluation.vehicle_tables import authority_table, doubts, parameter_table
+
+    try:
+        vehicle = load_vehicle(options.vehicle)
+    except CannotHover as error:
+        print(f"cannot hover: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    able = authority(vehicle)
+    console().print(parameter_table(vehicle, able))
+    console().print(authority_table(able))
+    for doubt in doubts(vehicle, able):
+        print(f"unusual: {doubt}")
+    if options.episodes:
+        _fly(options.vehicle, vehicle, options.episodes, FRESH_SEED + options.seed)
+    return 0
+
+
+def _fly(source: str, vehicle: Vehicle, episodes: int, seed: int) -> None:
+    from sb3_quad.envs.registration import ENVIRONMENTS
+    from sb3_quad.evaluation.summary import fly_all
+    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
+    from sb3_quad.evaluation.vehicle_tables import lost_whatever_flies
+    from sb3_quad.experts.geometric import GeometricExpert
+    from sb3_quad.experts.pid import PIDExpert
+    from sb3_quad.scenarios.load import load_suite
+
+    suite = load_suite("thesis")
+    gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
+    pilots = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}
+    for task in ENVIRONMENTS.values():
+        columns = fly_all(pilots, task, episodes, seed, vehicle=vehicle, noise=0.0)
+        title = f"{task}: {episodes} fresh episodes, the same for both, true state"
+        console().print(comparison(title, columns, suite.scenario(TASK_SCENARIOS[task]), ()))
+    lost = lost_whatever_flies(vehicle, episodes, seed)
+    print(f"{lost} of {episodes} recoveries certainly end at the ground, whatever flies (a lower bound: docs/experts.md)")
+    if vehicle.geometric_gains is None:
+        print(f"gains found for it, mostly better ones: sb3-quad tune-expert --vehicle {source}")

@@ -1,0 +1,149 @@
+"""Authority from the parameters alone, checked by trying it; and the command that tells of it."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sb3_quad.cli import main
+from sb3_quad.dynamics.authority import authority, gyration_ratio
+from sb3_quad.dynamics.vehicle import load_vehicle, vehicle_names
+from sb3_quad.envs.batch import QuadcopterBatch
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.vehicle_tables import doubts, lost_whatever_flies
+from sb3_quad.experts.geometric import GeometricExpert, derived_gains
+
+ITM = load_vehicle("itm")
+names = st.sampled_from(vehicle_names())
+
+
+@given(names, st.lists(st.floats(-1, 1), min_size=4, max_size=4))
+def test_no_thrusts_within_the_limits_give_more(name, actions):
+    vehicle = load_vehicle(name)
+    able = authority(vehicle)
+    lift, *moments = vehicle.mixer @ vehicle.action_to_thrust(np.array(actions))
+    assert (np.abs(moments) <= able.moments * (1 + 1e-9)).all()
+    weight = vehicle.mass * vehicle.gravity
+    assert able.least_thrust * weight * (1 - 1e-9) <= lift <= able.thrust_to_weight * weight * (1 + 1e-9)
+
+
+@given(names, st.integers(0, 2), st.sampled_from([-1.0, 1.0]))
+def test_moments_in_hover_can_be_had_and_no_more(name, axis, sign):
+    vehicle = load_vehicle(name)
+    wrench = np.array([vehicle.mass * vehicle.gravity, 0.0, 0.0, 0.0])
+    wrench[1 + axis] = sign * authority(vehicle).hover_moments[axis]
+    low, high = vehicle.thrust_range
+    thrusts = vehicle.mixer_inverse @ wrench
+    assert (thrusts >= low * (1 - 1e-9)).all() and (thrusts <= high * (1 + 1e-9)).all()
+    wrench[1 + axis] *= 1.001
+    both = [vehicle.mixer_inverse @ (wrench * [1, turn, turn, turn]) for turn in (1, -1)]
+    assert any((each < low).any() or (each > high).any() for each in both)
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_the_environment_accelerates_as_authority_says(name):
+    """Full thrust upwards once the motors have settled; full roll for as long as it turns below 100 rad/s, so not quite."""
+    vehicle = load_vehicle(name)
+    able = authority(vehicle)
+    batch = QuadcopterBatch(1, "target_tracking", vehicle=vehicle, noise=0.0, seed=0)
+    climbing = accelerations(batch, np.ones((1, 4), dtype=np.float32), 9, 80)
+    assert climbing[-1] == pytest.approx(able.climb, rel=1e-3)
+    for axis in range(3):
+        turning = accelerations(batch, np.sign(vehicle.mixer[None, 1 + axis]).astype(np.float32), 10 + axis, 20)
+        assert 0.85 * able.accelerations[axis] < turning.max() <= able.accelerations[axis] * (1 + 1e-9)
+
+
+def accelerations(batch, action, row, steps):
+    """Of one number of the state under a constant action, from hover."""
+    batch.reset()
+    values = np.array([(batch.step(action), batch.state[row, 0])[1] for _ in range(steps)])
+    return np.diff(values) / batch.vehicle_list[0].control_step
+
+
+@pytest.mark.parametrize("name", ["crazyflie", "hummingbird"])
+def test_the_geometric_expert_flies_them_with_gains_derived_or_found(name):
+    vehicle = load_vehicle(name)
+    for gains in (None, derived_gains(vehicle)):
+        expert = GeometricExpert(vehicle, gains)
+        recovery = fly(expert, "state_recovery", 240, 5, vehicle, noise=0.0, max_steps=600)
+        tracking = fly(expert, "target_tracking", 60, 5, vehicle, noise=0.0, max_steps=1000)
+        assert recovery.success.mean() > 0.99 and tracking.success.all()
+        assert np.nanmean(tracking.time_to[0.1]) < 3.0 and tracking.final_error.max() < 0.01
+
+
+def test_doubts_are_about_units():
+    assert not any(doubts(load_vehicle(name), authority(load_vehicle(name))) for name in vehicle_names())
+    in_grams = ITM.model_copy(update={"inertia": tuple(1000 * each for each in ITM.inertia)})
+    weak = ITM.model_copy(update={"thrust_limits": (0.5, 1.1)})
+    bulky = ITM.model_copy(update={"collision_radius": 13.5})
+    for vehicle, about in ((in_grams, "inertia"), (weak, "thrust"), (bulky, "collision_radius")):
+        assert [doubt.split(":")[0] for doubt in doubts(vehicle, authority(vehicle))] == [about]
+    np.testing.assert_allclose(gyration_ratio(in_grams), np.sqrt(1000) * gyration_ratio(ITM))
+
+
+def test_some_starts_are_lost_to_a_weak_vehicle_whatever_flies():
+    weak = ITM.model_copy(update={"thrust_limits": (0.9, 1.05)})
+    lost = lost_whatever_flies(weak, 200, 3)
+    assert lost > lost_whatever_flies(ITM, 200, 3) == 0
+    flown = fly(GeometricExpert(weak), "state_recovery", 200, 3, weak, noise=0.0)
+    assert (~flown.success).sum() >= lost
+
+
+def written(path, **changes):
+    data = {**ITM.model_dump(mode="json", exclude={"geometric_gains"}), **changes}
+    path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not None}))
+    return str(path)
+
+
+def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, capsys):
+    own = written(tmp_path / "own.yaml", name="own", mass=1.5, thrust_limits=None, rotor_thrust_limits=[2.0, 6.0])
+    assert main(["check-vehicle", own, "-n", "24"]) == 0
+    printed = capsys.readouterr().out
+    vehicle = load_vehicle(own)
+    assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed and "physical" in printed and "tune-expert" in printed
+    assert all(f"{each:.1f} rad/s²" in printed for each in authority(vehicle).accelerations)
+    assert re.search(r"success +│ +\S+ % .* 100 %", printed) and "mean time to 0.1 m" in printed and "0 of 24" in printed
+    assert "thesis" not in printed  # its figures are of another vehicle
+
+
+def test_nothing_is_flown_where_nothing_is_asked_for(capsys):
+    assert main(["check-vehicle", "crazyflie", "-n", "0"]) == 0
+    printed = capsys.readouterr().out
+    assert "0.02 to 0.1125 N" in printed and "success" not in printed
+
+
+def test_what_cannot_hover_leaves_with_1(tmp_path, capsys):
+    heavy = written(tmp_path / "heavy.yaml", mass=5.0, thrust_limits=None, rotor_thrust_limits=[2.0, 6.0])
+    assert main(["check-vehicle", heavy]) == 1
+    error = capsys.readouterr().err
+    assert error.startswith("cannot hover") and "heavy.yaml" in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mas": 1.0}, "did you mean 'mass'"),
+        ({"inertia": [0.1, 0.1, 0.5]}, "no rigid body"),
+        ({"mass": "heavy"}, "mass: "),
+    ],
+)
+def test_bad_files_leave_with_2(changes, message, tmp_path, capsys):
+    path = written(tmp_path / "bad.yaml", **changes)
+    assert main(["check-vehicle", path]) == 2
+    error = capsys.readouterr().err
+    assert message in error and path in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [(["nowhere.yaml"], "nowhere.yaml"), (["crazyfly"], "did you mean 'crazyflie'"), (["itm", "-n", "-1"], "at least 0")],
+)
+def test_mistakes_are_named(arguments, message, capsys):
+    assert main(["check-vehicle", *arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1

@@ -1,0 +1,117 @@
+"""Training, flying and evaluating a vehicle that is not the default one: by name, or by the file of a user's own."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from sb3_quad.cli import main
+from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.errors import ConfigError
+from sb3_quad.evaluation.evaluate import with_changes
+from sb3_quad.scenarios.load import load_suite
+from sb3_quad.training.config import load_config
+
+ENV = "QuadStateRecovery-v0"
+TINY = {
+    "n_envs": 8,
+    "n_steps": 16,
+    "batch_size": 64,
+    "n_timesteps": 256,
+    "env_kwargs": {"max_episode_steps": 12},
+    "policy_kwargs": {"net_arch": [8, 8]},
+}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A user's folder with a vehicle and a small pipeline in it."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    data = load_vehicle("crazyflie").model_dump(mode="json", exclude={"geometric_gains"})
+    (folder / "my.yaml").write_text(yaml.safe_dump({**data, "name": "my", "mass": 0.03}))
+    stages = [
+        {
+            "name": name,
+            "algo": algo,
+            "env": ENV,
+            "pass_on": "last",
+            "trim": "hover",
+            "settings": {**TINY, "expert": "geometric"},
+        }
+        for name, algo in (("one", "dagger"), ("two", "ppo_bc"))
+    ]
+    stages[1]["settings"] = {**stages[1]["settings"], "n_epochs": 1}
+    (folder / "stages.yml").write_text(yaml.safe_dump({"stages": stages}))
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("sb3_quad.cli.stages.FRESH_EPISODES", 4)
+    return folder
+
+
+@pytest.mark.parametrize("vehicle", ["my.yaml", "hummingbird"])
+def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(vehicle, here, tmp_path, monkeypatch, capsys):
+    command = ["train", "--conf-file", "stages.yml", "--env-kwargs", f"vehicle:{vehicle}", "--eval-episodes", "0"]
+    assert main([*command, "-f", str(here / "logs")]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("fresh episodes, the same for all") == 2 and "thesis" not in printed
+    settings = yaml.safe_load((here / "logs" / "ppo_bc" / f"{ENV}_1" / ENV / "config.yml").read_text())
+    flown = load_vehicle(settings["env_kwargs"]["vehicle"])
+    assert flown == load_vehicle(vehicle)
+    status = yaml.safe_load(next((here / "logs" / "stages").rglob("pipeline.yml")).read_text())
+    assert load_vehicle(status["stages"][0]["settings"]["env_kwargs"]["vehicle"]) == flown
+
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    monkeypatch.chdir(elsewhere)
+    assert main(["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", str(here / "logs"), "--no-render", "-n", "20"]) == 0
+    agent = here / "logs" / "ppo_bc" / f"{ENV}_1" / "trimmed_model.zip"
+    assert main(["export", str(agent), "--format", "c", "-o", "agent.h"]) == 0
+    assert flown.name in (elsewhere / "agent.h").read_text()
+
+
+def test_the_file_that_the_documentation_writes_flies(here, capsys):
+    text = (Path(__file__).resolve().parent.parent / "docs" / "vehicles.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, flags=re.DOTALL)
+    (here / "mine.yaml").write_text(block)
+    assert main(["check-vehicle", "mine.yaml", "-n", "48"]) == 0
+    printed = capsys.readouterr().out
+    assert "unusual" not in printed and "0 of 48" in printed
+
+
+def test_a_vehicle_that_is_not_there_is_named_before_anything_is_trained(here, capsys):
+    for vehicle, message in (("nowhere.yaml", "nowhere.yaml"), ("crazyfly", "did you mean 'crazyflie'")):
+        assert main(["train", "--conf-file", "stages.yml", "--env-kwargs", f"vehicle:{vehicle}"]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
+
+
+def test_the_path_of_a_vehicle_is_kept_whole_and_a_name_is_a_name(here):
+    config = load_config("dagger", ENV, None, {"env_kwargs": {"vehicle": "my.yaml"}})
+    assert config.settings["env_kwargs"]["vehicle"] == config.env_kwargs["vehicle"] == str(here / "my.yaml")
+    (here / "itm").write_text("a file that only happens to be called so")
+    assert load_config("dagger", ENV, None, {"env_kwargs": {"vehicle": "itm"}}).env_kwargs["vehicle"] == "itm"
+
+
+def test_a_suite_flown_by_another_vehicle(here, capsys):
+    command = ["evaluate", "pid", "geometric", "--suite", "quick", "--scenario", "tracking", "--episodes", "4", "--no-report"]
+    assert main([*command, "--vehicle", "my.yaml", "-o", "out"]) == 0
+    assert "thesis" not in capsys.readouterr().out
+    results = json.loads((here / "out" / "results.json").read_text())
+    assert results["scenarios"][0]["vehicle"] == str(here / "my.yaml")
+    assert results["scenarios"][0]["reference"] == {}
+    assert main([*command, "--vehicle", "hummingbird", "-o", "out"]) == 2  # other flights of the same name
+    assert "another scenario" in capsys.readouterr().err
+
+
+def test_scenarios_that_a_vehicle_cannot_fly_are_named(here):
+    suite = load_suite("quick")
+    with pytest.raises(ConfigError, match="did you mean 'hummingbird'"):
+        with_changes(suite, vehicle="humingbird")
+    data = yaml.safe_load((here / "my.yaml").read_text())
+    (here / "huge.yaml").write_text(yaml.safe_dump({**data, "collision_radius": 16.0}))
+    with pytest.raises(ConfigError, match=r"scenario tracking, flown by huge\.yaml: .*touches the ground"):
+        with_changes(suite, vehicle="huge.yaml")
