@@ -151,7 +151,21 @@ def session(tmp_path_factory):
     commands = [
         [*dagger, "--env-kwargs", "noise:0.1"],
         ["train", "--algo", "ppo_bc", *common, "--eval-freq", "-1", "-i", agent, "-params", "vec_env:'dummy'", "n_envs:2"],
-        *([*dagger, "-optimize", "--n-trials", "1", "--storage", "study.log", "--study-name", "s", "--no-optim-plots"],),
+        *(
+            [
+                *dagger,
+                "-optimize",
+                "--n-trials",
+                "1",
+                "--storage",
+                "study.log",
+                "--study-name",
+                "s",
+                "--no-optim-plots",
+                "-f",
+                "search",
+            ],
+        ),
         ["enjoy", "--algo", "dagger", "--env", ENV, "-f", "logs", "--no-render", "-n", "40", "--load-best"],
         ["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", "ours", "--no-render", "-n", "40"],
         ["plot_train", "-a", "dagger", "-e", ENV, "-f", "logs", "-y", "success", "-w", "2"],
@@ -207,7 +221,7 @@ def test_a_second_stage_starts_from_the_first(session):
 def test_its_search_goes_through_our_spaces(session):
     folder, (_, _, said, *_) = session
     assert "Number of finished trials:  1" in said and "gradient_steps:" in said
-    assert (folder / "study.log").is_file() and list((folder / "logs" / "dagger").glob("report_*.csv"))
+    assert (folder / "study.log").is_file() and list((folder / "search" / "dagger").glob("report_*.csv"))
 
 
 @with_zoo
