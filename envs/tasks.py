@@ -88,6 +88,7 @@ TASKS: Mapping[str, Task] = {
         velocity_std=2.0,
         body_rates_std=4.0,
     ),
+    "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
 }
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 

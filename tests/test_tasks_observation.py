@@ -207,6 +207,9 @@ def test_targets_near_and_far():
     state = QuadcopterState(rows.state)
     assert np.quantile(state.distance, [0.0, 0.25, 0.5, 0.75, 1.0]) == pytest.approx([0, 6.25, 12.5, 18.75, 25], abs=0.5)
     assert np.linalg.norm(state.velocity, axis=1).min() > 0.0
+    state = QuadcopterState(start(20_000, "far_tracking").state)
+    assert np.quantile(state.distance, [0.0, 0.5, 1.0]) == pytest.approx([10, 17.5, 25], abs=0.3)
+    assert (state.velocity == 0.0).all() and (state.rotation[:, 2, 2] == 1.0).all()
 
 
 def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():

@@ -48,8 +48,8 @@ COMMANDS = {
     "publish": publish,
     "benchmark": benchmark,
     "plot": plot,
-    "check-vehicle": check_vehicle,
     "tune": tune,
+    "check-vehicle": check_vehicle,
     "tune-expert": tune_expert,
 }
 

@@ -10,13 +10,11 @@ if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
 
 FRESH_EPISODES = 240
-THESIS_VEHICLE = "itm"
+THESIS_VEHICLE = "itm"  # beside another one the thesis has no figures
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """The table of the agent of a job and of its expert over the same episodes, which no training has seen.
-
-    The thesis's figures stand beside those of its own vehicle only.
 
     :param job: of an environment of this package.
     """
@@ -28,7 +26,9 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
 
     config = for_evaluation(job)
     given = config.env_kwargs
-    keywords: dict[str, Any] = {key: given[key] for key in ("vehicle", "noise", "task_kwargs") if key in given}
+    keywords: dict[str, Any] = dict(config.flight_kwargs)
+    if "task_kwargs" in given:
+        keywords["task_kwargs"] = given["task_kwargs"]
     if "max_episode_steps" in given:
         keywords["max_steps"] = given["max_episode_steps"]
     expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))

@@ -80,7 +80,7 @@ def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
     from sb3_quad.scenarios.load import load_suite
     from sb3_quad.training.trainer import FRESH_SEED
 
-    keywords = {key: job.config.env_kwargs[key] for key in ("vehicle", "noise") if key in job.config.env_kwargs}
+    keywords = job.config.flight_kwargs
     suite = load_suite("thesis")
     for task in ENVIRONMENTS.values():
         columns = fly_all(pilots, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
@@ -100,7 +100,7 @@ def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:
 
 
 def _vehicle(job: TrainingJob) -> Any:
-    return job.config.env_kwargs.get("vehicle", "itm")
+    return job.config.env_kwargs.get("vehicle", THESIS_VEHICLE)
 
 
 def is_pipeline_run(folder: Path) -> bool:

@@ -37,7 +37,7 @@ def measure(policy: Any, n_episodes: int = N_EPISODES, **settings: Any) -> dict[
     parts = [fly(policy, "state_recovery", n_episodes, FIRST_SEED + k * n_episodes, **settings) for k in range(N_RECOVERIES)]
     rows = {RECOVERY: summarise(Flights.concatenate(parts))}
     for distance in DISTANCES:
-        task = {"task_kwargs": {"target_distance": distance}}
+        task: dict[str, Any] = {"task_kwargs": {"target_distance": distance}}
         flown = fly(policy, "target_tracking", n_episodes, FIRST_SEED + int(1000 * distance), **task, **settings)
         rows[f"targets {distance:.0f} m away"] = summarise(flown)
     return rows

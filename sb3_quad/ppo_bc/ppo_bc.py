@@ -155,7 +155,7 @@ class PPOBC(PPO):
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
         if self.use_sde and self.bc_loss == "nll" and self._ever_clones():
-            raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse' or 'huber'")
+            raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")
         self.bc_coef = FloatSchedule(self.bc_coef)
 
     def _excluded_save_params(self) -> list[str]:
