@@ -217,7 +217,20 @@ print(PPO.load(sys.argv[1], device="cpu").predict(np.zeros(18, dtype=np.float32)
         assert model.with_suffix(ending).stat().st_size > 10_000
     space = tmp_path / "space.yml"
     space.write_text("learning_rate: {low: 1.0e-3, high: 1.0e-2, log: true}\n")
-    search = ("--algo", "dagger", "-n", "1600", "--n-envs", "16", "--n-trials", "3", "--n-evaluations", "1", "--eval-episodes", "2")
+    search = (
+        "--algo",
+        "dagger",
+        "-n",
+        "1600",
+        "--n-envs",
+        "16",
+        "--n-trials",
+        "3",
+        "--n-evaluations",
+        "1",
+        "--eval-episodes",
+        "2",
+    )
     run(command, "tune", *search, *seed, *small, "--search-space", space, cwd=tmp_path)
     best = tmp_path / "logs" / "tune" / "dagger" / "QuadTargetTracking-v0_1" / "best.yml"
     run(command, "train", "--algo", "dagger", "--conf-file", best, "-n", "1600", "--eval-episodes", "0", cwd=tmp_path)
