@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from sb3_quad.lazy import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.callbacks.best_model import BestModel
@@ -30,24 +31,16 @@ __all__ = [
 ]
 
 _LAZY = {  # imported on first use: naming one waits for none of the others
-    "BestModel": "best_model",
-    "Checkpoint": "checkpoint",
-    "CoefficientSchedule": "coefficient_schedule",
-    "EpisodeLog": "episode_log",
-    "FlightMetrics": "flight_metrics",
-    "LastGoodModel": "last_good",
-    "ObservationStatistics": "observation_statistics",
-    "StopOnSignal": "stop",
-    "StopWhen": "stop",
-    "TrajectoryFigures": "trajectory_figures",
+    "BestModel": "sb3_quad.callbacks.best_model",
+    "Checkpoint": "sb3_quad.callbacks.checkpoint",
+    "CoefficientSchedule": "sb3_quad.callbacks.coefficient_schedule",
+    "EpisodeLog": "sb3_quad.callbacks.episode_log",
+    "FlightMetrics": "sb3_quad.callbacks.flight_metrics",
+    "LastGoodModel": "sb3_quad.callbacks.last_good",
+    "ObservationStatistics": "sb3_quad.callbacks.observation_statistics",
+    "StopOnSignal": "sb3_quad.callbacks.stop",
+    "StopWhen": "sb3_quad.callbacks.stop",
+    "TrajectoryFigures": "sb3_quad.callbacks.trajectory_figures",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(f"sb3_quad.callbacks.{_LAZY[name]}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+__getattr__, __dir__ = lazy_names(__name__, _LAZY)

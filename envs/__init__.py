@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from sb3_quad.lazy import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
@@ -21,12 +22,4 @@ _LAZY = {  # imported on first use: `import sb3_quad` waits neither for pybullet
     "Task": "sb3_quad.envs.tasks",
 }
 
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+__getattr__, __dir__ = lazy_names(__name__, _LAZY)

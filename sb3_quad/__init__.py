@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 # In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie beside this folder rather than inside it; an installed
 # package holds them inside, and then this does nothing.
@@ -13,6 +12,7 @@ if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").
     __path__.append(str(_checkout))
 
 from sb3_quad.envs.registration import register_environments  # noqa: E402
+from sb3_quad.lazy import lazy_names  # noqa: E402
 
 if TYPE_CHECKING:
     from sb3_quad.dagger.dagger import DAgger
@@ -35,12 +35,4 @@ _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do no
 
 register_environments()
 
-
-def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(_LAZY[name]), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *_LAZY})
+__getattr__, __dir__ = lazy_names(__name__, _LAZY)

@@ -7,6 +7,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from sb3_quad.cli.arguments import whole
+from sb3_quad.cli.compare import task_table
 from sb3_quad.cli.output import console
 from sb3_quad.errors import CannotHover, ConfigError
 
@@ -58,20 +59,15 @@ def run(options: argparse.Namespace) -> int:
 
 def _fly(source: str, vehicle: Vehicle, episodes: int, seed: int) -> None:
     from sb3_quad.envs.registration import ENVIRONMENTS
-    from sb3_quad.evaluation.summary import fly_all
-    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
     from sb3_quad.evaluation.vehicle_tables import lost_whatever_flies
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
-    from sb3_quad.scenarios.load import load_suite
 
-    suite = load_suite("thesis")
     gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
     pilots = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}
     for task in ENVIRONMENTS.values():
-        columns = fly_all(pilots, task, episodes, seed, vehicle=vehicle, noise=0.0)
-        title = f"{task}: {episodes} fresh episodes, the same for both, true state"
-        console().print(comparison(title, columns, suite.scenario(TASK_SCENARIOS[task]), ()))
+        title = "the same for both, true state"
+        console().print(task_table(pilots, task, episodes, seed, title, vehicle=vehicle, noise=0.0))
     lost = lost_whatever_flies(vehicle, episodes, seed)
     print(f"{lost} of {episodes} recoveries certainly end at the ground, whatever flies (a lower bound: docs/experts.md)")
     if vehicle.geometric_gains is None:

@@ -1,7 +1,8 @@
-"""One agent and its expert in a table."""
+"""Controllers on the same episodes of a task, in a table."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -13,15 +14,30 @@ FRESH_EPISODES = 240
 THESIS_VEHICLE = "itm"  # beside another one the thesis has no figures
 
 
+def task_table(
+    pilots: Mapping[str, Any], task: str, n_episodes: int, seed: int, title: str, beside: Iterable[str] = (), **keywords: Any
+) -> Table:
+    """The table of some controllers over the same episodes of a task.
+
+    :param title: what follows the task's name and the number of fresh episodes.
+    :param beside: the columns of the thesis that stand beside them.
+    :param keywords: further arguments of :func:`~sb3_quad.evaluation.flights.fly`, such as ``vehicle``.
+    """
+    from sb3_quad.evaluation.summary import fly_all
+    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
+    from sb3_quad.scenarios.load import load_suite
+
+    columns = fly_all(pilots, task, n_episodes, seed, **keywords)
+    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[task])
+    return comparison(f"{task}: {n_episodes} fresh episodes, {title}", columns, scenario, beside)
+
+
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """The table of the agent of a job and of its expert over the same episodes, which no training has seen.
 
     :param job: of an environment of this package.
     """
-    from sb3_quad.evaluation.summary import fly_all
-    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
     from sb3_quad.experts.resolve import resolve_expert
-    from sb3_quad.scenarios.load import load_suite
     from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
 
     config = for_evaluation(job)
@@ -33,9 +49,7 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
         keywords["max_steps"] = given["max_episode_steps"]
     expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
     pilots = {"agent": model, "expert": expert}
-    columns = fly_all(pilots, config.task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
     agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
-    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[str(config.task)])
-    title = f"{config.task}: {FRESH_EPISODES} fresh episodes, the same for both"
     beside = (agent, "expert") if keywords.get("vehicle", THESIS_VEHICLE) == THESIS_VEHICLE else ()
-    return comparison(title, columns, scenario, beside)
+    seed = job.seed + FRESH_SEED
+    return task_table(pilots, str(config.task), FRESH_EPISODES, seed, "the same for both", beside, **keywords)

@@ -18,7 +18,9 @@ the card it is flown over fresh episodes: 3,840 recoveries, 960 targets at each 
 
 examples:
   sb3-quad publish logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent --command "sb3-quad train --seed 0"
-  sb3-quad publish agent.zip --name my-agent --command "python my_script.py" -o published --episodes 240
+  sb3-quad publish logs/ppo/QuadStateRecovery-v0_2/best_model.zip --name other --command "python my.py" -o published
+
+The zip must lie in its run folder, which says how it was trained.
 """
 
 

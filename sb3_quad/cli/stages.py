@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.cli.compare import THESIS_VEHICLE
+from sb3_quad.cli.compare import THESIS_VEHICLE, task_table
 from sb3_quad.cli.output import console
 from sb3_quad.errors import ConfigError
 
@@ -75,19 +75,13 @@ def finish(result: PipelineResult, reference: bool, seconds: float, first: Train
 def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
     """Both tasks, all pilots on the same fresh episodes; beside ITM's the thesis's figures."""
     from sb3_quad.envs.registration import ENVIRONMENTS
-    from sb3_quad.evaluation.summary import fly_all
-    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
-    from sb3_quad.scenarios.load import load_suite
     from sb3_quad.training.trainer import FRESH_SEED
 
-    keywords = job.config.flight_kwargs
-    suite = load_suite("thesis")
+    beside = THESIS_PILOTS if _vehicle(job) == THESIS_VEHICLE else ()
+    seed = job.seed + FRESH_SEED
     for task in ENVIRONMENTS.values():
-        columns = fly_all(pilots, task, FRESH_EPISODES, job.seed + FRESH_SEED, **keywords)
-        scenario = suite.scenario(TASK_SCENARIOS[task])
-        title = f"{task}: {FRESH_EPISODES} fresh episodes, the same for all"
-        beside = THESIS_PILOTS if _vehicle(job) == THESIS_VEHICLE else ()
-        console().print(comparison(title, columns, scenario, beside))
+        table = task_table(pilots, task, FRESH_EPISODES, seed, "the same for all", beside, **job.config.flight_kwargs)
+        console().print(table)
 
 
 def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:

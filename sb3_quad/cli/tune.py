@@ -157,9 +157,9 @@ def _tell(search: Search, folder: Path) -> None:
     """The best trials, the best agent on fresh episodes, and where everything is."""
     from sb3_quad.training.files import write_bytes
     from sb3_quad.tuning.picture import draw_search
-    from sb3_quad.tuning.results import BEST, TRIALS
+    from sb3_quad.tuning.results import BEST, TRIALS, train_command
 
-    config, best = search.job.config, search.best
+    best = search.best
     written = [TRIALS]
     if best is not None:
         buffer = io.BytesIO()
@@ -172,8 +172,7 @@ def _tell(search: Search, folder: Path) -> None:
     where = f"--storage {search.options.storage} --study-name {search.options.name}"
     say(f"to go on, the same command with {where}")
     if best is not None:
-        start = f" -i {search.job.trained_agent}" if search.job.trained_agent else ""
-        say(f"to train: sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {folder / BEST}{start}")
+        say(f"to train: {train_command(search, folder / BEST)}")
 
 
 def _fly(search: Search, best: FrozenTrial) -> None:

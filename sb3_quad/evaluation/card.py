@@ -73,10 +73,9 @@ def write_card(name: str, rows: Mapping[str, Figures], origin: Origin, settings:
             "## Loading it",
             "",
             "```python",
-            "import sb3_quad",
             "from stable_baselines3 import PPO",
             "",
-            f'model = PPO.load(sb3_quad.pretrained("{name}"))  # or, where sb3_quad is not installed, the path of the zip',
+            f'model = PPO.load("{name}.zip", device="cpu")  # the file beside this card',
             "```",
             "",
         ]

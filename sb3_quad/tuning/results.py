@@ -50,15 +50,20 @@ def in_words(search: Search, trial: FrozenTrial) -> str:
 
 def best_yaml(search: Search, best: FrozenTrial, path: Path) -> str:
     """A trial's settings as ``train --conf-file`` takes them."""
-    config = search.job.config
-    start = f" -i {search.job.trained_agent}" if search.job.trained_agent else ""
     how, episodes = in_words(search, best), search.job.eval_episodes
     lines = [
         f"# Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.options.name}.",
         f"# {how} over {episodes} episodes, by which it was chosen; seed {search.job.seed}.",
-        f"# sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {path}{start}",
+        f"# {train_command(search, path)}",
     ]
-    return "\n".join(lines) + "\n" + yaml.safe_dump({config.env_id: settings_of(best)}, sort_keys=False)
+    return "\n".join(lines) + "\n" + yaml.safe_dump({search.job.config.env_id: settings_of(best)}, sort_keys=False)
+
+
+def train_command(search: Search, path: Path) -> str:
+    """What trains with the settings of a file, as the trials were."""
+    config = search.job.config
+    start = f" -i {search.job.trained_agent}" if search.job.trained_agent else ""
+    return f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {path}{start}"
 
 
 def trials_csv(search: Search) -> str:
