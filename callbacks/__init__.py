@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sb3_quad.lazy import lazy_names
+from sb3_quad.base.lazy import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.callbacks.best_model import BestModel
@@ -12,10 +12,10 @@ if TYPE_CHECKING:
     from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule
     from sb3_quad.callbacks.episode_log import EpisodeLog
     from sb3_quad.callbacks.flight_metrics import FlightMetrics
-    from sb3_quad.callbacks.last_good import LastGoodModel
     from sb3_quad.callbacks.observation_statistics import ObservationStatistics
     from sb3_quad.callbacks.stop import StopOnSignal, StopWhen
     from sb3_quad.callbacks.trajectory_figures import TrajectoryFigures
+    from sb3_quad.training.last_good import LastGoodModel
 
 __all__ = [
     "BestModel",
@@ -36,7 +36,7 @@ _LAZY = {  # imported on first use: naming one waits for none of the others
     "CoefficientSchedule": "sb3_quad.callbacks.coefficient_schedule",
     "EpisodeLog": "sb3_quad.callbacks.episode_log",
     "FlightMetrics": "sb3_quad.callbacks.flight_metrics",
-    "LastGoodModel": "sb3_quad.callbacks.last_good",
+    "LastGoodModel": "sb3_quad.training.last_good",
     "ObservationStatistics": "sb3_quad.callbacks.observation_statistics",
     "StopOnSignal": "sb3_quad.callbacks.stop",
     "StopWhen": "sb3_quad.callbacks.stop",

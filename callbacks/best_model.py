@@ -13,9 +13,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.common.labels import ExpertLabeller
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.files import save_model, write_bytes
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import save_model, write_bytes
+from sb3_quad.experts.controller import ExpertLabeller
 
 GoesOn = Callable[[float, float], bool]
 

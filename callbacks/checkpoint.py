@@ -7,8 +7,8 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.files import save_model
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import save_model
 
 
 class Checkpoint(BaseCallback):

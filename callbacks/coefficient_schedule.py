@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.utils import FloatSchedule
 
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 
 PROGRESS = "progress"
 

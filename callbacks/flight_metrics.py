@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
-from sb3_quad.envs.observation import DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.files import refuse_existing, write_bytes, write_text
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import refuse_existing, write_bytes, write_text
+from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE
 
 FloatArray = npt.NDArray[np.float64]
 GROUPS = {"position": slice(0, 3), "rotation": slice(3, 12), "velocity": slice(12, 15), "body_rates": slice(15, 18)}

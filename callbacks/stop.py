@@ -7,8 +7,8 @@ from pathlib import Path
 
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.training.files import save_model
-from sb3_quad.training.signals import StopSignals
+from sb3_quad.base.files import save_model
+from sb3_quad.base.signals import StopSignals
 
 
 class StopWhen(BaseCallback):

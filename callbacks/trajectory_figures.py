@@ -9,9 +9,9 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Figure
 
-from sb3_quad.envs.observation import OBSERVATION_SIZE
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
-from sb3_quad.errors import ConfigError
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure as Picture

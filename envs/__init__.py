@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sb3_quad.lazy import lazy_names
+from sb3_quad.base.lazy import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
     from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-    from sb3_quad.envs.tasks import TASKS, Task
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
+    from sb3_quad.simulation.tasks import TASKS, Task
 
 __all__ = ["TASKS", "QuadcopterEnv", "QuadcopterVecEnv", "QuadcopterVectorEnv", "Task"]
 
@@ -18,8 +18,8 @@ _LAZY = {  # imported on first use: `import sb3_quad` waits neither for pybullet
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
     "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",
-    "TASKS": "sb3_quad.envs.tasks",
-    "Task": "sb3_quad.envs.tasks",
+    "TASKS": "sb3_quad.simulation.tasks",
+    "Task": "sb3_quad.simulation.tasks",
 }
 
 __getattr__, __dir__ = lazy_names(__name__, _LAZY)

@@ -11,11 +11,11 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.envs.batch import QuadcopterBatch
-from sb3_quad.envs.observation import OBSERVATION_SIZE
-from sb3_quad.envs.tasks import TaskSpec
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.tasks import TaskSpec
 
 BoolArray = npt.NDArray[np.bool_]
 Observations = npt.NDArray[np.float32]
@@ -32,7 +32,7 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
     one in ``final_obs[i]`` and ``is_success``, ``distance``, ``collision`` and ``out_of_range`` in ``final_info``, each with
     the mask ``_final_obs``, ``_final_info`` and so on. Steps that end nowhere have empty infos.
 
-    The setters of the arguments are those of :attr:`batch`, a :class:`~sb3_quad.envs.batch.QuadcopterBatch`.
+    The setters of the arguments are those of :attr:`batch`, a :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]

@@ -11,16 +11,16 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 
-from sb3_quad.dynamics.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
-from sb3_quad.dynamics.state import STATE_SIZE, TARGET, QuadcopterState
-from sb3_quad.dynamics.streams import STEP, new_streams, stream_key
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.bullet import BulletBody
-from sb3_quad.envs.checks import check_options, check_size, vector
-from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE, observe
 from sb3_quad.envs.rendering import RENDER_MODES, Renderer
-from sb3_quad.envs.tasks import TaskSpec, reset_rows, resolve_tasks, score
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.simulation.checks import check_options, check_size, vector
+from sb3_quad.simulation.engine.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
+from sb3_quad.simulation.engine.streams import STEP, new_streams, stream_key
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE, observe
+from sb3_quad.simulation.state import STATE_SIZE, TARGET, QuadcopterState
+from sb3_quad.simulation.tasks import TaskSpec, reset_rows, resolve_tasks, score
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 FloatArray = npt.NDArray[np.float64]
 Observation = npt.NDArray[np.float32]
@@ -120,9 +120,9 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
-    | `task` | by id | a name, a :class:`~sb3_quad.envs.tasks.Task`, or a mixture `{name: weight}` drawn from at each reset |
+    | `task` | by id | a name, a :class:`~sb3_quad.simulation.tasks.Task`, or a mixture `{name: weight}` |
     | `task_kwargs` | `None` | fields of the task to override |
-    | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.dynamics.vehicle.Vehicle` |
+    | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.vehicles.vehicle.Vehicle` |
     | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
     | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |

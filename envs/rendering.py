@@ -9,12 +9,12 @@ import numpy as np
 import numpy.typing as npt
 import pybullet as p
 
-from sb3_quad.dynamics.state import POSITION, TARGET
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.envs.backdrop import Camera
+from sb3_quad.drawing.backdrop import Camera
+from sb3_quad.drawing.chase import FIELD_OF_VIEW, ChaseCamera
+from sb3_quad.drawing.scenery import RING, DrawnTarget, DrawnVehicle, DrawnWrench, rotor_turning, scale_of, take_picture
 from sb3_quad.envs.bullet import BulletBody
-from sb3_quad.envs.chase import FIELD_OF_VIEW, ChaseCamera
-from sb3_quad.envs.scenery import RING, DrawnTarget, DrawnVehicle, DrawnWrench, rotor_turning, scale_of, take_picture
+from sb3_quad.simulation.state import POSITION, TARGET
+from sb3_quad.vehicles.vehicle import Vehicle
 
 FloatArray = npt.NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from gymnasium import Env, Wrapper, spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.envs.batch import QuadcopterBatch
-from sb3_quad.envs.observation import OBSERVATION_SIZE
-from sb3_quad.envs.tasks import TaskSpec
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.vehicles.vehicle import Vehicle
 
 _SETTERS = ("target", "noise", "observation_mean", "observation_std", "max_episode_steps")
 _METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
@@ -32,7 +32,7 @@ class QuadcopterVecEnv(VecEnv):
     ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``distance``, ``collision`` and ``out_of_range``. The infos of other
     rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are fresh.
 
-    See :class:`~sb3_quad.envs.batch.QuadcopterBatch` for the arguments.
+    See :class:`~sb3_quad.simulation.batch.QuadcopterBatch` for the arguments.
     """
 
     def __init__(

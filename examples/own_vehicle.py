@@ -10,9 +10,9 @@ import argparse
 from pathlib import Path
 
 from sb3_quad import DAgger, GeometricExpert, PIDExpert
-from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument("--vehicle", default=str(Path(__file__).with_name("my_quadcopter.yaml")), help="a name or a YAML file")

@@ -15,13 +15,13 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.results_plotter import load_results
 
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.callbacks import best_model
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.checkpoint import Checkpoint
 from sb3_quad.callbacks.episode_log import EpisodeLog
-from sb3_quad.callbacks.last_good import LastGoodModel, random_state, set_random_state
 from sb3_quad.callbacks.stop import StopOnSignal, StopWhen
-from sb3_quad.errors import ConfigError, TrainingError
+from sb3_quad.training.last_good import LastGoodModel, random_state, set_random_state
 
 
 class Walk(gymnasium.Env):

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.cli import main
-from sb3_quad.dynamics.authority import authority, gyration_ratio
-from sb3_quad.dynamics.vehicle import load_vehicle, vehicle_names
-from sb3_quad.envs.batch import QuadcopterBatch
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.vehicle_tables import doubts, lost_whatever_flies
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
+from sb3_quad.report.vehicle import doubts, lost_whatever_flies
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.vehicles.authority import authority, gyration_ratio
+from sb3_quad.vehicles.vehicle import load_vehicle, vehicle_names
 
 ITM = load_vehicle("itm")
 names = st.sampled_from(vehicle_names())

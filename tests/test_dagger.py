@@ -13,11 +13,11 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.common.forward import actor_mean
 from sb3_quad.common.losses import CLONING_LOSSES, gaussian_entropy, gaussian_nll, l2_loss, mean_errors, value_loss
 from sb3_quad.dagger import DAgger
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.experts.pid import PIDExpert
 
 SMALL = {"n_steps": 32, "batch_size": 64, "n_epochs": 2, "seed": 3, "device": "cpu"}

@@ -10,8 +10,8 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.dagger.dataset import AggregatedDataset, draw_rows
-from sb3_quad.errors import ConfigError
 
 
 def pairs(first, n):

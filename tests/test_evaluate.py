@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.folder import load_results

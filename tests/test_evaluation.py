@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from sb3_quad.dynamics.vehicle import vehicle_names
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import comparison
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.load import load_suite
+from sb3_quad.vehicles.vehicle import vehicle_names
 
 BACKENDS = ("batch", "pybullet")
 

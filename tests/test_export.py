@@ -18,13 +18,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import A2C, PPO, SAC
 
+from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
-from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError, ExportError
 from sb3_quad.export import c_header, c_trial, policy
 from sb3_quad.export.network import build_network
 from sb3_quad.export.policy import FORMATS, export_policy
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 DOCS = (Path(__file__).resolve().parent.parent / "docs" / "export.md").read_text(encoding="utf-8")

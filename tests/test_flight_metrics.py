@@ -10,9 +10,9 @@ from stable_baselines3.common.env_util import make_vec_env
 
 import sb3_quad  # noqa: F401
 from sb3_quad import DAgger, GeometricExpert
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.callbacks import FlightMetrics
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
 
 SMALL = {"policy_kwargs": {"net_arch": [4]}, "seed": 0, "device": "cpu"}

@@ -7,12 +7,12 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.envs.observation import DEFAULT_STD
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
+from sb3_quad.simulation.observation import DEFAULT_STD
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.training.hover import trim_hover
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 @pytest.fixture

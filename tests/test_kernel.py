@@ -8,9 +8,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from sb3_quad.dynamics.kernel import control_step
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle, vehicle_names
+from sb3_quad.simulation.engine.kernel import control_step
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle, vehicle_names
 
 URDF = """<robot name="body"><link name="base"><inertial><mass value="{m!r}"/>
 <inertia ixx="{i[0]!r}" iyy="{i[1]!r}" izz="{i[2]!r}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""

@@ -16,9 +16,9 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 from stable_baselines3.common.vec_env import VecNormalize
 
 import sb3_quad  # noqa: F401
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.callbacks import ObservationStatistics
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 
 
 class Keep(BaseCallback):

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.evaluate import with_changes
 from sb3_quad.scenarios.load import load_suite
-from sb3_quad.training.config import load_config
+from sb3_quad.settings.config import load_config
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 ENV = "QuadStateRecovery-v0"
 TINY = {

@@ -10,9 +10,9 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError, TrainingError
 from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.training.pipeline import load_pipeline, make_jobs, run_pipeline, with_settings

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sb3_quad.cli import main
-from sb3_quad.evaluation.curves import plot_curves, read_curve
+from sb3_quad.report.curves import plot_curves, read_curve
 
 
 @pytest.fixture

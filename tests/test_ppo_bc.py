@@ -10,8 +10,8 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.common.losses import CLONING_LOSSES
-from sb3_quad.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.ppo_bc.forward import evaluate
 

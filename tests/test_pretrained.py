@@ -13,9 +13,9 @@ import stable_baselines3
 from stable_baselines3 import PPO
 
 import sb3_quad
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.resolve import resolve_expert

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.envs.batch import QuadcopterBatch
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.reach import least_height_lost
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 HIGH = {"start_position": (0.0, 0.0, 1000.0), "max_distance": 5000.0, "velocity_std": 4.0, "body_rates_std": 8.0}

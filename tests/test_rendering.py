@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.envs import meshes
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.drawing import meshes
+from sb3_quad.drawing.urdf import frame_urdfs, rotor_urdf, vehicle_urdf
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-from sb3_quad.envs.urdf import frame_urdfs, rotor_urdf, vehicle_urdf
-from sb3_quad.errors import ConfigError
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
 Picture = npt.NDArray[np.uint8]

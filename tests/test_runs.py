@@ -8,8 +8,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.files import write_bytes, write_text
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.training.runs import claim_run, open_run
 
 ENV = "QuadTargetTracking-v0"

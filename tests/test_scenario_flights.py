@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sb3_quad.errors import ConfigError, ControllerError
+from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.evaluation.flightlog import episode_arrays, flight_file, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.hits import find_limit

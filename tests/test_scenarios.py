@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.scenarios.draw import draw_episodes, wrench_changes
 from sb3_quad.scenarios.load import load_suite, parse_suite, suite_names
 from sb3_quad.scenarios.parts import VehicleChanges
 from sb3_quad.scenarios.scenario import Scenario, Suite
 from sb3_quad.scenarios.vary import axis_label
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 def suite(*entries: str) -> Suite:

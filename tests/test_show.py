@@ -15,22 +15,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
-from sb3_quad.dynamics.state import POSITION, TARGET
-from sb3_quad.envs.backdrop import Camera
+from sb3_quad.drawing import framing
+from sb3_quad.drawing.backdrop import Camera
+from sb3_quad.drawing.labels import header_height, side_by_side, with_header
+from sb3_quad.drawing.lines import draw_line, project
+from sb3_quad.drawing.scenery import SUPERSAMPLING, Picture
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-from sb3_quad.envs.scenery import SUPERSAMPLING, Picture
-from sb3_quad.errors import ControllerError
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.parts import Wrench
-from sb3_quad.show import framing, sequence
+from sb3_quad.settings.config import load_config
+from sb3_quad.show import sequence
 from sb3_quad.show.episodes import Setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, HOLD, Film
-from sb3_quad.show.labels import header_height, side_by_side, with_header
-from sb3_quad.show.lines import draw_line, project
 from sb3_quad.show.recording import record
 from sb3_quad.show.video import write_video
-from sb3_quad.training.config import load_config
+from sb3_quad.simulation.state import POSITION, TARGET
 from sb3_quad.training.runs import claim_run
 
 HIT = Wrench(start=0.1, duration=0.02, force=(-20, -20, 0), torque=(-5, -5, -5))

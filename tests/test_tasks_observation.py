@@ -8,13 +8,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sb3_quad.dynamics.state import QUATERNION, ROTOR_SPEEDS, STATE_SIZE, QuadcopterState
-from sb3_quad.dynamics.streams import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.envs.episodes import TASK_COLUMNS
-from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE, observe
-from sb3_quad.envs.tasks import TASK_PARAMETERS, TASKS, Task, reset_rows, resolve_tasks, score
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.engine.streams import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
+from sb3_quad.simulation.episodes import TASK_COLUMNS
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE, observe
+from sb3_quad.simulation.state import QUATERNION, ROTOR_SPEEDS, STATE_SIZE, QuadcopterState
+from sb3_quad.simulation.tasks import TASK_PARAMETERS, TASKS, Task, reset_rows, resolve_tasks, score
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 

@@ -8,11 +8,11 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.algorithms import ALGORITHMS
-from sb3_quad.training.config import build_config, check_environment, config_names, load_config, read_settings
-from sb3_quad.training.literals import parse_mapping, parse_number, parse_value
-from sb3_quad.training.values import qualified_classes
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.settings.algorithms import ALGORITHMS
+from sb3_quad.settings.config import build_config, check_environment, config_names, load_config, read_settings
+from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
+from sb3_quad.settings.values import qualified_classes
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}

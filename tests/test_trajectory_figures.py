@@ -9,9 +9,9 @@ import torch
 from stable_baselines3 import A2C, PPO, SAC
 from stable_baselines3.common.logger import Figure, KVWriter, Logger
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.callbacks.trajectory_figures import TrajectoryFigures
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 
 
 def small():

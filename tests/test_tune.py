@@ -18,9 +18,9 @@ from hypothesis import strategies as st
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.config import build_config, load_config
+from sb3_quad.settings.config import build_config, load_config
 from sb3_quad.tuning import search as search_module
 from sb3_quad.tuning.search import score
 from sb3_quad.tuning.space import load_space

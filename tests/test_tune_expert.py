@@ -14,13 +14,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.cli import main, tune_expert
-from sb3_quad.dynamics.gains import GAIN_NAMES, GeometricFigures, GeometricGains
-from sb3_quad.dynamics.vehicle import load_vehicle
 from sb3_quad.evaluation.expert_figures import by_start, start_groups, start_states
-from sb3_quad.training import expert_objective
-from sb3_quad.training.expert_objective import ExpertObjective
-from sb3_quad.training.expert_search import ExpertSearch
-from sb3_quad.training.vehicle_files import vehicle_text, with_gains
+from sb3_quad.tuning import expert_objective
+from sb3_quad.tuning.expert_objective import ExpertObjective
+from sb3_quad.tuning.expert_search import ExpertSearch
+from sb3_quad.tuning.vehicle_files import vehicle_text, with_gains
+from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricFigures, GeometricGains
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 GAINS = ITM.geometric_gains
@@ -74,7 +74,7 @@ def test_gains_survive_the_file_and_leave_the_rest_of_it(values, measured, where
 
 
 def test_gains_in_another_form_are_not_cut_in_half():
-    from sb3_quad.errors import ConfigError
+    from sb3_quad.base.errors import ConfigError
 
     with pytest.raises(ConfigError, match="remove it"):
         with_gains('{"name": "x", "geometric_gains": {"position": 1}}', GAINS)

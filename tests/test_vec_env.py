@@ -11,11 +11,11 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from sb3_quad.dynamics.vehicle import load_vehicle
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
 from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("target_tracking", "state_recovery")
 MIXTURE = {"target_tracking": 1.0, "state_recovery": 2.0}

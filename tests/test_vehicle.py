@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from sb3_quad.dynamics.vehicle import PARAMETER_NAMES, Vehicle, is_vehicle_file, load_vehicle, vehicle_names
-from sb3_quad.errors import CannotHover, ConfigError
+from sb3_quad.base.errors import CannotHover, ConfigError
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle, is_vehicle_file, load_vehicle, vehicle_names
 
 ITM = load_vehicle("itm")
 GAINS = ITM.model_dump(mode="json")["geometric_gains"]

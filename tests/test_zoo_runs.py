@@ -8,11 +8,11 @@ import pytest
 import yaml
 from stable_baselines3 import SAC
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.config import read_yaml
-from sb3_quad.training.zoo_yaml import ZooLoader
+from sb3_quad.settings.config import read_yaml
+from sb3_quad.settings.zoo_yaml import ZooLoader
 
 ENV = "QuadStateRecovery-v0"
 TAGGED = """!!python/object/apply:collections.OrderedDict

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
+from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.cli import (
     benchmark,
     check_vehicle,
@@ -20,7 +21,6 @@ from sb3_quad.cli import (
     tune_expert,
 )
 from sb3_quad.cli.arguments import Parser
-from sb3_quad.errors import ConfigError, SB3QuadError, unknown
 
 EPILOG = """examples:
   sb3-quad train                                                          both stages, imitation then PPO with cloning

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from sb3_quad.errors import ConfigError, unknown
-from sb3_quad.training.literals import parse_number, parse_value
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.settings.literals import parse_number, parse_value
 
 
 class Parser(argparse.ArgumentParser):

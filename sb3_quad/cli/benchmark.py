@@ -6,14 +6,14 @@ import argparse
 import json
 from typing import TYPE_CHECKING
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console
-from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sb3_quad.evaluation.benchmark import Measurement
+    from sb3_quad.training.benchmark import Measurement
 
 HELP = "Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop."
 EXAMPLES = """examples:
@@ -40,9 +40,9 @@ def run(options: argparse.Namespace) -> int:
     """Measure, print, write. Returns the exit code."""
     if min(options.sizes) < 1 or options.n_envs < 1 or options.seconds <= 0:
         raise ConfigError("--sizes and --n-envs must be at least 1, --seconds above 0")
-    from sb3_quad.evaluation.benchmark import ENV_ID, as_dict, single, training_loop, vectorised
-    from sb3_quad.training.config import config_names, load_config
-    from sb3_quad.training.files import write_text
+    from sb3_quad.base.files import write_text
+    from sb3_quad.settings.config import config_names, load_config
+    from sb3_quad.training.benchmark import ENV_ID, as_dict, single, training_loop, vectorised
 
     screen = console()
     default = f"geometric/{options.algo}.yml"

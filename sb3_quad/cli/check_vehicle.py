@@ -6,13 +6,13 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
+from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.compare import task_table
 from sb3_quad.cli.output import console
-from sb3_quad.errors import CannotHover, ConfigError
 
 if TYPE_CHECKING:
-    from sb3_quad.dynamics.vehicle import Vehicle
+    from sb3_quad.vehicles.vehicle import Vehicle
 
 HELP = "Say whether a vehicle can hover, what authority it has, and how the experts fly it."
 EXAMPLES = """examples:
@@ -38,9 +38,9 @@ def run(options: argparse.Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
     if options.episodes < 0 or not 0 <= options.seed < 2**31:
         raise ConfigError(f"--episodes {options.episodes}, --seed {options.seed}: must be at least 0")
-    from sb3_quad.dynamics.authority import authority
-    from sb3_quad.dynamics.vehicle import load_vehicle
-    from sb3_quad.evaluation.vehicle_tables import authority_table, doubts, parameter_table
+    from sb3_quad.report.vehicle import authority_table, doubts, parameter_table
+    from sb3_quad.vehicles.authority import authority
+    from sb3_quad.vehicles.vehicle import load_vehicle
 
     try:
         vehicle = load_vehicle(options.vehicle)
@@ -59,9 +59,9 @@ def run(options: argparse.Namespace) -> int:
 
 def _fly(source: str, vehicle: Vehicle, episodes: int, seed: int) -> None:
     from sb3_quad.envs.registration import ENVIRONMENTS
-    from sb3_quad.evaluation.vehicle_tables import lost_whatever_flies
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
+    from sb3_quad.report.vehicle import lost_whatever_flies
 
     gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
     pilots = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}

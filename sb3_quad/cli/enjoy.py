@@ -8,6 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.flights import (
     SINGLE,
@@ -19,7 +20,6 @@ from sb3_quad.cli.flights import (
     tell,
     write_film,
 )
-from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
     from sb3_quad.show.episodes import Setting
@@ -83,8 +83,8 @@ def run(options: argparse.Namespace) -> int:
 
 def _check(options: argparse.Namespace, window: bool) -> None:
     """What can be refused before anything is flown."""
+    from sb3_quad.base.files import refuse_existing
     from sb3_quad.show.video import check_video
-    from sb3_quad.training.files import refuse_existing
 
     if not options.controllers and not options.algo:
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
@@ -142,8 +142,8 @@ def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
 def _write_sequence(options: argparse.Namespace, episode: Sequence[Recording], size: tuple[int, int] | None) -> None:
     from PIL import Image
 
+    from sb3_quad.base.files import write_bytes
     from sb3_quad.show.sequence import sequence
-    from sb3_quad.training.files import write_bytes
 
     with status("drawing"):
         picture = sequence(episode, options.times, size)

@@ -9,10 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console
 from sb3_quad.cli.report import report
-from sb3_quad.errors import ConfigError, unknown
 
 if TYPE_CHECKING:
     from sb3_quad.evaluation.evaluate import Progress

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
@@ -42,9 +42,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Build, check, time, write. Returns the exit code."""
+    from sb3_quad.base.files import write_bytes
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
-    from sb3_quad.training.files import write_bytes
 
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))

@@ -8,8 +8,8 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.cli.arguments import whole
-from sb3_quad.errors import ConfigError, unknown
 
 if TYPE_CHECKING:
     from sb3_quad.show.agents import Agent
@@ -59,8 +59,8 @@ def agent_of_run(options: argparse.Namespace) -> Agent:
 
     :raises ConfigError: there is no such run or agent.
     """
+    from sb3_quad.settings.algorithms import get_algorithm
     from sb3_quad.show.agents import find_agent
-    from sb3_quad.training.algorithms import get_algorithm
 
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # says so if there is none of that name
@@ -100,7 +100,7 @@ def write_film(path: Path, episodes: Sequence[Sequence[Recording]], size: tuple[
 
 def make_size(options: argparse.Namespace) -> tuple[int, int] | None:
     """The size that is asked for."""
-    from sb3_quad.envs.checks import check_size
+    from sb3_quad.simulation.checks import check_size
 
     if not options.size:
         return None

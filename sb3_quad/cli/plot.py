@@ -7,7 +7,7 @@ import glob
 import io
 from pathlib import Path
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 
 HELP = "Draw learning curves: success and reward over transitions and wall-clock time, seeds as mean and range."
 EXAMPLES = """examples:
@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Read the runs, draw, write. Returns the exit code."""
-    from sb3_quad.evaluation.curves import plot_curves, read_curve
-    from sb3_quad.training.files import write_bytes
+    from sb3_quad.base.files import write_bytes
+    from sb3_quad.report.curves import plot_curves, read_curve
 
     groups = {}
     for text in options.groups:

@@ -7,10 +7,10 @@ import subprocess
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 
 if TYPE_CHECKING:
-    from sb3_quad.evaluation.card import Origin
+    from sb3_quad.report.card import Origin
 
 HELP = "Write a trained policy as a small zip for stock PPO, with a card: measured figures, command, seed, versions."
 EXAMPLES = """The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 read it too. For
@@ -37,10 +37,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Slim, fly, write. Returns the exit code."""
-    from sb3_quad.evaluation.card import measure, write_card
+    from sb3_quad.base.files import refuse_existing, write_bytes, write_text
     from sb3_quad.experts.models import load_model
-    from sb3_quad.training.files import refuse_existing, write_bytes, write_text
-    from sb3_quad.training.slim import slim_bytes
+    from sb3_quad.export.slim import slim_bytes
+    from sb3_quad.report.card import measure, write_card
 
     if options.episodes < 1:
         raise ConfigError(f"--episodes {options.episodes}: must be at least 1")
@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _settings(model: str) -> dict[str, Any]:
     """The settings of the environment that a policy is flown in, from its run folder."""
-    from sb3_quad.export.settings import trained_with
+    from sb3_quad.settings.trained_with import trained_with
 
     found = trained_with(model)
     if found.observation_mean is not None or found.observation_std is not None:
@@ -76,7 +76,7 @@ def _origin(options: argparse.Namespace) -> Origin:
     import torch
 
     import sb3_quad
-    from sb3_quad.evaluation.card import Origin
+    from sb3_quad.report.card import Origin
     from sb3_quad.training.runs import open_run
 
     run = open_run(Path(options.model).parent)

@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.flights import add_flight, agent_of_run, known_environment, make_size, status, tell, write_film
-from sb3_quad.errors import ConfigError
 from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Record a trained agent as a film; as enjoy --record does, with the flags and folders of rl-zoo's record_video."
@@ -35,11 +35,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Fly, draw, write. Returns the exit code."""
+    from sb3_quad.base.files import refuse_existing
     from sb3_quad.envs.registration import ENVIRONMENTS
     from sb3_quad.experts.models import load_model
     from sb3_quad.show.episodes import Setting, fly_all
     from sb3_quad.show.video import check_video
-    from sb3_quad.training.files import refuse_existing
 
     if (options.trained_agent is None) == (options.algo is None):
         raise ConfigError("whose flight? Give a run by --algo and --env, or an agent by -i; one of both")

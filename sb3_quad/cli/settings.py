@@ -8,12 +8,12 @@ import random
 import sys
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import pairs, whole
-from sb3_quad.errors import ConfigError
 from sb3_quad.pretrained_policies import agent_path
 
 if TYPE_CHECKING:
-    from sb3_quad.training.config import TrainingConfig
+    from sb3_quad.settings.config import TrainingConfig
 
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
@@ -56,7 +56,7 @@ def prepare(options: argparse.Namespace) -> None:
 
 def make_config(options: argparse.Namespace) -> TrainingConfig:
     """The settings that a command line describes."""
-    from sb3_quad.training.config import load_config
+    from sb3_quad.settings.config import load_config
 
     return load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, make_overrides(options))
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.compare import THESIS_VEHICLE, task_table
 from sb3_quad.cli.output import console
-from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob
@@ -86,7 +86,7 @@ def print_tables(pilots: Mapping[str, Any], job: TrainingJob) -> None:
 
 def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:
     """PPO alone on as many transitions as all stages had together."""
-    from sb3_quad.training.config import load_config
+    from sb3_quad.settings.config import load_config
 
     kept = {"vec_env": first.config.vec_env, "env_kwargs": first.config.flight_kwargs}
     config = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, {**kept, "n_timesteps": n_timesteps})

@@ -7,12 +7,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console
 from sb3_quad.cli.settings import add_settings, make_config, make_overrides, make_seed, prepare, say, shows_progress
 from sb3_quad.cli.stages import is_pipeline_run, resume_stages, run_stages
-from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
     from sb3_quad.training.job import TrainingJob

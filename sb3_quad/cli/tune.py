@@ -9,17 +9,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console
 from sb3_quad.cli.settings import add_settings, make_config, make_seed, prepare, say, shows_progress
-from sb3_quad.errors import ConfigError, SB3QuadError
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
     from rich.table import Table
 
-    from sb3_quad.training.signals import StopSignals
+    from sb3_quad.base.signals import StopSignals
     from sb3_quad.tuning.search import Search
 
 HELP = "Search for hyperparameters: trains with one choice after the other; writes the best as a settings file."
@@ -66,9 +66,9 @@ def run(options: argparse.Namespace) -> int:
     """Search, tell, write. Returns the exit code."""
     if options.n_trials < 0 or (options.max_total_trials is not None and options.max_total_trials < 1):
         raise ConfigError("--n-trials must be at least 0, --max-total-trials at least 1")
-    from sb3_quad.training.signals import StopSignals
-    from sb3_quad.training.study import require_optuna
+    from sb3_quad.base.signals import StopSignals
     from sb3_quad.tuning.results import write_results
+    from sb3_quad.tuning.study import require_optuna
 
     require_optuna("tune")
     prepare(options)
@@ -85,12 +85,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
     """The search that a command line describes, and the folder of its results, which is new."""
-    from sb3_quad.training.config import build_config
+    from sb3_quad.settings.config import build_config
     from sb3_quad.training.job import TrainingJob
     from sb3_quad.training.runs import claim_folder, file_name
-    from sb3_quad.training.study import check_names
     from sb3_quad.tuning.search import Search, StudyOptions
     from sb3_quad.tuning.space import load_space
+    from sb3_quad.tuning.study import check_names
 
     check_names(options.sampler, options.pruner)
     config = make_config(options)
@@ -155,7 +155,7 @@ def _line(search: Search, trial: FrozenTrial) -> str:
 
 def _tell(search: Search, folder: Path) -> None:
     """The best trials, the best agent on fresh episodes, and where everything is."""
-    from sb3_quad.training.files import write_bytes
+    from sb3_quad.base.files import write_bytes
     from sb3_quad.tuning.picture import draw_search
     from sb3_quad.tuning.results import BEST, TRIALS, train_command
 
@@ -178,7 +178,7 @@ def _tell(search: Search, folder: Path) -> None:
 def _fly(search: Search, best: FrozenTrial) -> None:
     """The best agent on episodes by which nothing was chosen, where its run folder is at hand."""
     from sb3_quad.experts.models import load_model
-    from sb3_quad.training.config import build_config
+    from sb3_quad.settings.config import build_config
     from sb3_quad.training.runs import open_run
     from sb3_quad.tuning.results import settings_of
     from sb3_quad.tuning.search import RUN

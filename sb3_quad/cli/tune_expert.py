@@ -7,16 +7,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console
-from sb3_quad.errors import ConfigError
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from sb3_quad.dynamics.gains import GeometricFigures
     from sb3_quad.evaluation.expert_figures import Recoveries
-    from sb3_quad.training.expert_search import ExpertSearch
+    from sb3_quad.tuning.expert_search import ExpertSearch
+    from sb3_quad.vehicles.gains import GeometricFigures
 
 HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the figures they reach."
 EXAMPLES = """examples:
@@ -50,13 +50,13 @@ def run(options: argparse.Namespace) -> int:
     """Search, measure on fresh episodes, write. Returns the exit code."""
     if min(options.trials, options.starts, options.targets) < 1 or options.seed < 0:
         raise ConfigError("--trials, --starts and --targets must be at least 1, --seed at least 0")
-    from sb3_quad.dynamics.vehicle import load_vehicle
+    from sb3_quad.base.files import write_text
+    from sb3_quad.base.signals import StopSignals
     from sb3_quad.evaluation.expert_figures import measure_expert
     from sb3_quad.experts.geometric import GeometricExpert, derived_gains
-    from sb3_quad.training.expert_search import ExpertSearch
-    from sb3_quad.training.files import write_text
-    from sb3_quad.training.signals import StopSignals
-    from sb3_quad.training.vehicle_files import vehicle_text, with_gains
+    from sb3_quad.tuning.expert_search import ExpertSearch
+    from sb3_quad.tuning.vehicle_files import vehicle_text, with_gains
+    from sb3_quad.vehicles.vehicle import load_vehicle
 
     text = vehicle_text(options.vehicle)
     vehicle = load_vehicle(options.vehicle)

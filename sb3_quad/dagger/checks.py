@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from gymnasium import spaces
 
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.common.losses import CLONING_LOSSES
-from sb3_quad.errors import ConfigError, unknown
 
 if TYPE_CHECKING:
     from sb3_quad.dagger.dagger import DAgger

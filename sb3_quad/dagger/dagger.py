@@ -20,8 +20,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.common.forward import actor_mean, critic_values
-from sb3_quad.common.labels import ExpertLabeller
 from sb3_quad.common.losses import (
     CloningLoss,
     cloning_loss,
@@ -32,7 +32,7 @@ from sb3_quad.common.losses import (
 )
 from sb3_quad.dagger.checks import check_arguments, check_spaces
 from sb3_quad.dagger.dataset import AggregatedDataset, draw_rows
-from sb3_quad.errors import ConfigError, TrainingError
+from sb3_quad.experts.controller import ExpertLabeller
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -64,7 +64,7 @@ class DAgger(OnPolicyAlgorithm):
         ``log_std_init``, it begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3
-        model, or a function from observations to actions; :class:`~sb3_quad.common.labels.ExpertLabeller` says what
+        model, or a function from observations to actions; :class:`~sb3_quad.experts.controller.ExpertLabeller` says what
         each is shown. Never saved: give it again to ``load``, or call :meth:`set_expert`, before learning goes on
     :param learning_rate: The learning rate, it can be a function
         of the current progress remaining (from 1 to 0)

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_quad.common.files import atomic_write
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import atomic_write
 
 
 class AggregatedDataset:

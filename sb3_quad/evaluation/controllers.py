@@ -13,13 +13,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sb3_quad.envs.observation import OBSERVATION_SIZE
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.records import ControllerRecord
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.experts.models import saved_algorithm
 from sb3_quad.experts.resolve import EXPERTS, resolve_expert
 from sb3_quad.pretrained_policies import agent_path
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 Scaling = Literal["none", "adaptive"]
 SCALINGS = ("none", "adaptive")

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from sb3_quad.dynamics.vehicle import is_vehicle_file, load_vehicle
-from sb3_quad.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.evaluation.controllers import ControllerSpec, describe, measured
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.folder import ResultFolder
@@ -16,6 +15,7 @@ from sb3_quad.evaluation.jobs import Job, make_job, run_jobs
 from sb3_quad.evaluation.records import ControllerRecord, Failure, Results
 from sb3_quad.scenarios.load import explain
 from sb3_quad.scenarios.scenario import Scenario, Suite
+from sb3_quad.vehicles.vehicle import is_vehicle_file, load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
 

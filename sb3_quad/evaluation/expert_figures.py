@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.gains import GeometricFigures
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.gains import GeometricFigures
+from sb3_quad.vehicles.vehicle import Vehicle
 
 Groups = Mapping[str, Mapping[str, npt.NDArray[np.bool_]]]
 NEAR = 0.1  # m
@@ -53,7 +53,7 @@ def measure_expert(
 
 def start_states(task: str, episodes: int, seed: int, vehicle: Vehicle) -> QuadcopterState:
     """The states in which the episodes of :func:`~sb3_quad.evaluation.flights.fly` with the same arguments begin."""
-    from sb3_quad.envs.batch import QuadcopterBatch
+    from sb3_quad.simulation.batch import QuadcopterBatch
 
     batch = QuadcopterBatch(episodes, task=task, vehicle=vehicle, noise=0.0, seed=seed)
     batch.reset()

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 MAX_CLIENTS = 512  # PyBullet allows about 1000 physics clients in a process
 Observation = npt.NDArray[np.float32]

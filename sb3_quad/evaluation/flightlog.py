@@ -40,8 +40,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.state import QuadcopterState
 
 if TYPE_CHECKING:
     from sb3_quad.evaluation.flights import Flights

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
-from sb3_quad.dynamics.vehicle import Vehicle
+from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
-from sb3_quad.errors import ConfigError, ControllerError, SB3QuadError, unknown
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.evaluation.controllers import file_name
 from sb3_quad.evaluation.flightlog import Arrays, flight_file, read_flights
 from sb3_quad.evaluation.records import Entry, Results
-from sb3_quad.training.files import write_bytes, write_text
 
 RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
 _START = (

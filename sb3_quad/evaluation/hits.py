@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.intervals import share
 from sb3_quad.evaluation.records import Estimate, HitLimit, HitTrial
 from sb3_quad.evaluation.scenario_flights import fly_scenario

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.errors import SB3QuadError
+from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.evaluation.controllers import ControllerSpec, build
 from sb3_quad.evaluation.flightlog import episode_arrays
 from sb3_quad.evaluation.folder import ResultFolder
@@ -111,7 +111,7 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | F
 def _begin_worker() -> None:
     import torch
 
-    from sb3_quad.training.signals import ignore_interrupts
+    from sb3_quad.base.signals import ignore_interrupts
 
     ignore_interrupts()  # the process that started the workers ends them
     torch.set_num_threads(1)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.envs.observation import DEFAULT_STD
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.simulation.observation import DEFAULT_STD
 
 FloatArray = npt.NDArray[np.float64]
 Observation = npt.NDArray[np.float32]

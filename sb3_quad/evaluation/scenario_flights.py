@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Arrays, Recorder
 from sb3_quad.evaluation.flights import Flights, Plan, fly_fleet

@@ -8,17 +8,17 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.authority import command_lag, greatest_moments
-from sb3_quad.dynamics.gains import GeometricGains
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle
 from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.authority import command_lag, greatest_moments
+from sb3_quad.vehicles.gains import GeometricGains
+from sb3_quad.vehicles.vehicle import Vehicle
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
 
-    The units are the lag τ from a command to its thrust (:func:`~sb3_quad.dynamics.authority.command_lag`); the greatest
+    The units are the lag τ from a command to its thrust (:func:`~sb3_quad.vehicles.authority.command_lag`); the greatest
     angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
     upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
     limits in hover thrusts.

@@ -8,10 +8,10 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle
 
 ANGLE_FACTOR = 0.25  # φ_des and θ_des are taken at a quarter, "to ensure smoother rotations" (3.2.1)
 

@@ -7,11 +7,11 @@ from abc import ABC, abstractmethod
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.rotation import nearest_rotation, quaternion_from_rotation
-from sb3_quad.dynamics.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD
-from sb3_quad.errors import ExpertError
+from sb3_quad.base.errors import ExpertError
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
+from sb3_quad.simulation.rotation import nearest_rotation, quaternion_from_rotation
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Actions = npt.NDArray[np.float32]
 
@@ -26,7 +26,7 @@ class Expert(ABC):
     Anything with such an ``actions(state)`` method can teach; this class adds ``predict``, so that
     ``evaluate_policy(PIDExpert(), env)`` works as for an SB3 model.
 
-    :param vehicle: name, YAML path or :class:`~sb3_quad.dynamics.vehicle.Vehicle` that the expert is designed for.
+    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that the expert is designed for.
     :param observation_mean: μ of Eq. 3.16, shape (18,), that :meth:`predict` undoes; None for the environment's default.
     :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
     """

@@ -8,8 +8,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 FloatArray = npt.NDArray[np.float64]
 HORIZON = 20.0  # s; a fall that is not over by then counts as lost height until then

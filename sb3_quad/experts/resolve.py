@@ -7,10 +7,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.errors import ConfigError, ExpertError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
 from sb3_quad.experts.models import load_model
 from sb3_quad.pretrained_policies import agent_path, pretrained_names
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.experts.geometric:GeometricExpert"}
 

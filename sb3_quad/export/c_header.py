@@ -9,9 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.envs.observation import OBSERVATION_SIZE
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.export.network import N_ROTORS, Layer, Network
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 WIDTH = 110  # columns
 

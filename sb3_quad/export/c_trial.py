@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from sb3_quad.envs.observation import OBSERVATION_SIZE
-from sb3_quad.errors import ExportError
+from sb3_quad.base.errors import ExportError
 from sb3_quad.export.check import Trial
 from sb3_quad.export.network import N_ROTORS, Float32Array, Network
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 COMPILERS = ("cc", "gcc", "clang")
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")

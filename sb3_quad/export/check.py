@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.envs.batch import QuadcopterBatch
-from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
-from sb3_quad.errors import ExportError
+from sb3_quad.base.errors import ExportError
 from sb3_quad.export.network import Float32Array, Output, actions_to_result, result_range
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.vehicles.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

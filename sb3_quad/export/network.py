@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.envs.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.vehicles.vehicle import Vehicle
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

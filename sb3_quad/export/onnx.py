@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.envs.observation import OBSERVATION_SIZE
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.export.check import Trial, time_calls
 from sb3_quad.export.network import N_ROTORS, Float32Array, Network
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 OPSET, IR_VERSION = 13, 7
 

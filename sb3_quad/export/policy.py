@@ -11,13 +11,13 @@ from typing import Any
 import numpy.typing as npt
 
 from sb3_quad import __version__
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.export import c_header, c_trial, onnx, torchscript
 from sb3_quad.export.check import N_OBSERVATIONS, Trial, draw_samples, largest_error
 from sb3_quad.export.network import Float32Array, Network, build_network, result_range
-from sb3_quad.export.settings import trained_with
+from sb3_quad.settings.trained_with import trained_with
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}
 """Each format and the ending of its files."""

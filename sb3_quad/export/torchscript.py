@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sb3_quad.envs.observation import OBSERVATION_SIZE
 from sb3_quad.export.check import Trial, time_calls
 from sb3_quad.export.network import Float32Array, Network
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 if TYPE_CHECKING:
     import torch as th

@@ -15,9 +15,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.common.labels import ExpertLabeller
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss
-from sb3_quad.errors import ConfigError, ExpertError, TrainingError, unknown
+from sb3_quad.experts.controller import ExpertLabeller
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer, ExpertRolloutBufferSamples
 from sb3_quad.ppo_bc.gradients import gradient_norms
 from sb3_quad.ppo_bc.loss import BC_FILTERS, LossTerms, Weights, loss_terms

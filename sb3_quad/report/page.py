@@ -7,14 +7,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import refuse_existing, write_bytes, write_text
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.records import Results
 from sb3_quad.report import interactive, pictures
 from sb3_quad.report.figures import LineFigure
 from sb3_quad.report.markdown import render_markdown
 from sb3_quad.report.sections import Section, sections
-from sb3_quad.training.files import refuse_existing, write_bytes, write_text
 
 PAGE, TABLES, PICTURES = "report.html", "report.md", "figures"
 
@@ -55,7 +55,7 @@ def render(results: Results, parts: list[Section], with_pictures: bool) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined
     from plotly.offline import get_plotlyjs
 
-    from sb3_quad.show.palette import colours_of
+    from sb3_quad.drawing.palette import colours_of
 
     figures = {figure.name: interactive.draw(figure) for section in parts for figure in section.figures}
     environment = Environment(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from itertools import groupby
 from pathlib import Path
 
+from sb3_quad.drawing.palette import colours_of
 from sb3_quad.evaluation.records import Entry, Results
 from sb3_quad.evaluation.tables import SUCCESS
 from sb3_quad.report.figures import Figure
@@ -15,7 +16,6 @@ from sb3_quad.report.tables import Cell, Row, Table, estimate_cell, mark_best, r
 from sb3_quad.report.tracks import read_tracks
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.scenarios.vary import axis_label
-from sb3_quad.show.palette import colours_of
 
 
 @dataclass(frozen=True)

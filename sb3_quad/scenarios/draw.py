@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.envs.tasks import Task
 from sb3_quad.scenarios.parts import Attitude, Draw, Wrench
 from sb3_quad.scenarios.scenario import Scenario
+from sb3_quad.simulation.tasks import Task
+from sb3_quad.vehicles.vehicle import Vehicle
 
 FloatArray = npt.NDArray[np.float64]
 _STREAM = 0x5B3  # so that these draws have nothing to do with those of the environment of the same seed

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.scenarios.scenario import Scenario, Suite
 from sb3_quad.scenarios.vary import expand
 

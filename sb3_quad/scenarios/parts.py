@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from sb3_quad.dynamics.quantities import Finite
-from sb3_quad.dynamics.vehicle import Vehicle
-from sb3_quad.errors import unknown
+from sb3_quad.base.errors import unknown
+from sb3_quad.base.quantities import Finite
+from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector = tuple[Finite, Finite, Finite]
 NotNegative = Annotated[Finite, Field(ge=0)]

@@ -10,10 +10,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, field_validator, model_validator
 
-from sb3_quad.dynamics.quantities import Finite
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.quantities import Finite
 from sb3_quad.scenarios.parts import Part, Positive, Start, Target, VehicleChanges, Wrench
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names

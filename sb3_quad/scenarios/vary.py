@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 
 MAX_CELLS = 1000
 _UNITS = dict(

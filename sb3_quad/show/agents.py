@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.literals import parse_mapping
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.runs import RunFolder, find_run, latest_checkpoint
 
 # Of the settings of an environment, those that a flight to be shown can have.

@@ -10,11 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
-from sb3_quad.envs.checks import vector
+from sb3_quad.base.errors import ConfigError, ControllerError, unknown
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
-from sb3_quad.envs.tasks import resolve_tasks
-from sb3_quad.errors import ConfigError, ControllerError, unknown
 from sb3_quad.evaluation.flights import Plan
 from sb3_quad.scenarios.draw import DrawnWrench, draw_episodes, wrench_changes
 from sb3_quad.scenarios.load import explain, load_suite
@@ -22,6 +19,9 @@ from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.show.agents import check_keywords
 from sb3_quad.show.recording import Recording, record
+from sb3_quad.simulation.checks import vector
+from sb3_quad.simulation.tasks import resolve_tasks
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
 @dataclass(frozen=True, eq=False)

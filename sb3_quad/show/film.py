@@ -7,15 +7,15 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import POSITION, TARGET
-from sb3_quad.envs.backdrop import Camera
-from sb3_quad.envs.scenery import rotor_turning
-from sb3_quad.show.framing import FIELD_OF_VIEW, broadside, following_cameras, framing_camera
-from sb3_quad.show.labels import side_by_side, with_header
-from sb3_quad.show.lines import project
-from sb3_quad.show.palette import colours_of, rgb, rgb255
+from sb3_quad.drawing.backdrop import Camera
+from sb3_quad.drawing.framing import FIELD_OF_VIEW, broadside, following_cameras, framing_camera
+from sb3_quad.drawing.labels import side_by_side, with_header
+from sb3_quad.drawing.lines import project
+from sb3_quad.drawing.palette import colours_of, rgb, rgb255
+from sb3_quad.drawing.scenery import rotor_turning
+from sb3_quad.drawing.stage import Pose, Scene, Stage, Trail
 from sb3_quad.show.recording import Recording
-from sb3_quad.show.stage import Pose, Scene, Stage, Trail
+from sb3_quad.simulation.state import POSITION, TARGET
 
 FloatArray = npt.NDArray[np.float64]
 Frame = npt.NDArray[np.uint8]

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.dynamics.state import POSITION, TARGET, QuadcopterState
-from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
 from sb3_quad.evaluation.fleets import PyBulletFleet
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import Plan, fly_fleet
+from sb3_quad.simulation.state import POSITION, TARGET, QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 FloatArray = npt.NDArray[np.float64]
 
@@ -26,7 +26,7 @@ class Recording:
     name        shape                 meaning
     ==========  ====================  =========================================================================
     times       (T + 1,)              s since the start
-    state       (STATE_SIZE, T + 1)   the true state, laid out as in :mod:`sb3_quad.dynamics.state`
+    state       (STATE_SIZE, T + 1)   the true state, laid out as in :mod:`sb3_quad.simulation.state`
     wrench      (12, T + 1)           that acted during the step before: force in the world and in the body
                                       frame (N), torques likewise (N m)
     reward                            sum of the rewards

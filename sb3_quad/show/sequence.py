@@ -8,15 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.envs.backdrop import Camera
-from sb3_quad.envs.scenery import rotor_turning
-from sb3_quad.envs.urdf import arm_length, rotor_radius
-from sb3_quad.show.framing import FIELD_OF_VIEW, broadside, framing_camera
-from sb3_quad.show.labels import Box, Canvas, overlap, side_by_side, tag_box, with_header
-from sb3_quad.show.lines import project
-from sb3_quad.show.palette import colours_of, rgb, rgb255
+from sb3_quad.drawing.backdrop import Camera
+from sb3_quad.drawing.framing import FIELD_OF_VIEW, broadside, framing_camera
+from sb3_quad.drawing.labels import Box, Canvas, overlap, side_by_side, tag_box, with_header
+from sb3_quad.drawing.lines import project
+from sb3_quad.drawing.palette import colours_of, rgb, rgb255
+from sb3_quad.drawing.scenery import rotor_turning
+from sb3_quad.drawing.stage import Pose, Scene, Stage, Trail
+from sb3_quad.drawing.urdf import arm_length, rotor_radius
 from sb3_quad.show.recording import Recording
-from sb3_quad.show.stage import Pose, Scene, Stage, Trail
 
 FloatArray = npt.NDArray[np.float64]
 Picture = npt.NDArray[np.uint8]

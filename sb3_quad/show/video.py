@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.files import write_bytes
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import write_bytes
 
 FORMATS = (".mp4", ".gif")
 

@@ -9,15 +9,15 @@ from collections.abc import Sequence
 import numpy as np
 import pybullet as p
 
-from sb3_quad.dynamics.state import POSITION, TARGET
-from sb3_quad.envs.bullet import has_display, open_window
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.drawing.client import has_display, open_window
+from sb3_quad.drawing.framing import broadside, following_cameras
+from sb3_quad.drawing.palette import colours_of, rgb
+from sb3_quad.drawing.scenery import DrawnTarget, DrawnVehicle, DrawnWrench, rotor_turning, scale_of
 from sb3_quad.envs.rendering import furnish_window, point_window
-from sb3_quad.envs.scenery import DrawnTarget, DrawnVehicle, DrawnWrench, rotor_turning, scale_of
-from sb3_quad.errors import ConfigError
 from sb3_quad.show.film import FPS, HOLD, MARGIN, sight
-from sb3_quad.show.framing import broadside, following_cameras
-from sb3_quad.show.palette import colours_of, rgb
 from sb3_quad.show.recording import Recording
+from sb3_quad.simulation.state import POSITION, TARGET
 
 WINDOW_FIELD_OF_VIEW = math.radians(60.0)  # PyBullet's, vertical
 

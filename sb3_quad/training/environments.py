@@ -6,10 +6,10 @@ from collections.abc import Callable
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.errors import ConfigError, SB3QuadError
-from sb3_quad.training.config import TrainingConfig
-from sb3_quad.training.signals import ignore_interrupts
-from sb3_quad.training.values import import_class
+from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.signals import ignore_interrupts
+from sb3_quad.settings.config import TrainingConfig
+from sb3_quad.settings.values import import_class
 
 if TYPE_CHECKING:
     import gymnasium

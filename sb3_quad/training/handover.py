@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch as th
 
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 
 if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm

@@ -21,10 +21,10 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_quad.dynamics.vehicle import load_vehicle
-from sb3_quad.envs.observation import DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError
+from sb3_quad.simulation.observation import DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm

@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.errors import ConfigError, unknown
-from sb3_quad.training.config import TrainingConfig
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.settings.config import TrainingConfig
 
 
 @dataclass(frozen=True)

@@ -38,10 +38,10 @@ import numpy as np
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from sb3_quad.errors import ConfigError, TrainingError, unknown
-from sb3_quad.training.algorithms import get_algorithm
-from sb3_quad.training.config import load_config, read_settings, with_vehicle_path
-from sb3_quad.training.files import save_model, write_text
+from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.files import save_model, write_text
+from sb3_quad.settings.algorithms import get_algorithm
+from sb3_quad.settings.config import load_config, read_settings, with_vehicle_path
 from sb3_quad.training.hover import trim_hover
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run

@@ -25,10 +25,10 @@ from typing import Any
 
 import yaml
 
-from sb3_quad.errors import ConfigError
-from sb3_quad.training.config import read_yaml
-from sb3_quad.training.files import write_text
-from sb3_quad.training.zoo_yaml import ZooLoader
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import write_text
+from sb3_quad.settings.config import read_yaml
+from sb3_quad.settings.zoo_yaml import ZooLoader
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,17 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.training.algorithms import get_algorithm, takes_expert
-from sb3_quad.training.config import TrainingConfig, build_config
+from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
+from sb3_quad.base.files import save_model
+from sb3_quad.base.signals import StopSignals
+from sb3_quad.settings.algorithms import get_algorithm, takes_expert
+from sb3_quad.settings.config import TrainingConfig, build_config
+from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
-from sb3_quad.training.files import save_model
 from sb3_quad.training.handover import hand_over
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.resume import forget_snapshot, load_snapshot, write_snapshot
 from sb3_quad.training.runs import RunFolder, claim_run, open_run
-from sb3_quad.training.signals import StopSignals
-from sb3_quad.training.values import import_class
 
 if TYPE_CHECKING:
     from stable_baselines3.common.callbacks import BaseCallback
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
     from sb3_quad.callbacks.best_model import BestModel
-    from sb3_quad.callbacks.last_good import LastGoodModel
+    from sb3_quad.training.last_good import LastGoodModel
 
 EVALUATION_SEED = 2**18  # added to the seed for the evaluations along the way; beyond any training environment's
 FRESH_SEED = 2**19  # added to the seed for the figures at the end: episodes that nothing before has seen
@@ -234,8 +234,8 @@ def _callbacks(
     from sb3_quad.callbacks.best_model import BestModel
     from sb3_quad.callbacks.checkpoint import Checkpoint
     from sb3_quad.callbacks.episode_log import EpisodeLog
-    from sb3_quad.callbacks.last_good import LastGoodModel
     from sb3_quad.callbacks.stop import StopWhen
+    from sb3_quad.training.last_good import LastGoodModel
 
     last_good = LastGoodModel()
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]

@@ -16,10 +16,10 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_quad.envs.observation import DEFAULT_STD
-from sb3_quad.errors import ConfigError
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
+from sb3_quad.simulation.observation import DEFAULT_STD
 
 if TYPE_CHECKING:
     from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm

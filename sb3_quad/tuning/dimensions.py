@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.training.literals import parse_number
+from sb3_quad.settings.literals import parse_number
 
 if TYPE_CHECKING:
     from optuna import Trial

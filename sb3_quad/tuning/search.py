@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.errors import ConfigError, TrainingError
-from sb3_quad.training.config import TrainingConfig, build_config
+from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.signals import StopSignals
+from sb3_quad.settings.config import TrainingConfig, build_config
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.signals import StopSignals
-from sb3_quad.training.study import check_names, make_pruner, make_sampler, open_study
 from sb3_quad.tuning.space import SearchSpace, current
+from sb3_quad.tuning.study import check_names, make_pruner, make_sampler, open_study
 
 if TYPE_CHECKING:
     from optuna import Study, Trial
@@ -33,8 +33,8 @@ class StudyOptions:
     """How a study proposes its trials and cuts them short.
 
     :param name: of the study, within its storage.
-    :param storage: see :func:`sb3_quad.training.study.open_study`.
-    :param sampler: one of :data:`sb3_quad.training.study.SAMPLERS`; ``pruner`` one of its PRUNERS.
+    :param storage: see :func:`sb3_quad.tuning.study.open_study`.
+    :param sampler: one of :data:`sb3_quad.tuning.study.SAMPLERS`; ``pruner`` one of its PRUNERS.
     :param n_startup_trials: drawn at random before the sampler begins, and finished before the median pruner does.
     :param n_evaluations: of each trial, the last at its end.
     """

@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from sb3_quad.errors import ConfigError, unknown
-from sb3_quad.training.algorithms import constructor_parameters, get_algorithm
-from sb3_quad.training.config import TrainingConfig, read_yaml
-from sb3_quad.training.literals import parse_value
-from sb3_quad.training.values import takes_whole
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
+from sb3_quad.settings.config import TrainingConfig, read_yaml
+from sb3_quad.settings.literals import parse_value
+from sb3_quad.settings.values import takes_whole
 from sb3_quad.tuning.dimensions import LINEAR, Choice, Interval, Parameter, number_of
 
 if TYPE_CHECKING:

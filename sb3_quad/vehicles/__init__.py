@@ -1,1 +1,1 @@
-"""One YAML file per vehicle; see :mod:`sb3_quad.dynamics.vehicle`."""
+"""One YAML file per vehicle; see :mod:`sb3_quad.vehicles.vehicle`."""

@@ -6,7 +6,7 @@ import importlib
 import runpy
 import sys
 
-from sb3_quad.errors import SB3QuadError, unknown
+from sb3_quad.base.errors import SB3QuadError, unknown
 
 SCRIPTS = {  # the function to call, or the module to run
     **{name: f"rl_zoo3.{name}:{name}" for name in ("train", "enjoy")},

@@ -17,15 +17,15 @@ from rl_zoo3 import ALGOS
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.errors import ConfigError, unknown
 from sb3_quad.experts.resolve import resolve_expert
-from sb3_quad.training.algorithms import constructor_parameters, takes_expert
-from sb3_quad.training.config import VEC_ENVS, config_names
+from sb3_quad.settings.algorithms import constructor_parameters, takes_expert
+from sb3_quad.settings.config import VEC_ENVS, config_names
+from sb3_quad.settings.literals import parse_mapping, parse_number
+from sb3_quad.settings.values import convert
 from sb3_quad.training.handover import hand_over
-from sb3_quad.training.literals import parse_mapping, parse_number
-from sb3_quad.training.values import convert
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm

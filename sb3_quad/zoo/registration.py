@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 
-from sb3_quad.training.algorithms import get_algorithm
+from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.zoo.search import CONVERTERS, SAMPLERS
 
 OWN_ALGORITHMS = ("dagger", "ppo_bc")

@@ -1,0 +1,112 @@
+"""Files that appear whole or not at all, with a clear error where a folder cannot be written."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from sb3_quad.base.errors import ConfigError
+
+
+@contextmanager
+def atomic_write(path: Path) -> Iterator[BinaryIO]:
+    """Write beside ``path`` and move the finished file there, so that a reader never meets half of it.
+
+    An error or an interruption inside the ``with`` block leaves whatever ``path`` held before.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with beside.open("wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file whole.
+
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    try:
+        with atomic_write(Path(path)) as file:
+            file.write(content)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """As :func:`write_bytes`, of text in UTF-8."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> None:
+    """As :func:`write_bytes`, of NumPy arrays as ``.npz``."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
+    write_bytes(path, buffer.getvalue())
+
+
+def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
+    """The arrays of an ``.npz`` file whose names begin with ``prefix``; the others are not even read.
+
+    :raises ConfigError: a missing or damaged file.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return {name: file[name] for name in file.files if name.startswith(prefix)}
+    except Exception as error:  # what a damaged archive raises depends on where the damage is
+        raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a file.
+
+    :raises ConfigError: it is missing or cannot be read.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot be read ({error})") from None
+
+
+def refuse_existing(path: str | Path, overwrite: bool) -> None:
+    """See that a file that a command is to write does not cost one that is there.
+
+    :raises ConfigError: it exists, and ``overwrite`` was not asked for; or it is a folder.
+    """
+    if Path(path).is_dir():
+        raise ConfigError(f"{path}: is a folder; name a file")
+    if Path(path).exists() and not overwrite:
+        raise ConfigError(f"{path}: exists already; name another file, or add --overwrite")
+
+
+def model_bytes(model: Any) -> bytes:
+    """The zip that ``model.save`` of Stable-Baselines3 would write."""
+    buffer = io.BytesIO()
+    model.save(buffer)
+    return buffer.getvalue()
+
+
+def save_model(model: Any, path: str | Path) -> None:
+    """``model.save(path)``, whole or not at all.
+
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    write_bytes(path, model_bytes(model))
+
+
+def one_line(error: BaseException) -> str:
+    """What an exception says, in one line that is not too long."""
+    return (" ".join(str(error).split()) or type(error).__name__)[:200]

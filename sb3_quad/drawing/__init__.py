@@ -1,0 +1,1 @@
+"""What is drawn: vehicles, targets, trails, cameras and labels."""

@@ -1,1 +1,0 @@
-"""The vehicle, its state and its equations of motion: parameters and pure functions over arrays."""

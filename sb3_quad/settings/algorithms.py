@@ -1,0 +1,46 @@
+"""The algorithms that can be trained, imported when first needed."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from typing import TYPE_CHECKING
+
+from sb3_quad.base.errors import ConfigError, unknown
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+
+ALGORITHMS = {
+    "dagger": "sb3_quad.dagger.dagger:DAgger",
+    "ppo_bc": "sb3_quad.ppo_bc.ppo_bc:PPOBC",
+    "ppo": "stable_baselines3.ppo.ppo:PPO",
+}
+# Set by a training job rather than by the settings of an algorithm.
+_SET_BY_JOB = {"self", "policy", "env", "expert", "policy_kwargs", "verbose", "tensorboard_log", "device", "seed"}
+
+
+def get_algorithm(name: str) -> type[OnPolicyAlgorithm]:
+    """The class of an algorithm by its name.
+
+    :raises ConfigError: an unknown name.
+    """
+    if name not in ALGORITHMS:
+        raise ConfigError(unknown("algorithm", name, ALGORITHMS))
+    module, _, attribute = ALGORITHMS[name].partition(":")
+    return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
+
+
+def constructor_parameters(algorithm: type[OnPolicyAlgorithm]) -> dict[str, inspect.Parameter]:
+    """What an algorithm's settings may give: its constructor's keywords, less those that a training job sets."""
+    parameters = inspect.signature(algorithm.__init__).parameters
+    return {
+        name: parameter
+        for name, parameter in parameters.items()
+        if name not in _SET_BY_JOB and not name.startswith("_") and parameter.kind is not parameter.VAR_KEYWORD
+    }
+
+
+def takes_expert(algorithm: type[OnPolicyAlgorithm]) -> bool:
+    """Whether the algorithm learns from an expert."""
+    return "expert" in inspect.signature(algorithm.__init__).parameters

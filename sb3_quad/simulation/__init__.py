@@ -1,0 +1,1 @@
+"""n quadcopters as arrays: state, tasks, observation, episodes."""

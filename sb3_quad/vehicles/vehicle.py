@@ -1,0 +1,260 @@
+"""Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files that hold them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import numpy.typing as npt
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from sb3_quad.base.errors import CannotHover, ConfigError, unknown
+from sb3_quad.base.quantities import Finite, Positive
+from sb3_quad.vehicles.gains import GeometricFigures, GeometricGains
+from sb3_quad.vehicles.limits import DEFAULT_GRAVITY, OTHER_LIMITS, in_hover_thrusts
+
+FloatArray = npt.NDArray[np.float64]
+
+
+PerRotor = tuple[tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite]]
+
+# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
+PARAMETER_NAMES = (
+    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain", "gravity"),
+    *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
+    *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
+)
+
+
+class _HoverOutOfReach(ValueError):
+    """Thrust limits that hover is not between."""
+
+
+class Vehicle(BaseModel):
+    """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
+
+    The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover thrusts,
+    ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. They become ``thrust_limits``, which a copy with another
+    mass keeps.
+
+    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises :class:`ConfigError`
+    through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(min_length=1, description="what the vehicle is called")
+    mass: Positive = Field(description="m, kg")
+    inertia: tuple[Positive, Positive, Positive] = Field(description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2")
+    rotor_positions: PerRotor = Field(description="x, y of each rotor in the body frame (x forward, y left), m")
+    rotor_directions: tuple[int, int, int, int] = Field(
+        description="sign of the yaw moment of each rotor: two of 1, two of -1"
+    )
+    moment_thrust_ratio: Positive = Field(description="kM / kF, m")
+    thrust_coefficient: Positive = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
+    motor_gain: Positive = Field(description="k_m, 1/s (Eq. 4.1)")
+    gravity: Positive = Field(default=DEFAULT_GRAVITY, description="g, m/s^2")
+    thrust_limits: tuple[Annotated[Finite, Field(ge=0)], Positive] = Field(
+        description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
+    )
+    physics_step: Positive = Field(default=0.0025, description="s")
+    control_step: Positive = Field(default=0.01, description="s; a whole number of physics steps")
+    delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
+    collision_radius: Positive = Field(description="radius of the collision sphere at the centre of mass, m")
+    geometric_gains: GeometricGains | None = Field(
+        default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _limits(cls, data: Any) -> Any:
+        return in_hover_thrusts(data) if isinstance(data, Mapping) else data
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Vehicle:
+        low, high = self.thrust_limits
+        if not low < 1.0 < high:
+            raise _HoverOutOfReach(
+                f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover"
+            )
+        if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
+            raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
+        ixx, iyy, izz = self.inertia
+        if max(ixx, iyy, izz) > (ixx + iyy + izz) / 2 * (1 + 1e-9):
+            raise ValueError(f"inertia {list(self.inertia)}: no rigid body has one moment larger than the other two together")
+        substeps = self.control_step / self.physics_step
+        if abs(substeps - round(substeps)) > 1e-9 or round(substeps) < 1:
+            raise ValueError(f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step}")
+        if self.motor_gain * self.physics_step > 1.0:
+            raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
+        try:
+            _ = self.mixer
+        except np.linalg.LinAlgError:
+            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently") from None
+        if not np.allclose(self.mixer[1:].sum(axis=1), 0.0, atol=1e-9):
+            raise ValueError(
+                "rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)"
+            )
+        return self
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Vehicle:
+        """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated.
+
+        ``geometric_gains`` were found for this vehicle: one that differs in more than its name has none, unless ``update``
+        brings some.
+        """
+        changes = dict(update or {})
+        if changes.keys() - {"name"}:
+            changes = {"geometric_gains": None, **changes}
+        own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & OTHER_LIMITS.keys() else None)
+        return Vehicle.model_validate({**own, **changes})
+
+    @property
+    def mixer(self) -> FloatArray:
+        """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N.
+
+        Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and pitch.
+        """
+        return _mixers(self.rotor_positions, self.rotor_directions, self.moment_thrust_ratio)[0]
+
+    @property
+    def mixer_inverse(self) -> FloatArray:
+        """Rotor thrusts from [ΣF; Mx; My; Mz], shape (4, 4)."""
+        return _mixers(self.rotor_positions, self.rotor_directions, self.moment_thrust_ratio)[1]
+
+    @property
+    def hover_thrust(self) -> float:
+        """Thrust of one rotor in hover, m g / 4, N."""
+        return self.mass * self.gravity / 4.0
+
+    @property
+    def thrust_range(self) -> tuple[float, float]:
+        """Least and greatest thrust of one rotor, N."""
+        return self.thrust_limits[0] * self.hover_thrust, self.thrust_limits[1] * self.hover_thrust
+
+    @property
+    def rotor_speed_range(self) -> tuple[float, float]:
+        """Least and greatest speed of one rotor, rad/s (Eq. 2.4 at the thrust limits)."""
+        low, high = self.thrust_range
+        return math.sqrt(low / self.thrust_coefficient), math.sqrt(high / self.thrust_coefficient)
+
+    @property
+    def hover_rotor_speed(self) -> float:
+        """Speed of one rotor in hover, rad/s."""
+        return math.sqrt(self.hover_thrust / self.thrust_coefficient)
+
+    @property
+    def hover_action(self) -> float:
+        """The action of each rotor in hover; 0 where hover is in the middle of the thrust limits."""
+        return float(self.thrust_to_action(np.array(self.hover_thrust)))
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps in one control step."""
+        return round(self.control_step / self.physics_step)
+
+    def thrust_to_action(self, thrust: FloatArray) -> FloatArray:
+        """Actions in [-1, 1] from rotor thrusts in N, any shape; the inverse of Eq. 3.18 (not clipped)."""
+        low, high = self.thrust_range
+        return (thrust - (high + low) / 2) / ((high - low) / 2)
+
+    def action_to_thrust(self, action: FloatArray) -> FloatArray:
+        """Rotor thrusts in N from actions, any shape; Eq. 3.18, actions outside [-1, 1] clipped."""
+        low, high = self.thrust_range
+        return (high + low) / 2 + (high - low) / 2 * np.clip(action, -1.0, 1.0)
+
+    def parameters(self) -> FloatArray:
+        """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of ``PARAMETER_NAMES``."""
+        low, high = self.thrust_range
+        head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
+        tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius)
+        return np.array([*head, *self.mixer[1:].ravel(), *tail], dtype=np.float64)
+
+
+@lru_cache(maxsize=256)
+def _mixers(positions: PerRotor, directions: tuple[int, int, int, int], ratio: float) -> tuple[FloatArray, FloatArray]:
+    """Mixer and inverse, kept outside the model, whose copies and comparisons they would otherwise disturb; read-only."""
+    x, y = np.asarray(positions, dtype=np.float64).T
+    mixer = np.stack([np.ones(4), y, -x, ratio * np.asarray(directions, dtype=np.float64)])
+    if abs(np.linalg.det(mixer)) < 1e-12:
+        raise np.linalg.LinAlgError("singular mixer")
+    inverse = np.asarray(np.linalg.inv(mixer))
+    mixer.setflags(write=False)
+    inverse.setflags(write=False)
+    return mixer, inverse
+
+
+def vehicle_names() -> list[str]:
+    """The vehicles that come with the package."""
+    folder = resources.files("sb3_quad.vehicles")
+    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+
+
+def is_vehicle_file(source: str | Path) -> bool:
+    """Whether :func:`load_vehicle` takes it for the path of a file rather than for a name."""
+    return isinstance(source, Path) or source.endswith((".yaml", ".yml")) or "/" in source
+
+
+def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
+    """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
+
+    :raises CannotHover: all is well with the file but that hover is not between the rotors' limits.
+    :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
+    """
+    if isinstance(source, Vehicle):
+        return source
+    text = str(source)
+    if is_vehicle_file(source if isinstance(source, Path) else text):
+        try:
+            content = Path(text).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"vehicle file {text}: cannot be read ({error})") from None
+        return _parse_vehicle(content, text)
+    if text not in vehicle_names():
+        raise ConfigError(unknown("vehicle", text, vehicle_names()) + ", or the path of a .yaml file")
+    content = resources.files("sb3_quad.vehicles").joinpath(f"{text}.yaml").read_text(encoding="utf-8")
+    return _parse_vehicle(content, f"{text}.yaml")
+
+
+def _parse_vehicle(content: str, where: str) -> Vehicle:
+    try:
+        data = yaml.safe_load(content)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"vehicle file {where}: not valid YAML ({' '.join(str(error).split())})") from None
+    if not isinstance(data, dict):
+        raise ConfigError(f"vehicle file {where}: must hold keys and values, such as 'mass: 1.727'")
+    try:
+        return Vehicle.model_validate(data)
+    except ValidationError as error:
+        wrong = error.errors()
+        only_weak = all(isinstance(item.get("ctx", {}).get("error"), _HoverOutOfReach) for item in wrong)
+        kind = CannotHover if only_weak else ConfigError
+        raise kind(f"vehicle file {where}: {'; '.join(_explain(item) for item in wrong)}") from None
+
+
+def _explain(item: Any) -> str:
+    key = ".".join(str(part) for part in item["loc"])
+    *blocks, name = item["loc"] or ("",)
+    where, fields = _fields_at(tuple(blocks))
+    if item["type"] == "extra_forbidden":
+        return where + unknown("key", name, fields if where else [*fields, *OTHER_LIMITS])
+    message = item["msg"].removeprefix("Value error, ")
+    field = fields.get(str(name)) or Vehicle.model_fields.get(key.split(".")[0])
+    meaning = f" ({field.description})" if field and field.description else ""
+    return f"{key}: {message}{meaning}" if key else message
+
+
+def _fields_at(blocks: tuple[Any, ...]) -> tuple[str, dict[str, Any]]:
+    """Where in the file some nested blocks lead (as the beginning of a message), and the fields that block has."""
+    known: dict[tuple[Any, ...], type[BaseModel]] = {
+        ("geometric_gains",): GeometricGains,
+        ("geometric_gains", "measured"): GeometricFigures,
+    }
+    model = known.get(blocks)
+    return (f"{'.'.join(blocks)}: ", model.model_fields) if model else ("", Vehicle.model_fields)
