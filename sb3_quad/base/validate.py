@@ -1,0 +1,81 @@
+"""Validated data: one base class for records and settings, and errors of one line."""
+
+from __future__ import annotations
+
+import typing
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from sb3_quad.base.errors import ConfigError, unknown
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class Frozen(BaseModel):
+    """A record: frozen, with finite numbers and no unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    other_keys: ClassVar[tuple[str, ...]] = ()
+    """Further keys that a validator of the model understands; messages about unknown keys list them."""
+
+
+def validate(model: type[Model], data: Any, where: str) -> Model:
+    """``data`` as a ``model``.
+
+    :param where: what the message calls the data, such as the name of its file.
+    :raises ConfigError: something does not fit; one line names each key, what is wrong, and the nearest valid key. Where all
+        that is wrong is an error of a kind of its own, such as :class:`CannotHover`, that kind is raised.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
+        kind = kinds.pop() if len(kinds) == 1 else ConfigError
+        raise (kind if issubclass(kind, ConfigError) else ConfigError)(f"{where}: {explain(error, model)}") from None
+
+
+def explain(error: ValidationError, model: type[BaseModel]) -> str:
+    """What is wrong, in one line: each key with what is wrong about it, what it means, and the nearest valid key."""
+    found: dict[str, str] = {}
+    for item in error.errors():
+        inside, names, meaning = _walk(model, item["loc"])
+        key = ".".join(names)
+        if item["type"] == "extra_forbidden":
+            text = unknown("key", item["loc"][-1], [*inside.model_fields, *getattr(inside, "other_keys", ())])
+        else:
+            text = _message(item) + (f" ({meaning})" if meaning else "")
+        found.setdefault(key, f"{key}: {text}" if key else text)  # of a union only the first alternative
+    return "; ".join(found.values())
+
+
+def _message(item: Mapping[str, Any]) -> str:
+    given = item["input"]
+    if str(item["type"]).startswith(("float_", "int_")) and isinstance(given, str):
+        return f"{given!r} must be a number alone, its unit left out"
+    if item["type"] == "missing":
+        return "is missing"
+    return str(item["msg"]).removeprefix("Value error, ")
+
+
+def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[type[BaseModel], list[str], str]:
+    """The innermost model a location leads to, its keys (names of a union's alternatives left out), the last one's meaning."""
+    names: list[str] = []
+    meaning = ""
+    for part in location:
+        if isinstance(part, int):
+            names.append(str(part))
+        elif part in model.model_fields:
+            field = model.model_fields[part]
+            names.append(part)
+            meaning = field.description or ""
+            model = _model_in(field.annotation) or model
+    return model, names, meaning
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    if typing.get_origin(annotation) is None:
+        return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
+    return next((found for entry in typing.get_args(annotation) if (found := _model_in(entry)) is not None), None)

@@ -1,0 +1,94 @@
+"""YAML files by name, where they come with the package, or by path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.files import one_line, read_text
+
+SUFFIXES = (".yaml", ".yml")
+
+
+def parse_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
+    """:raises ConfigError: text that is not YAML, in one line."""
+    try:
+        return yaml.load(text, Loader=loader)
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
+
+
+def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> dict[str, Any]:
+    """The keys and values of a YAML file.
+
+    :raises ConfigError: it is missing, unreadable or holds something else.
+    """
+    content = parse_yaml(read_text(path), str(path), loader)
+    if not isinstance(content, dict):
+        raise ConfigError(f"{path}: must hold keys and values")
+    return content
+
+
+@dataclass(frozen=True)
+class YamlFolder:
+    """The YAML files of one kind that come with the package; a user's own are given by their paths.
+
+    :param kind: what messages call such a file.
+    :param package: that holds the files.
+    :param suffix: of the files.
+    :param in_name: whether the suffix is part of the name, as in ``thesis/dagger.yml``.
+    :param folders: further ones inside the package, in the order in which their names are listed.
+    """
+
+    kind: str
+    package: str
+    suffix: str = ".yaml"
+    in_name: bool = False
+    folders: tuple[str, ...] = ()
+
+    def names(self) -> list[str]:
+        """The names of the files in the package."""
+        return [name for folder in ("", *self.folders) for name in sorted(self._files(folder))]
+
+    def is_path(self, source: str | Path) -> bool:
+        """Whether a source is the path of a file rather than a name."""
+        if isinstance(source, Path) or Path(source).is_file():
+            return True
+        return source not in self.names() and not self.in_name and (source.endswith(SUFFIXES) or "/" in source)
+
+    def text(self, source: str | Path) -> tuple[str, str]:
+        """The text of a file by name or path, and what messages call it.
+
+        :raises ConfigError: an unknown name, a missing or unreadable file.
+        """
+        if self.is_path(source):
+            return read_text(source), str(source)
+        name = str(source)
+        folder, _, _ = name.rpartition("/")
+        if name not in self.names():
+            raise ConfigError(f"{unknown(self.kind, name, self.names())}, or the path of a {self.suffix} file")
+        file = self._files(folder)[name]
+        return file.read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"
+
+    def read(self, source: str | Path) -> tuple[dict[Any, Any], str]:
+        """The keys and values of a file by name or path, and what messages call it.
+
+        :raises ConfigError: as :meth:`text`; or it holds something else.
+        """
+        text, where = self.text(source)
+        content = parse_yaml(text, where)
+        if not isinstance(content, dict):
+            raise ConfigError(f"{where}: must hold keys and values")
+        return content, where
+
+    def _files(self, folder: str) -> dict[str, Any]:
+        place = resources.files(self.package)
+        place = place.joinpath(folder) if folder else place
+        prefix = f"{folder}/" if folder else ""
+        found = [entry for entry in place.iterdir() if entry.name.endswith(self.suffix)]
+        return {prefix + (each.name if self.in_name else each.name.removesuffix(self.suffix)): each for each in found}
