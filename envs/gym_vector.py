@@ -10,9 +10,10 @@ import numpy.typing as npt
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
@@ -42,27 +43,12 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
         num_envs: int = 1,
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
-        vehicle: Any = "itm",
-        noise: Any = 0.05,
-        observation_mean: Any = None,
-        observation_std: Any = None,
-        max_episode_steps: int = 1500,
         render_mode: str | None = None,
-        n_threads: int | None = None,
+        **keywords: Unpack[BatchKeywords],
     ) -> None:
         if render_mode is not None:
             raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
-        self.batch = QuadcopterBatch(
-            num_envs,
-            task,
-            task_kwargs,
-            vehicle,
-            noise,
-            observation_mean,
-            observation_std,
-            max_episode_steps,
-            n_threads=n_threads,
-        )
+        self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords)
         self.num_envs = self.batch.n
         self.render_mode = None
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
@@ -95,19 +81,19 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Observations, npt.NDArray[Any], BoolArray, BoolArray, dict[str, Any]]:
         """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos."""
-        batch = self.batch
-        observations, rewards, done = batch.step(actions)
-        truncated = done & batch.truncated
+        outcome = self.batch.outcome
+        observations, rewards, done = self.batch.step(actions)
+        truncated = done & outcome["truncated"]
         infos: dict[str, Any] = {}
         if done.any():
             final = np.full(self.num_envs, None, dtype=object)
             for row in np.flatnonzero(done):
-                final[row] = batch.final_observation[row].copy()
+                final[row] = outcome["observation"][row].copy()
             info: dict[str, Any] = {
                 "is_success": truncated.copy(),
-                "distance": np.where(done, batch.distance, 0.0),
-                "collision": done & batch.collided,
-                "out_of_range": done & batch.out_of_range,
+                "distance": np.where(done, outcome["distance"], 0.0),
+                "collision": done & outcome["collision"],
+                "out_of_range": done & outcome["out_of_range"],
             }
             info |= {f"_{key}": done.copy() for key in info}
             infos = {"final_obs": final, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}

@@ -3,31 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from typing_extensions import Unpack
 
+from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.rendering import RENDER_MODES, Renderer
-from sb3_quad.simulation.checks import check_options, check_size, vector
+from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
+from sb3_quad.simulation.checks import check_size, parse_options
 from sb3_quad.simulation.engine.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
-from sb3_quad.simulation.engine.streams import STEP, new_streams, stream_key
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE, observe
-from sb3_quad.simulation.state import STATE_SIZE, TARGET, QuadcopterState
-from sb3_quad.simulation.tasks import TaskSpec, reset_rows, resolve_tasks, score
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD, QuadcopterState
+from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.vehicles.vehicle import Vehicle
 
-FloatArray = npt.NDArray[np.float64]
-Observation = npt.NDArray[np.float32]
-_ROW = np.zeros(1, dtype=np.int64)
+_NO_LIMIT = 2**62  # TimeLimit truncates
 
 
-class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
+class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
     """
     ## Description
 
@@ -153,51 +152,34 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self,
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
-        vehicle: str | Path | Vehicle = "itm",
-        noise: float = 0.05,
-        observation_mean: npt.ArrayLike | None = None,
-        observation_std: npt.ArrayLike | None = None,
         render_mode: str | None = None,
         render_width: int = 640,
         render_height: int = 480,
+        **keywords: Unpack[BatchKeywords],
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
-        self._vehicle = load_vehicle(vehicle)
-        self._tasks = self._next_tasks = resolve_tasks(task, task_kwargs)
-        # Arrays of one vehicle for the functions that the batched environment uses, too.
-        self._state = np.zeros((STATE_SIZE, 1))
-        self._queue = np.zeros((self._vehicle.delay, 4, 1))
-        self._wrench = np.zeros((12, 1))
-        self._streams = np.zeros((4, 1), dtype=np.uint32)
-        self._parameters = self._vehicle.parameters()[:, None].copy()
-        self._task_index = np.zeros(1, dtype=np.int64)
-        self._mean, self._std = DEFAULT_MEAN[:, None].copy(), DEFAULT_STD[:, None].copy()
-        self._noise = np.zeros(1)
-        self._wrenches = np.zeros((self._vehicle.substeps, 2, 3))
-        self._reward, self._distance = np.zeros(1), np.zeros(1)
-        self._collided, self._out_of_range = np.zeros(1, dtype=np.bool_), np.zeros(1, dtype=np.bool_)
+        check_size(render_width, render_height)
+        # One row of the batched environment, whose body PyBullet moves.
+        self._row = QuadcopterBatch(1, task, task_kwargs, **{"max_episode_steps": _NO_LIMIT, **keywords}, autoreset=False)
+        self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._seeded = self._ready = False
-        self.set_noise(noise)
-        self.set_observation_scaling(observation_mean, observation_std)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.render_mode = render_mode
         if render_mode is not None:
-            self.metadata = {**self.metadata, "render_fps": round(1.0 / self._vehicle.control_step)}
-        check_size(render_width, render_height)
+            self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height
         self._open()
 
     def _open(self) -> None:
-        self._body = BulletBody(
-            self._vehicle, self._size if self.render_mode == "human" else None, visuals=self.render_mode == "rgb_array"
-        )
+        window = self._size if self.render_mode == "human" else None
+        self._body = BulletBody(self.vehicle, window, visuals=self.render_mode == "rgb_array")
         self._renderer = None
         if self._body.has_window or self.render_mode == "rgb_array":
-            self._renderer = Renderer(self._vehicle, self._body, *self._size)
+            self._renderer = Renderer(self.vehicle, self._body, *self._size)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Float32Array, dict[str, Any]]:
         """Begin an episode; after :meth:`close`, in a new simulation.
 
         :param seed: begins a new stream of random numbers; None: the next episode of the present one.
@@ -205,27 +187,26 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         :raises ConfigError: an unknown option, or a value that is no start.
         """
         super().reset(seed=seed)
-        fixed = check_options(options, self._vehicle)
+        fixed = parse_options(options, self.vehicle)
+        row = self._row
         if seed is not None or not self._seeded:
-            self._streams[:] = new_streams(np.array([stream_key(self.np_random)], dtype=np.uint64))
+            row.set_streams([self.np_random])
             self._seeded = True
-        self._tasks = tasks = self._next_tasks
-        state, parameters = self._state, self._parameters
-        reset_rows(_ROW, state, self._queue, self._streams, self._task_index, parameters, tasks.parameters, tasks.weights)
+        row.reset()
         for rows, values in fixed:
-            state[rows, 0] = values
+            row.state[rows, 0] = values
         if not self._body.connected:
             self._open()
-        self._body.place(state)
+        self._body.place(row.state)
         self._ready = True
-        self._distance[:] = self.true_state().distance
-        self._collided[:] = self._out_of_range[:] = False  # only the end of a control step is judged
         if self._renderer is not None:
-            self._renderer.reset(state)
+            self._renderer.reset(row.state)
             self._show()
+        self._row.outcome[:] = 0  # only the end of a control step is judged
+        self._row.outcome["truncated"], self._row.outcome["distance"] = True, self.true_state().distance
         return self.observe(), self._info()
 
-    def step(self, action: npt.NDArray[Any]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """Fly one control step.
 
         :param action: (4,), clipped to [-1, 1].
@@ -236,126 +217,102 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
             raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        body, state, wrench, parameters, wrenches = self._body, self._state, self._wrench, self._parameters, self._wrenches
-        kind = rotor_wrenches(state, self._queue, array, wrench, parameters, self._vehicle.physics_step, wrenches)
+        row, body, wrenches = self._row, self._body, self._wrenches
+        step = self.vehicle.physics_step
+        kind = rotor_wrenches(row.state, row.queue, array, row.wrench, row.vehicles, step, wrenches)
         if kind == NOT_FINITE:
             raise ValueError(f"action {array.tolist()}: every number must be finite")
         if kind == WORLD_FRAME_TOO:
-            body.fly_pushed(wrenches, wrench[0:3, 0], wrench[6:9, 0])
+            body.fly_pushed(wrenches, row.wrench[FORCE_WORLD, 0], row.wrench[TORQUE_WORLD, 0])
         else:
             body.fly(wrenches)
-        body.read(state)
-        self._streams[STEP, 0] += 1
-        collided, out_of_range, tasks = self._collided, self._out_of_range, self._tasks.parameters
-        score(state, parameters, self._task_index, tasks, self._reward, collided, out_of_range, self._distance)
+        body.read(row.state)
+        observations, _, _ = row.score()
         if self.render_mode == "human":
             self._show()
         info = self._info()
-        return self.observe(), float(self._reward[0]), not info["is_success"], False, info
+        return observations[0], float(row.outcome["reward"][0]), not info["is_success"], False, info
 
-    def render(self) -> npt.NDArray[np.uint8] | None:
+    def _info(self) -> dict[str, Any]:
+        ended = self._row.outcome[0]
+        info = {"is_success": bool(ended["truncated"]), "distance": float(ended["distance"])}
+        return info | {name: bool(ended[name]) for name in ("collision", "out_of_range")}
+
+    def render(self) -> Image | None:
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() does nothing without a render_mode; pass render_mode='rgb_array' to make()")
         if self._renderer is None or self.render_mode == "human":
             return None
-        return self._renderer.render(self._state, self._wrench)
+        return self._renderer.render(self._row.state, self._row.wrench)
 
     def _show(self) -> None:
         if self._renderer is not None and self.render_mode == "human":
-            self._renderer.render(self._state, self._wrench)
+            self._renderer.render(self._row.state, self._row.wrench)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
         self._ready = False
         self._body.close()
 
+    def observe(self) -> Float32Array:
+        """The present observation, (18,); the same numbers until the next step, unless something was set meanwhile."""
+        return self._row.observe()[0]
+
     def true_state(self) -> QuadcopterState:
         """The true state, a live view of one row."""
-        return QuadcopterState(self._state)
+        return self._row.true_state()
 
     @property
     def vehicle(self) -> Vehicle:
         """The vehicle's parameters."""
-        return self._vehicle
+        return self._row.vehicle_list[0]
 
     @property
     def target(self) -> FloatArray:
         """r_T, (3,), world frame, m."""
-        return self._state[TARGET, 0].copy()
+        return self.true_state().target[0].copy()
 
     @property
     def noise(self) -> float:
         """Relative standard deviation of the observation noise."""
-        return float(self._noise[0])
+        return float(self._row.noise_level[0])
 
     @property
     def observation_mean(self) -> FloatArray:
         """μ of Eq. 3.16, (18,)."""
-        return self._mean[:, 0].copy()
+        return self._row.mean[:, 0].copy()
 
     @property
     def observation_std(self) -> FloatArray:
         """σ of Eq. 3.16, (18,)."""
-        return self._std[:, 0].copy()
-
-    def set_target(self, position: npt.ArrayLike) -> None:
-        """Move the target, (3,), world frame, m; until the next reset."""
-        self._state[TARGET, 0] = vector("target", position, 3)
-
-    def set_wrench(
-        self,
-        force: npt.ArrayLike = (0.0, 0.0, 0.0),
-        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
-        force_frame: str = "world",
-        torque_frame: str = "body",
-    ) -> None:
-        """Apply an external force (N) and torque (N m), (3,) each, at the centre of mass until set anew.
-
-        :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of ``torque``.
-        """
-        wrench = np.zeros((4, 3))
-        for number, (name, value, frame) in enumerate((("force", force, force_frame), ("torque", torque, torque_frame))):
-            if frame not in ("world", "body"):
-                raise ConfigError(f"{name}_frame {frame!r}: must be 'world' or 'body'")
-            wrench[2 * number + (frame == "body")] = vector(name, value, 3)
-        self._wrench[:, 0] = wrench.ravel()
+        return self._row.std[:, 0].copy()
 
     @property
     def wrench(self) -> FloatArray:
         """What :meth:`set_wrench` has set, (12,), a live view: force world, force body, torque world, torque body; N, N m."""
-        return self._wrench[:, 0]
+        return self._row.wrench[:, 0]
+
+    def set_target(self, position: npt.ArrayLike) -> None:
+        """Move the target, (3,), world frame, m; until the next reset."""
+        self._row.set_target(position)
+
+    def set_wrench(self, *arguments: Any, **keywords: Any) -> None:
+        """Apply an external force (N) and torque (N m), (3,) each, at the centre of mass until set anew.
+
+        The arguments are ``force``, ``torque``, ``force_frame`` ("world") and ``torque_frame`` ("body"), as of
+        :meth:`~sb3_quad.simulation.batch.QuadcopterBatch.set_wrench`.
+        """
+        self._row.set_wrench(*arguments, **keywords)
 
     def set_noise(self, level: float) -> None:
         """Set the relative standard deviation of the observation noise; 0: none."""
-        value = vector("noise", np.atleast_1d(np.asarray(level)), 1)
-        if value[0] < 0:
-            raise ConfigError(f"noise {level!r}: must not be negative")
-        self._noise[:] = value
+        self._row.set_noise(level)
 
     def set_observation_scaling(self, mean: npt.ArrayLike | None = None, std: npt.ArrayLike | None = None) -> None:
         """Set μ and σ of Eq. 3.16, (18,) each; None leaves one as it is."""
-        new_mean = self.observation_mean if mean is None else vector("observation_mean", mean, OBSERVATION_SIZE)
-        new_std = self.observation_std if std is None else vector("observation_std", std, OBSERVATION_SIZE)
-        if (new_std <= 0).any():
-            raise ConfigError("observation_std: every value must be positive")
-        self._mean[:, 0], self._std[:, 0] = new_mean, new_std
+        self._row.set_observation_scaling(mean, std)
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> None:
         """Set the task of all episodes that begin from now on."""
-        self._next_tasks = resolve_tasks(task, task_kwargs)
-
-    def observe(self) -> Observation:
-        """The present observation, (18,); the same numbers until the next step, unless something was set meanwhile."""
-        observation = np.empty(OBSERVATION_SIZE, dtype=np.float32)
-        observe(self._state, self._streams, self._mean, self._std, self._noise, observation[None])
-        return observation
-
-    def _info(self) -> dict[str, Any]:
-        collision, out_of_range = bool(self._collided[0]), bool(self._out_of_range[0])
-        return {
-            "is_success": not (collision or out_of_range),
-            "distance": float(self._distance[0]),
-            "collision": collision,
-            "out_of_range": out_of_range,
-        }
+        self._row.set_task(task, task_kwargs)

@@ -11,9 +11,10 @@ import numpy.typing as npt
 from gymnasium import Env, Wrapper, spaces
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
@@ -40,26 +41,9 @@ class QuadcopterVecEnv(VecEnv):
         n_envs: int,
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
-        vehicle: Any = "itm",
-        noise: Any = 0.05,
-        observation_mean: Any = None,
-        observation_std: Any = None,
-        max_episode_steps: int = 1500,
-        seed: int | None = None,
-        n_threads: int | None = None,
+        **keywords: Unpack[BatchKeywords],
     ) -> None:
-        self.batch = QuadcopterBatch(
-            n_envs,
-            task,
-            task_kwargs,
-            vehicle,
-            noise,
-            observation_mean,
-            observation_std,
-            max_episode_steps,
-            seed,
-            n_threads,
-        )
+        self.batch = QuadcopterBatch(n_envs, task, task_kwargs, **keywords)
         self.render_mode: str | None = None
         self.spec = None
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
@@ -100,20 +84,11 @@ class QuadcopterVecEnv(VecEnv):
         return observations, rewards, dones, self._infos
 
     def _fill_infos(self, rows: npt.NDArray[np.int64]) -> None:
-        batch = self.batch
         elapsed = round(time.time() - self._start, 6)
-        columns = zip(
-            self._ended,
-            batch.final_observation[rows],
-            batch.final_return[rows].tolist(),
-            batch.final_length[rows].tolist(),
-            batch.truncated[rows].tolist(),
-            batch.distance[rows].tolist(),
-            batch.collided[rows].tolist(),
-            batch.out_of_range[rows].tolist(),
-            strict=True,
-        )
-        for row, observation, total, length, truncated, distance, collision, out_of_range in columns:
+        outcomes = self.batch.outcome[rows].tolist()  # of a copy, so that the last observations are fresh
+        for row, (total, _, length, distance, collision, out_of_range, truncated, observation) in zip(
+            self._ended, outcomes, strict=True
+        ):
             self._infos[row] = {
                 "terminal_observation": observation,
                 "TimeLimit.truncated": truncated,
@@ -139,7 +114,7 @@ class QuadcopterVecEnv(VecEnv):
     @property
     def target(self) -> npt.NDArray[np.float64]:
         """Targets, (n, 3), world frame, m."""
-        return self.batch.state[17:20].T.copy()
+        return self.true_state().target.copy()
 
     @property
     def noise(self) -> npt.NDArray[np.float64]:

@@ -1,4 +1,7 @@
-"""Checks of what users hand to an environment; every message names the thing and what is allowed."""
+"""Checks of what users hand to an environment; every message names the thing and what is allowed.
+
+:raises ConfigError: by every function.
+"""
 
 from __future__ import annotations
 
@@ -6,18 +9,18 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY
 from sb3_quad.vehicles.vehicle import Vehicle
 
-FloatArray = npt.NDArray[np.float64]
-_START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
+START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
+"""What a start can fix, and where it lies in a state."""
 MAX_SIZE = 2048  # of a picture, pixels
 
 
-def check_options(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
+def parse_options(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
     """The rows of the state that ``options`` of reset fix, and their values."""
     options = options or {}
     for key in options:
@@ -25,11 +28,11 @@ def check_options(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[t
             raise ConfigError(f"options: {unknown('key', key, ('target', 'state'))}")
     start = options.get("state") or {}
     if not isinstance(start, Mapping):
-        raise ConfigError(f"options: state must map names to values (valid names: {', '.join(_START)})")
+        raise ConfigError(f"options: state must map names to values (valid names: {', '.join(START)})")
     fixed = [(TARGET, vector("target", options["target"], 3))] if options.get("target") is not None else []
     for key, value in start.items():
-        if key not in _START:
-            raise ConfigError(f"options: {unknown('state key', key, _START)}")
+        if key not in START:
+            raise ConfigError(f"options: {unknown('state key', key, START)}")
         values = vector(key, value, 4 if key == "quaternion" else 3)
         if key == "quaternion":
             norm = np.linalg.norm(values)
@@ -38,28 +41,47 @@ def check_options(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[t
             values = values / norm
         if key == "position" and values[2] <= vehicle.collision_radius:
             raise ConfigError(f"position {values.tolist()}: touches the ground; z must exceed {vehicle.collision_radius} m")
-        fixed.append((_START[key], values))
+        fixed.append((START[key], values))
     return fixed
 
 
-def vector(name: str, value: npt.ArrayLike, size: int) -> FloatArray:
+def vector(name: str, value: Any, size: int) -> FloatArray:
     """``value`` as finite numbers of shape (size,)."""
+    array = _numbers(name, value, f"{size} numbers")
+    if array.shape != (size,):
+        raise ConfigError(f"{name} of shape {array.shape}: must be ({size},)")
+    return array
+
+
+def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
+    """``value`` of shape (size,) or (rows, size) as (size, rows); with no size, () or (rows,) as (1, rows)."""
+    array = _numbers(name, value, "numbers")
+    inner = () if size is None else (size,)
+    if array.shape not in (inner, (rows, *inner)):
+        raise ConfigError(f"{name} of shape {array.shape}: must be {inner}, or {(rows, *inner)} for {rows} rows")
+    return np.ascontiguousarray(np.broadcast_to(array, (rows, *inner)).T).reshape(-1, rows)
+
+
+def _numbers(name: str, value: Any, what: str) -> FloatArray:
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ConfigError(f"{name} {value!r}: must be {size} numbers") from None
-    if array.shape != (size,):
-        raise ConfigError(f"{name} of shape {array.shape}: must be ({size},)")
+        raise ConfigError(f"{name} {value!r}: must be {what}") from None
     if not np.isfinite(array).all():
         raise ConfigError(f"{name} {array.tolist()}: every number must be finite")
     return array
 
 
-def check_size(width: int, height: int) -> None:
-    """Refuse what is no size of a picture.
+def whole_number(name: str, value: Any, least: int = 1, most: int | None = None, unit: str = "") -> int:
+    """``value``, a whole number of ``least`` to ``most``."""
+    whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+    if not whole or value < least or (most is not None and value > most):
+        limits = f"of at least {least}" if most is None else f"of {least} to {most}"
+        raise ConfigError(f"{name} {value!r}: must be a whole number {limits}{unit}")
+    return int(value)
 
-    :raises ConfigError: names the argument.
-    """
+
+def check_size(width: int, height: int) -> None:
+    """Refuse what is no size of a picture, in pixels."""
     for name, value in (("render_width", width), ("render_height", height)):
-        if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 16 <= value <= MAX_SIZE:
-            raise ConfigError(f"{name} {value!r}: must be a whole number of 16 to {MAX_SIZE} pixels")
+        whole_number(name, value, 16, MAX_SIZE, " pixels")

@@ -1,37 +1,42 @@
-"""The true state of a batch of quadcopters, and its layout in memory.
+"""The true state of n quadcopters, the wrench that acts on them, and how both lie in memory.
 
-One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle per column
-(structure of arrays, so that compiled loops over vehicles run over neighbouring numbers).
+One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle per column, so that
+compiled loops over vehicles run over neighbouring numbers. The order of the rows is that of the tables.
 
-=========  ================  =======================================================================  ======
-rows       name              meaning                                                                  unit
-=========  ================  =======================================================================  ======
-0:3        position          r, world frame                                                           m
-3:7        quaternion        body to world, (w, x, y, z), unit norm                                   --
-7:10       velocity          v, world frame                                                           m/s
-10:13      body_rates        angular velocity, body frame (x forward, z up)                           rad/s
-13:17      rotor_speeds      ω of each rotor; thrust F = kF ω² (Eq. 2.4)                              rad/s
-17:20      target            r_T, world frame                                                         m
-=========  ================  =======================================================================  ======
+================  =====  ===============================================================  ======
+state             rows   meaning                                                          unit
+================  =====  ===============================================================  ======
+position          3      r, world frame                                                   m
+quaternion        4      body to world, (w, x, y, z), unit norm                           --
+velocity          3      v, world frame                                                   m/s
+body_rates        3      angular velocity, body frame (x forward, z up)                   rad/s
+rotor_speeds      4      ω of each rotor; thrust F = kF ω² (Eq. 2.4)                      rad/s
+target            3      r_T, world frame                                                 m
+================  =====  ===============================================================  ======
+
+A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N), ``torque_world`` and ``torque_body`` (N m),
+three rows each, all at the centre of mass.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-POSITION = slice(0, 3)
-QUATERNION = slice(3, 7)
-VELOCITY = slice(7, 10)
-BODY_RATES = slice(10, 13)
-ROTOR_SPEEDS = slice(13, 17)
-TARGET = slice(17, 20)
-STATE_SIZE = 20
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.layout import row_slices
 
-FloatArray = npt.NDArray[np.float64]
+STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}
+STATE_SIZE = sum(STATE.values())
+POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = row_slices(STATE).values()
+
+WRENCH = {"force_world": 3, "force_body": 3, "torque_world": 3, "torque_body": 3}
+WRENCH_SIZE = sum(WRENCH.values())
+FORCE_WORLD, FORCE_BODY, TORQUE_WORLD, TORQUE_BODY = row_slices(WRENCH).values()
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,3 +109,19 @@ class QuadcopterState:
     def concatenate(states: Sequence[QuadcopterState]) -> QuadcopterState:
         """Several states as one batch, in order."""
         return QuadcopterState(np.concatenate([state.array for state in states], axis=1))
+
+
+def make_wrench(force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body") -> FloatArray:
+    """The wrench of n vehicles, (WRENCH_SIZE, n).
+
+    :param force: (n, 3), N; ``torque`` (n, 3), N m; both at the centre of mass.
+    :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of ``torque``.
+    :raises ConfigError: another frame.
+    """
+    wrench = np.zeros((WRENCH_SIZE, len(force)))
+    rows: Any = row_slices(WRENCH)
+    for kind, values, frame in (("force", force, force_frame), ("torque", torque, torque_frame)):
+        if frame not in ("world", "body"):
+            raise ConfigError(f"{kind}_frame {frame!r}: must be 'world' or 'body'")
+        wrench[rows[f"{kind}_{frame}"]] = values.T
+    return wrench

@@ -1,55 +1,46 @@
-"""The two tasks (thesis 4.2) and one that is both: where an episode starts, what a step is worth and when it is over.
+"""The tasks (thesis 4.2): where an episode starts, what a control step is worth and when the episode is over.
 
-A task is data, one row of a table; the functions that read the table are in envs/episodes.py, for both environments.
+A task is data. :mod:`.episodes` begins episodes by it, :mod:`.reward` scores their control steps.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.quantities import Finite
-from sb3_quad.simulation.episodes import reset_rows, score
-
-__all__ = ["TASKS", "TASK_PARAMETERS", "Task", "TaskSpec", "TaskTable", "reset_rows", "resolve_tasks", "score"]
-
-FloatArray = npt.NDArray[np.float64]
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.simulation.layout import first_rows
 
 
-NotNegative = Annotated[Finite, Field(ge=0)]
-
-
-class Task(BaseModel):
+class Task(Frozen):
     """A task: start distribution, reward coefficients (Eqs. 4.5-4.9) and limits; units m, s, rad.
 
     Frozen. ``task_kwargs`` of the environments override its fields by name.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     name: str = Field(default="custom", min_length=1, description="what the task is called")
-    start_position: tuple[Finite, Finite, Finite] = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
-    target_distance: NotNegative = Field(default=0.0, description="|r_T - r0|, m; 0: the target is r0")
-    nearest_target: NotNegative | None = Field(
+    start_position: tuple[float, float, float] = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
+    target_distance: NonNegativeFloat = Field(default=0.0, description="|r_T - r0|, m; 0: the target is r0")
+    nearest_target: NonNegativeFloat | None = Field(
         default=None, description="if given, |r_T - r0| is uniform between this and target_distance, m"
     )
-    target_clearance: NotNegative = Field(
+    target_clearance: NonNegativeFloat = Field(
         default=0.25, description="no target is closer to the ground than the collision body plus this, m"
     )
     random_attitude: bool = Field(default=False, description="start attitude uniform on SO(3), else level")
-    velocity_std: NotNegative = Field(default=0.0, description="standard deviation of v at the start, per axis, m/s")
-    body_rates_std: NotNegative = Field(default=0.0, description="of the body rates at the start, per axis, rad/s")
-    max_distance: Annotated[Finite, Field(gt=0)] = Field(default=30.0, description="farther from the target ends, m")
-    position_cost: NotNegative = Field(default=0.003, description="per m and control step (Eq. 4.5)")
-    tilt_cost: NotNegative = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
-    body_rates_cost: NotNegative = Field(default=0.0005, description="per rad/s and control step (Eq. 4.7)")
-    collision_cost: NotNegative = Field(default=15.0, description="for touching the ground (Eq. 4.8)")
-    out_of_range_cost: NotNegative = Field(default=15.0, description="for leaving max_distance (Eq. 4.9)")
+    velocity_std: NonNegativeFloat = Field(default=0.0, description="standard deviation of v at the start, per axis, m/s")
+    body_rates_std: NonNegativeFloat = Field(default=0.0, description="of the body rates at the start, per axis, rad/s")
+    max_distance: PositiveFloat = Field(default=30.0, description="farther from the target ends, m")
+    position_cost: NonNegativeFloat = Field(default=0.003, description="per m and control step (Eq. 4.5)")
+    tilt_cost: NonNegativeFloat = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
+    body_rates_cost: NonNegativeFloat = Field(default=0.0005, description="per rad/s and control step (Eq. 4.7)")
+    collision_cost: NonNegativeFloat = Field(default=15.0, description="for touching the ground (Eq. 4.8)")
+    out_of_range_cost: NonNegativeFloat = Field(default=15.0, description="for leaving max_distance (Eq. 4.9)")
 
     @field_validator("start_position")
     @classmethod
@@ -65,17 +56,18 @@ class Task(BaseModel):
         return self
 
     def parameters(self) -> FloatArray:
-        """What the compiled functions need, shape (len(TASK_PARAMETERS),)."""
+        """What compiled code needs, in the order of :data:`TASK`, shape (columns,)."""
         nearest = self.target_distance if self.nearest_target is None else self.nearest_target
-        others = (float(getattr(self, name)) for name in TASK_PARAMETERS[4:])
-        return np.array([*self.start_position, nearest, *others], dtype=np.float64)
+        values = {**{name: getattr(self, name) for name in TASK}, "nearest_target": nearest}
+        return np.concatenate([np.atleast_1d(np.asarray(value, dtype=np.float64)) for value in values.values()])
 
 
-TASK_PARAMETERS = (
-    *("start_x", "start_y", "start_z", "nearest_target", "target_distance", "target_clearance"),
-    *("random_attitude", "velocity_std", "body_rates_std"),
-    *("max_distance", "position_cost", "tilt_cost", "body_rates_cost", "collision_cost", "out_of_range_cost"),
-)
+TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
+"""Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
+SCORED = [
+    name for name in TASK if name == "max_distance" or name.endswith("_cost")
+]  # what a control step needs; they come last
+S = first_rows(dict.fromkeys(SCORED, 1))
 
 TASKS: Mapping[str, Task] = {
     "target_tracking": Task(name="target_tracking", target_distance=10.0),
@@ -94,10 +86,10 @@ TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 
 
 class TaskTable(NamedTuple):
-    """The tasks an environment draws from at each reset; K rows."""
+    """The tasks an environment samples from at each reset; K rows."""
 
     parameters: FloatArray
-    """(K, len(TASK_PARAMETERS))"""
+    """(K, columns), see :data:`TASK`"""
     weights: FloatArray
     """(K,), cumulative, the last one 1"""
     tasks: tuple[Task, ...]
@@ -131,14 +123,4 @@ def _resolve(entry: Any, overrides: dict[str, Any]) -> Task:
         task = TASKS[entry]
     else:
         raise ConfigError(unknown("task", entry, TASKS))
-    for key in overrides:
-        if key not in Task.model_fields:
-            raise ConfigError(f"task_kwargs: {unknown('field', key, Task.model_fields)}")
-    try:
-        return Task.model_validate({**task.model_dump(), **overrides})
-    except ValidationError as error:
-        raise ConfigError(f"task_kwargs: {'; '.join(_explain(item) for item in error.errors())}") from None
-
-
-def _explain(item: Any) -> str:
-    return f"{'.'.join(map(str, item['loc']))}: {item['msg'].removeprefix('Value error, ')}"
+    return validate(Task, {**task.model_dump(), **overrides}, "task_kwargs")

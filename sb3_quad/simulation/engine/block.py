@@ -1,0 +1,194 @@
+"""A block: ``LANES`` neighbouring rows of the environment, with all that a control step needs of them in one piece of memory.
+
+Lanes behind the last row repeat it, so that every loop runs over all lanes: a row's numbers then never depend on how many
+others fly, or on where in the batch it stands.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numba import carray
+
+from sb3_quad.simulation.engine.lowlevel import LANES, compiled, pointer
+from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.state import STATE, WRENCH_SIZE
+from sb3_quad.simulation.tasks import SCORED, TASK
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
+
+X = first_rows(STATE)
+T = first_rows(TASK)
+P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
+_WORDS = -(-OBSERVATION_SIZE // 4) * 4
+_NORMALS = -(-OBSERVATION_SIZE // 2) * 2
+
+# Of every lane: the kind of numbers, and how many or of what shape.
+_CONTENTS: dict[str, tuple[str, Any]] = {
+    **{name: ("f8", rows) for name, rows in STATE.items()},
+    "command": ("f8", 4),  # action, then the rotor speed it commands
+    "wanted_speeds": ("f8", 4),  # rotor speeds to be reached in this control step
+    "wrench": ("f8", WRENCH_SIZE),
+    "motor": ("f8", ()),  # km dt
+    "lift": ("f8", ()),  # kF
+    "fall": ("f8", ()),  # g dt
+    "push": ("f8", ()),  # dt / m
+    "twist": ("f8", 3),  # dt / I
+    "gyro": ("f8", 3),  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
+    "arm": ("f8", (3, 4)),  # moment per thrust, by axis and rotor
+    "thrust_middle": ("f8", ()),  # divided by kF, as is the next
+    "thrust_half_range": ("f8", ()),
+    "radius": ("f8", ()),  # of the collision sphere
+    "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
+    "reward": ("f8", ()),
+    "distance": ("f8", ()),
+    "work": ("f8", 4),
+    "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
+    "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
+    "noise_level": ("f4", ()),
+    "noise": ("f4", _NORMALS),
+    "feature": ("f4", OBSERVATION_SIZE),
+    "word": ("u4", _WORDS),  # random
+    "stream": ("u4", 4),
+}
+BLOCK = np.dtype([(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()])
+MEMORY = BLOCK.itemsize + 64  # bytes of the array that a block lies in, at a cache line
+
+
+@compiled(forceinline=True)
+def block_in(memory):
+    """The block in a uint8 array of ``MEMORY`` bytes."""
+    return carray(pointer((memory.ctypes.data + 63) // 64 * 64), 1, BLOCK)[0]
+
+
+@compiled(forceinline=True)
+def load_rows(source, row, first, count, target):
+    """Copy rows of a (rows, n) array, from ``row`` on, to rows of a block."""
+    for k in range(target.shape[0]):
+        if count == LANES:
+            for lane in range(LANES):
+                target[k, lane] = source[row + k, first + lane]
+        else:
+            for lane in range(LANES):
+                target[k, lane] = source[row + k, first + min(lane, count - 1)]
+
+
+@compiled
+def load_state(b, state, first, count):
+    """The true state of a block."""
+    load_rows(state, X.position, first, count, b.position)
+    load_rows(state, X.quaternion, first, count, b.quaternion)
+    load_rows(state, X.velocity, first, count, b.velocity)
+    load_rows(state, X.body_rates, first, count, b.body_rates)
+    load_rows(state, X.rotor_speeds, first, count, b.rotor_speeds)
+    load_rows(state, X.target, first, count, b.target)
+
+
+@compiled(forceinline=True)
+def _store_rows(source, state, row, first, count):
+    for k in range(source.shape[0]):
+        for lane in range(count):
+            state[row + k, first + lane] = source[k, lane]
+
+
+@compiled
+def store_state(b, state, first, count):
+    """Back to the array of all rows; the target stays as it is."""
+    _store_rows(b.position, state, X.position, first, count)
+    _store_rows(b.quaternion, state, X.quaternion, first, count)
+    _store_rows(b.velocity, state, X.velocity, first, count)
+    _store_rows(b.body_rates, state, X.body_rates, first, count)
+    _store_rows(b.rotor_speeds, state, X.rotor_speeds, first, count)
+
+
+@compiled
+def load_vehicles(b, vehicles, first, count, physics_step):
+    """What the control step needs of the vehicles of a block, with the divisions done."""
+    last = vehicles.shape[1] - 1
+    dt = physics_step
+    for lane in range(LANES):
+        i = min(first + min(lane, count - 1), last)
+        lift = vehicles[P.thrust_coefficient, i]
+        ixx, iyy, izz = vehicles[P.ixx, i], vehicles[P.iyy, i], vehicles[P.izz, i]
+        b.motor[lane] = vehicles[P.motor_gain, i] * dt
+        b.lift[lane] = lift
+        b.fall[lane] = vehicles[P.gravity, i] * dt
+        b.push[lane] = dt / vehicles[P.mass, i]
+        b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
+        b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
+        for axis in range(3):
+            for rotor in range(4):
+                b.arm[axis, rotor, lane] = vehicles[P.roll_arm_0 + 4 * axis + rotor, i]
+        b.thrust_middle[lane] = vehicles[P.thrust_middle, i] / lift
+        b.thrust_half_range[lane] = vehicles[P.thrust_half_range, i] / lift
+        b.radius[lane] = vehicles[P.collision_radius, i]
+
+
+@compiled(fastmath=True)
+def _command_rotors(b):
+    """Rotor speeds from actions (Eqs. 3.18 and 2.4), in place."""
+    for lane in range(LANES):
+        for k in range(4):
+            action = min(max(b.command[k, lane], -1.0), 1.0)
+            b.command[k, lane] = math.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * action)
+
+
+@compiled
+def load_commands(b, actions, queue, first, count):
+    """Actions into the delay's end, and what leaves it into the wanted rotor speeds."""
+    command, wanted = b.command, b.wanted_speeds
+    delay, rotors = queue.shape[0], queue.shape[1]
+    for lane in range(LANES):
+        i = first + min(lane, count - 1)
+        for k in range(rotors):
+            command[k, lane] = actions[i, k]
+    _command_rotors(b)
+    if delay == 0:
+        for k in range(rotors):
+            for lane in range(LANES):
+                wanted[k, lane] = command[k, lane]
+        return
+    for k in range(rotors):
+        for lane in range(LANES):
+            wanted[k, lane] = queue[0, k, first + min(lane, count - 1)]
+        for late in range(delay - 1):
+            for lane in range(count):
+                queue[late, k, first + lane] = queue[late + 1, k, first + lane]
+        for lane in range(count):
+            queue[delay - 1, k, first + lane] = command[k, lane]
+
+
+@compiled
+def load_scored(b, task_index, tasks, first, count):
+    """Limits and costs of the tasks that the rows of a block are flying."""
+    scored = b.scored
+    for lane in range(LANES):
+        task = 0 if tasks.shape[0] == 1 else task_index[first + min(lane, count - 1)]
+        for k in range(scored.shape[0]):
+            scored[k, lane] = tasks[task, T.max_distance + k]
+
+
+@compiled
+def load_scaling(b, mean, std, noise_level, first, count):
+    """μ, 1/σ and the noise level of a block, in float32."""
+    step = 0 if noise_level.shape[0] == 1 else 1
+    for lane in range(LANES):
+        i = step * (first + min(lane, count - 1))
+        b.noise_level[lane] = noise_level[i]
+        for k in range(std.shape[0]):
+            b.mean[k, lane] = mean[k, i]
+            b.inverse_std[k, lane] = std[k, i]
+    for k in range(std.shape[0]):
+        for lane in range(LANES):
+            b.inverse_std[k, lane] = np.float32(1.0) / b.inverse_std[k, lane]
+
+
+@compiled
+def store_observations(b, out, first, count):
+    """The observations of a block to rows of ``out``, float32 (n, OBSERVATION_SIZE)."""
+    feature = b.feature
+    for lane in range(count):
+        for k in range(feature.shape[0]):
+            out[first + lane, k] = feature[k, lane]

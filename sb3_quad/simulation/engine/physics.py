@@ -1,0 +1,172 @@
+"""The physics of one control step of a block: the rotors (Eq. 4.1), the external wrench, and PyBullet's integrator.
+
+Per physics step, as PyBullet does it for the floating base of a multibody: v += dt F/m and ω += dt I⁻¹(τ - ω×Iω), explicit;
+world components of v and ω cut at 100; then position and attitude by the new velocities, the attitude by the exact
+exponential of ω dt with dt |ω| cut at π/4. Against PyBullet the difference is rounding (1e-12 over 400 control steps).
+
+The body rates stay in the body frame: a rotation about ω leaves ω as it is, so that PyBullet's world-frame sum is the same.
+"""
+
+from __future__ import annotations
+
+import math
+
+from sb3_quad.simulation.engine.lowlevel import LANES, compiled
+from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.state import WRENCH
+
+W = first_rows(WRENCH)
+
+MAX_COORDINATE_VELOCITY = 100.0  # btMultiBody's m_maxCoordinateVelocity, m/s and rad/s
+MAX_HALF_ANGLE = math.pi / 8.0  # btMultiBody's ANGULAR_MOTION_THRESHOLD, halved
+SMALL_STEP = 0.0025  # s; up to here half of dt |ω| stays below 0.2166, whatever ω the cut at 100 lets through
+
+
+@compiled(inline="always")
+def rotation_rows(qw, qx, qy, qz):
+    """The rotation matrix of a unit quaternion, body to world, row by row."""
+    return (
+        (1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)),
+        (2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)),
+        (2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)),
+    )
+
+
+@compiled(fastmath=True)
+def accelerate(b):
+    """Rotor speeds, velocities and body rates after one physics step; whether some may exceed PyBullet's cut."""
+    s, wanted, q, v, w, wrench, arm = b.rotor_speeds, b.wanted_speeds, b.quaternion, b.velocity, b.body_rates, b.wrench, b.arm
+    gyro, twist, largest = b.gyro, b.twist, b.work[0]
+    for lane in range(LANES):
+        motor = b.motor[lane]
+        s0 = s[0, lane] + motor * (wanted[0, lane] - s[0, lane])
+        s1 = s[1, lane] + motor * (wanted[1, lane] - s[1, lane])
+        s2 = s[2, lane] + motor * (wanted[2, lane] - s[2, lane])
+        s3 = s[3, lane] + motor * (wanted[3, lane] - s[3, lane])
+        s[0, lane], s[1, lane], s[2, lane], s[3, lane] = s0, s1, s2, s3
+        lift = b.lift[lane]
+        f0, f1, f2, f3 = lift * s0 * s0, lift * s1 * s1, lift * s2 * s2, lift * s3 * s3
+
+        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(q[0, lane], q[1, lane], q[2, lane], q[3, lane])
+        fx, fy = wrench[W.force_body, lane], wrench[W.force_body + 1, lane]
+        fz = wrench[W.force_body + 2, lane] + ((f0 + f1) + (f2 + f3))
+        push = b.push[lane]
+        vx = v[0, lane] + push * (wrench[W.force_world, lane] + r00 * fx + r01 * fy + r02 * fz)
+        vy = v[1, lane] + push * (wrench[W.force_world + 1, lane] + r10 * fx + r11 * fy + r12 * fz)
+        vz = v[2, lane] + push * (wrench[W.force_world + 2, lane] + r20 * fx + r21 * fy + r22 * fz) - b.fall[lane]
+        v[0, lane], v[1, lane], v[2, lane] = vx, vy, vz
+
+        gx, gy, gz = wrench[W.torque_world, lane], wrench[W.torque_world + 1, lane], wrench[W.torque_world + 2, lane]
+        wx, wy, wz = w[0, lane], w[1, lane], w[2, lane]
+        tx = wrench[W.torque_body, lane] + r00 * gx + r10 * gy + r20 * gz - gyro[0, lane] * wy * wz
+        ty = wrench[W.torque_body + 1, lane] + r01 * gx + r11 * gy + r21 * gz - gyro[1, lane] * wz * wx
+        tz = wrench[W.torque_body + 2, lane] + r02 * gx + r12 * gy + r22 * gz - gyro[2, lane] * wx * wy
+        tx += (arm[0, 0, lane] * f0 + arm[0, 1, lane] * f1) + (arm[0, 2, lane] * f2 + arm[0, 3, lane] * f3)
+        ty += (arm[1, 0, lane] * f0 + arm[1, 1, lane] * f1) + (arm[1, 2, lane] * f2 + arm[1, 3, lane] * f3)
+        tz += (arm[2, 0, lane] * f0 + arm[2, 1, lane] * f1) + (arm[2, 2, lane] * f2 + arm[2, 3, lane] * f3)
+        wx += twist[0, lane] * tx
+        wy += twist[1, lane] * ty
+        wz += twist[2, lane] * tz
+        w[0, lane], w[1, lane], w[2, lane] = wx, wy, wz
+        largest[lane] = max(wx * wx + wy * wy + wz * wz, vx * vx + vy * vy + vz * vz)
+    over = 0
+    for lane in range(LANES):
+        over += largest[lane] > MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY
+    return over > 0
+
+
+@compiled
+def _cut(value):
+    return min(max(value, -MAX_COORDINATE_VELOCITY), MAX_COORDINATE_VELOCITY)
+
+
+@compiled
+def limit_velocities(b):
+    """PyBullet's cut of each world component of v and ω, in the rare lanes that exceed it."""
+    q, v, w = b.quaternion, b.velocity, b.body_rates
+    for lane in range(LANES):
+        for k in range(3):
+            v[k, lane] = _cut(v[k, lane])
+        x, y, z = w[0, lane], w[1, lane], w[2, lane]
+        if x * x + y * y + z * z <= MAX_COORDINATE_VELOCITY * MAX_COORDINATE_VELOCITY:
+            continue
+        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(q[0, lane], q[1, lane], q[2, lane], q[3, lane])
+        wx = _cut(r00 * x + r01 * y + r02 * z)
+        wy = _cut(r10 * x + r11 * y + r12 * z)
+        wz = _cut(r20 * x + r21 * y + r22 * z)
+        w[0, lane] = r00 * wx + r10 * wy + r20 * wz
+        w[1, lane] = r01 * wx + r11 * wy + r21 * wz
+        w[2, lane] = r02 * wx + r12 * wy + r22 * wz
+
+
+@compiled(inline="always")
+def _turned(qw, qx, qy, qz, aw, ax, ay, az):
+    """The product of two quaternions."""
+    return (
+        qw * aw - qx * ax - qy * ay - qz * az,
+        qw * ax + qx * aw + qy * az - qz * ay,
+        qw * ay - qx * az + qy * aw + qz * ax,
+        qw * az + qx * ay - qy * ax + qz * aw,
+    )
+
+
+@compiled(fastmath=True)
+def move(b, dt):
+    """Position and attitude by the new velocities, for steps up to ``SMALL_STEP``.
+
+    With h = dt |ω| / 2 below 0.2166, sin(h)/h to h¹⁰ and cos(h) to h¹² are exact to double precision, and the new
+    quaternion is off unit norm by rounding only, which one step of Newton's method takes back.
+    """
+    x, q, v, w = b.position, b.quaternion, b.velocity, b.body_rates
+    half_step = 0.5 * dt
+    for lane in range(LANES):
+        x[0, lane] += dt * v[0, lane]
+        x[1, lane] += dt * v[1, lane]
+        x[2, lane] += dt * v[2, lane]
+        ax, ay, az = half_step * w[0, lane], half_step * w[1, lane], half_step * w[2, lane]
+        h2 = ax * ax + ay * ay + az * az
+        sinc = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0 * (1.0 - h2 / 110.0))))
+        aw = 1.0 - h2 / 2.0 * (
+            1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0 * (1.0 - h2 / 90.0 * (1.0 - h2 / 132.0))))
+        )
+        ax *= sinc
+        ay *= sinc
+        az *= sinc
+        nw, nx, ny, nz = _turned(q[0, lane], q[1, lane], q[2, lane], q[3, lane], aw, ax, ay, az)
+        scale = 1.5 - 0.5 * (nw * nw + nx * nx + ny * ny + nz * nz)
+        q[0, lane], q[1, lane], q[2, lane], q[3, lane] = nw * scale, nx * scale, ny * scale, nz * scale
+
+
+@compiled(fastmath=True)
+def move_far(b, dt):
+    """As :func:`move`, for steps of any length: PyBullet's cut of the angle, longer series, full normalisation."""
+    x, q, v, w, work = b.position, b.quaternion, b.velocity, b.body_rates, b.work
+    half_step = 0.5 * dt
+    for lane in range(LANES):
+        x[0, lane] += dt * v[0, lane]
+        x[1, lane] += dt * v[1, lane]
+        x[2, lane] += dt * v[2, lane]
+        ax, ay, az = half_step * w[0, lane], half_step * w[1, lane], half_step * w[2, lane]
+        h2 = min(ax * ax + ay * ay + az * az, MAX_HALF_ANGLE * MAX_HALF_ANGLE)
+        sinc = 1.0 - h2 / 156.0 * (1.0 - h2 / 210.0)
+        sinc = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0 * (1.0 - h2 / 110.0 * sinc))))
+        aw = 1.0 - h2 / 132.0 * (1.0 - h2 / 182.0)
+        aw = 1.0 - h2 / 2.0 * (1.0 - h2 / 12.0 * (1.0 - h2 / 30.0 * (1.0 - h2 / 56.0 * (1.0 - h2 / 90.0 * aw))))
+        work[0, lane], work[1, lane], work[2, lane], work[3, lane] = ax * sinc, ay * sinc, az * sinc, aw
+    for lane in range(LANES):
+        ax, ay, az, aw = work[0, lane], work[1, lane], work[2, lane], work[3, lane]
+        nw, nx, ny, nz = _turned(q[0, lane], q[1, lane], q[2, lane], q[3, lane], aw, ax, ay, az)
+        scale = 1.0 / math.sqrt(nw * nw + nx * nx + ny * ny + nz * nz)
+        q[0, lane], q[1, lane], q[2, lane], q[3, lane] = nw * scale, nx * scale, ny * scale, nz * scale
+
+
+@compiled(inline="always")
+def fly_block(b, physics_step, substeps):
+    """The physics steps of one control step of a loaded block, in place."""
+    for _ in range(substeps):
+        if accelerate(b):
+            limit_velocities(b)
+        if physics_step <= SMALL_STEP:
+            move(b, physics_step)
+        else:
+            move_far(b, physics_step)

@@ -1,0 +1,141 @@
+"""Counter-based random numbers: a stream per row, so that neither threads nor neighbours change what a row gets.
+
+Every number is Philox4x32 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) of a key and a
+counter: the key names the row, the counter is ``(block, step, episode, purpose)``. Nothing is remembered in between.
+
+``streams``, uint32 of shape ``(4, n)``: key_lo, key_hi, episode, step. Resetting a row adds one to ``episode`` and sets
+``step`` to 0; each control step adds one to ``step``.
+
+Normals are Box-Muller in float32, lane by lane. The logarithm, sine and cosine are short polynomials instead of library
+calls, so that the loops vectorise; their error (1e-7) is far below what any test of the numbers could see. The largest
+number there can be is 6.6.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import float32, int32, uint32, uint64
+
+from sb3_quad.simulation.engine.lowlevel import LANES, as_float32, as_int32, compiled
+
+KEY_LO, KEY_HI, EPISODE, STEP = range(4)
+OBSERVATION_NOISE, EPISODE_START = range(2)  # purposes: the last word of the counter
+ROUNDS = 10
+_MASK, _SHIFT = uint64(0xFFFFFFFF), uint64(32)
+_SQRT_HALF_BITS = 0x3F3504F3  # of sqrt(1/2)
+_LN2 = float32(math.log(2.0))
+_TO_UNIT = float32(2.0**-31)
+_TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
+
+
+def stream_key(np_random: np.random.Generator) -> int:
+    """A 64-bit key from a seeded generator (Gymnasium's ``self.np_random``)."""
+    return int(np_random.integers(2**64, dtype=np.uint64))
+
+
+def new_streams(keys: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:
+    """Streams before their first episode, shape (4, n), from 64-bit keys of shape (n,)."""
+    keys = np.asarray(keys, dtype=np.uint64)
+    streams = np.zeros((4, keys.shape[0]), dtype=np.uint32)
+    streams[KEY_LO] = keys & np.uint64(0xFFFFFFFF)
+    streams[KEY_HI] = keys >> np.uint64(32)
+    return streams
+
+
+@compiled(forceinline=True)
+def _round(c0, c1, c2, c3, k0, k1):
+    # In uint64 whose upper half is left to hold anything: AVX2 multiplies the lower halves of 64-bit lanes.
+    p0 = uint64(0xD2511F53) * (c0 & _MASK)
+    p1 = uint64(0xCD9E8D57) * (c2 & _MASK)
+    return (p1 >> _SHIFT) ^ c1 ^ k0, p1, (p0 >> _SHIFT) ^ c3 ^ k1, p0
+
+
+@compiled(forceinline=True)
+def philox(c0, c1, c2, c3, k0, k1):
+    """Philox4x32-10: four uint32 from a counter of four and a key of two."""
+    c0, c1, c2, c3, k0, k1 = uint64(c0), uint64(c1), uint64(c2), uint64(c3), uint64(k0), uint64(k1)
+    for _ in range(ROUNDS):
+        c0, c1, c2, c3 = _round(c0, c1, c2, c3, k0, k1)
+        k0 += uint64(0x9E3779B9)
+        k1 += uint64(0xBB67AE85)
+    return uint32(c0), uint32(c1), uint32(c2), uint32(c3)
+
+
+@compiled
+def uniforms(streams, row, blocks, purpose):
+    """Doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 blocks,)."""
+    numbers = np.empty(2 * blocks)
+    for block in range(blocks):
+        w0, w1, w2, w3 = philox(
+            uint32(block),
+            streams[STEP, row],
+            streams[EPISODE, row],
+            uint32(purpose),
+            streams[KEY_LO, row],
+            streams[KEY_HI, row],
+        )
+        numbers[2 * block] = (((uint64(w0) << _SHIFT | uint64(w1)) >> uint64(11)) + 0.5) * 2.0**-53
+        numbers[2 * block + 1] = (((uint64(w2) << _SHIFT | uint64(w3)) >> uint64(11)) + 0.5) * 2.0**-53
+    return numbers
+
+
+@compiled
+def random_words(b):
+    """``b.word``: random words of every lane, from the lane's key and counter."""
+    word, stream = b.word, b.stream
+    for block in range(word.shape[0] // 4):
+        for lane in range(LANES):
+            w0, w1, w2, w3 = philox(
+                uint32(block),
+                stream[STEP, lane],
+                stream[EPISODE, lane],
+                uint32(OBSERVATION_NOISE),
+                stream[KEY_LO, lane],
+                stream[KEY_HI, lane],
+            )
+            word[4 * block, lane] = w0
+            word[4 * block + 1, lane] = w1
+            word[4 * block + 2, lane] = w2
+            word[4 * block + 3, lane] = w3
+
+
+@compiled(forceinline=True)
+def _log(x):
+    """ln x of a positive float32: the exponent, and a polynomial on [sqrt(1/2), sqrt(2))."""
+    bits = as_int32(x)
+    exponent = int32(int32(bits - int32(_SQRT_HALF_BITS)) >> int32(23))
+    m = as_float32(int32(bits - int32(exponent << int32(23)))) - float32(1.0)
+    p = float32(7.0376836292e-2)
+    for coefficient in (
+        *(-1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1),
+        *(-1.6668057665e-1, 2.0000714765e-1, -2.4999993993e-1, 3.3333331174e-1),
+    ):
+        p = p * m + float32(coefficient)
+    return m + m * m * (m * p - float32(0.5)) + float32(exponent) * _LN2
+
+
+@compiled(fastmath=True)
+def standard_normals(b):
+    """``b.noise``: standard normals of every lane from its ``b.word``, two from two."""
+    word, noise = b.word, b.noise
+    for pair in range(noise.shape[0] // 2):
+        for lane in range(LANES):
+            u = (float32(int32(word[2 * pair, lane] >> uint32(1))) + float32(0.5)) * _TO_UNIT
+            radius = np.sqrt(float32(-2.0) * _log(u))
+            turn = word[2 * pair + 1, lane]
+            quadrant = int32(uint32(turn + uint32(0x20000000)) >> uint32(30))
+            t = float32(int32(uint32(turn - (uint32(quadrant) << uint32(30))))) * _TO_ANGLE
+            t2 = t * t
+            sine = t + t * t2 * (float32(-1.6666654611e-1) + t2 * (float32(8.3321608736e-3) + t2 * float32(-1.9515295891e-4)))
+            p = float32(4.166664568298827e-2) + t2 * (float32(-1.388731625493765e-3) + t2 * float32(2.443315711809948e-5))
+            cosine = float32(1.0) - float32(0.5) * t2 + t2 * t2 * p
+            odd = (quadrant & 1) != 0
+            first = sine if odd else cosine
+            second = cosine if odd else sine
+            first_sign = int32((quadrant ^ (quadrant >> int32(1))) & int32(1)) << int32(31)
+            second_sign = int32(quadrant >> int32(1)) << int32(31)
+            noise[2 * pair, lane] = radius * as_float32(int32(as_int32(first) ^ first_sign))
+            noise[2 * pair + 1, lane] = radius * as_float32(int32(as_int32(second) ^ second_sign))

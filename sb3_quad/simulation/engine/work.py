@@ -1,0 +1,227 @@
+"""One control step of a whole batch, in one pass over its blocks, shared out between threads.
+
+``work`` is all that the threads run. A job holds sizes and the addresses of arrays; the control array says which job is
+under way and how many of its blocks are not taken yet. Whoever comes takes the next block: a thread that is late, or never
+comes, costs time but changes nothing, since each row has a stream of its own and each block its own memory.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import carray, int64
+
+from sb3_quad.base.arrays import BoolArray, Float32Array
+from sb3_quad.simulation.engine.block import (
+    MEMORY,
+    block_in,
+    load_commands,
+    load_rows,
+    load_scaling,
+    load_scored,
+    load_state,
+    load_vehicles,
+    store_observations,
+    store_state,
+)
+from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, pointer
+from sb3_quad.simulation.engine.physics import fly_block
+from sb3_quad.simulation.engine.random import STEP
+from sb3_quad.simulation.episodes import start_episode
+from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
+from sb3_quad.simulation.reward import score
+from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
+from sb3_quad.simulation.tasks import TASK, S
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
+
+LOOK, SCORE, FLY = range(3)
+"""What a job does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a control
+step that another simulator has flown; it flies and scores one."""
+
+# Columns of vehicles and of scaling: 1 where one serves all rows. max_steps: control steps of an episode.
+SIZES = ("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "scaling_columns", "mode", "autoreset")
+ARRAYS = (
+    *("state", "queue", "wrench", "vehicles", "streams", "mean", "std", "noise_level", "task_index"),
+    *("task_parameters", "task_weights", "returns", "outcome"),
+)
+STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
+_ADDRESSES = tuple(f"{name}_at" for name in ARRAYS + STEP_ARRAYS)
+JOB = np.dtype([("physics_step", "f8"), *((name, "i8") for name in SIZES + _ADDRESSES)])
+
+OUTCOME = np.dtype(
+    [
+        ("total", "f8"),  # sum of the rewards
+        ("reward", "f8"),  # of the last control step
+        ("length", "i8"),  # control steps
+        ("distance", "f8"),  # |r - r_T|, m
+        ("collision", "?"),
+        ("out_of_range", "?"),
+        ("truncated", "?"),  # neither of these
+        ("observation", "f4", (OBSERVATION_SIZE,)),
+    ],
+    align=True,
+)
+"""How the last episode of a row ended."""
+
+# The control array, each number on a cache line of its own; from AWAKE on: whether worker k is looking for blocks.
+LINE = 16
+LEFT, DONE, NOW, SERIAL, AWAKE = (LINE * k for k in first_rows(dict.fromkeys(("left", "done", "job", "serial", "awake"), 1)))
+_PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
+
+
+class StepArrays(NamedTuple):
+    """What a step is given and gives: actions (n, 4), observations (n, OBSERVATION_SIZE), rewards (n,), dones (n,)."""
+
+    actions: Float32Array
+    observations: Float32Array
+    rewards: Float32Array
+    dones: BoolArray
+
+
+def step_arrays(n: int, actions: Float32Array | None = None) -> StepArrays:
+    """Arrays for a step: dones are False, actions zero unless given; observations and rewards hold anything."""
+    observations = np.empty((n, OBSERVATION_SIZE), dtype=np.float32)
+    given = np.zeros((n, 4), np.float32) if actions is None else actions
+    return StepArrays(given, observations, np.empty(n, np.float32), np.zeros(n, np.bool_))
+
+
+@compiled(inline="always")
+def run_block(job, number, b, fresh):
+    """One block of a job, see the modes; rows that end leave their outcome and, with ``autoreset``, begin their next episode.
+
+    What is the same for all rows is in the block already unless it is ``fresh``.
+    """
+    n = job.n
+    state = carray(pointer(job.state_at), (STATE_SIZE, n), np.float64)
+    streams = carray(pointer(job.streams_at), (4, n), np.uint32)
+    task_index = carray(pointer(job.task_index_at), (n,), np.int64)
+    tasks = carray(pointer(job.task_parameters_at), (job.tasks, _COLUMNS), np.float64)
+    vehicles = carray(pointer(job.vehicles_at), (_PARAMETERS, job.vehicle_columns), np.float64)
+    queue = carray(pointer(job.queue_at), (job.delay, 4, n), np.float64)
+    returns = carray(pointer(job.returns_at), (n,), np.float64)
+    observations = carray(pointer(job.observations_at), (n, OBSERVATION_SIZE), np.float32)
+    dones = carray(pointer(job.dones_at), (n,), np.bool_)
+    first = number * LANES
+    count = min(LANES, n - first)
+
+    if fresh or job.scaling_columns > 1:
+        scaling = job.scaling_columns
+        mean = carray(pointer(job.mean_at), (OBSERVATION_SIZE, scaling), np.float64)
+        std = carray(pointer(job.std_at), (OBSERVATION_SIZE, scaling), np.float64)
+        load_scaling(b, mean, std, carray(pointer(job.noise_level_at), (scaling,), np.float64), first, count)
+    if job.mode > LOOK:
+        load_state(b, state, first, count)
+        if fresh or job.vehicle_columns > 1:
+            load_vehicles(b, vehicles, first, count, job.physics_step)
+        if fresh or job.tasks > 1:
+            load_scored(b, task_index, tasks, first, count)
+        if job.mode == FLY:
+            load_rows(carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64), 0, first, count, b.wrench)
+            load_commands(b, carray(pointer(job.actions_at), (n, 4), np.float32), queue, first, count)
+            fly_block(b, job.physics_step, job.substeps)
+            store_state(b, state, first, count)
+        score(b)
+        for lane in range(count):
+            streams[STEP, first + lane] += np.uint32(1)
+        load_rows(streams, 0, first, count, b.stream)
+        observe(b)
+        store_observations(b, observations, first, count)
+
+        rewards = carray(pointer(job.rewards_at), (n,), np.float32)
+        height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
+        ended = 0
+        for lane in range(count):
+            i = first + lane
+            returns[i] += b.reward[lane]
+            rewards[i] = b.reward[lane]
+            lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
+            dones[i] = lost | (streams[STEP, i] >= job.max_steps)
+            ended += dones[i]
+        if ended == 0 and job.autoreset:
+            return
+        outcome = carray(pointer(job.outcome_at), (n,), OUTCOME)
+        for lane in range(count):
+            i = first + lane
+            if dones[i] or not job.autoreset:
+                outcome[i].collision = height[lane] <= radius[lane]
+                outcome[i].out_of_range = distance[lane] > scored[S.max_distance, lane]
+                outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
+                outcome[i].distance = distance[lane]
+                outcome[i].total, outcome[i].reward = returns[i], b.reward[lane]
+                outcome[i].length = streams[STEP, i]
+                for k in range(OBSERVATION_SIZE):
+                    outcome[i].observation[k] = observations[i, k]
+        if not job.autoreset:
+            return
+
+    weights = carray(pointer(job.task_weights_at), (job.tasks,), np.float64)
+    for i in range(first, first + count):
+        if dones[i]:
+            returns[i] = 0.0
+            start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
+    load_state(b, state, first, count)
+    load_rows(streams, 0, first, count, b.stream)
+    observe(b)
+    store_observations(b, observations, first, count)
+
+
+@compiled
+def _finite(actions):
+    # By their bits: code compiled with fastmath may take it that no NaN exists.
+    count = 4 * actions.shape[0]
+    bits = carray(pointer(actions.ctypes.data), (count,), np.int32)
+    wrong = 0
+    for i in range(count):
+        wrong += (bits[i] & 0x7F800000) == 0x7F800000
+    return wrong == 0
+
+
+@compiled
+def work(control, worker, patience, job, actions, observations, rewards, dones):
+    """The loop of every thread.
+
+    :param control: int64, see this module's constants; shared by all threads.
+    :param worker: number of a worker thread, which returns after ``patience`` looks without a block; -1 for the thread that
+        brings the job, which returns when the job is done or after ``patience`` looks at a block that a worker still has.
+    :param job: of the dtype ``JOB``, (1,), viewed as int64, which numba tells apart sooner; unused by workers, as are the
+        :class:`StepArrays`.
+    :return: whether all is done; -1 if an action is not finite, and then nothing has been done.
+    """
+    memory = np.empty(MEMORY, np.uint8)
+    blocks = int64(0)
+    if worker < 0:
+        if not _finite(actions):
+            return -1
+        own = carray(pointer(job.ctypes.data), 1, JOB)[0]
+        own.actions_at, own.observations_at = actions.ctypes.data, observations.ctypes.data
+        own.rewards_at, own.dones_at = rewards.ctypes.data, dones.ctypes.data
+        blocks = (own.n + LANES - 1) // LANES
+        atomic_set(control, DONE, 0)
+        atomic_set(control, NOW, job.ctypes.data)
+        atomic_add(control, SERIAL, 1)
+        atomic_set(control, LEFT, blocks)
+    idle = 0
+    known = int64(-1)  # the job whose common numbers lie in this thread's block
+    while True:
+        b = block_in(memory)  # in the loop: numba frees what is not used again
+        if atomic_get(control, LEFT) > 0:
+            number = atomic_add(control, LEFT, -1) - 1
+            if number >= 0:
+                # Whoever holds a block keeps its job under way, so what is read from here on belongs together.
+                address, serial = atomic_get(control, NOW), atomic_get(control, SERIAL)
+                run_block(carray(pointer(address), 1, JOB)[0], number, b, serial != known)
+                known = serial
+                atomic_add(control, DONE, 1)
+                idle = 0
+        elif worker < 0 and atomic_get(control, DONE) == blocks:
+            return 1
+        idle += 1
+        if idle > patience:
+            if worker >= 0:
+                atomic_set(control, AWAKE + LINE * worker, 0)
+                if atomic_get(control, LEFT) > 0 and atomic_set(control, AWAKE + LINE * worker, 1) == 0:
+                    idle = 0
+                    continue
+            return 0
