@@ -87,16 +87,13 @@ class TrajectoryFigures(BaseCallback):
         return True
 
     def _fly(self) -> Arrays:
-        from sb3_quad.evaluation.fleets import BatchFleet
         from sb3_quad.evaluation.flightlog import Recorder
-        from sb3_quad.evaluation.flights import Plan, fly_fleet
+        from sb3_quad.evaluation.flights import fly
 
         recorder = Recorder(len(self._seeds), self._max_steps)
-        fleet = BatchFleet(self._seeds, *self._setting)
-        try:
-            fly_fleet(fleet, self.model, Plan(), self._max_steps, (), recorder)
-        finally:
-            fleet.close()
+        task, task_kwargs, vehicle, noise, max_steps, std = self._setting
+        keywords = {"vehicle": vehicle, "noise": noise, "task_kwargs": task_kwargs, "observation_std": std}
+        fly(self.model, task, len(self._seeds), self._seeds[0], max_steps=max_steps, hooks=[recorder], **keywords)
         return recorder.arrays()
 
 

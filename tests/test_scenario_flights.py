@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from sb3_quad.base.errors import ConfigError, ControllerError
-from sb3_quad.evaluation.flightlog import episode_arrays, flight_file, read_flights
+from sb3_quad.base.files import write_arrays
+from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.hits import find_limit
 from sb3_quad.evaluation.intervals import mean, share
@@ -120,7 +121,7 @@ def test_a_lost_flight_is_recorded_to_its_end():
 
 def test_flight_files_hold_what_was_flown(tmp_path):
     flights, log = fly_scenario(PIDExpert(), scenario("target: {distance: 5}, duration: 3, episodes: 3"), recorded=2)
-    (tmp_path / "f.npz").write_bytes(flight_file({**episode_arrays(flights, range(3)), **log}))
+    write_arrays(tmp_path / "f.npz", **episode_arrays(flights, range(3)), **log)
     arrays = read_flights(tmp_path / "f.npz")
     np.testing.assert_array_equal(arrays["position"], log["position"])
     assert arrays["episode_outcome"].tolist() == ["success"] * 3

@@ -3,68 +3,39 @@
 from __future__ import annotations
 
 import math
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.engine.streams import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
-from sb3_quad.simulation.episodes import TASK_COLUMNS
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE, observe
-from sb3_quad.simulation.state import QUATERNION, ROTOR_SPEEDS, STATE_SIZE, QuadcopterState
-from sb3_quad.simulation.tasks import TASK_PARAMETERS, TASKS, Task, reset_rows, resolve_tasks, score
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.engine.block import T
+from sb3_quad.simulation.engine.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
+from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.state import BODY_RATES, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.simulation.tasks import SCORED, TASK, TASKS, Task, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
 
 
-def start(n, task, seed=0, delay=1, **task_kwargs):
-    """All arrays of n rows at the start of their first episode."""
-    tasks = resolve_tasks(task, task_kwargs)
-    rows = SimpleNamespace(
-        n=n,
-        tasks=tasks,
-        state=np.zeros((STATE_SIZE, n)),
-        queue=np.zeros((delay, 4, n)),
-        streams=new_streams(np.arange(seed, seed + n, dtype=np.uint64)),
-        task_index=np.zeros(n, dtype=np.int64),
-        vehicles=np.repeat(ITM.parameters()[:, None], n, axis=1),
-    )
-    again(rows, np.arange(n))
+def start(n, task, seed=0, **task_kwargs):
+    """n rows at the start of their first episode."""
+    rows = QuadcopterBatch(n, task, task_kwargs, autoreset=False, n_threads=1)
+    rows.streams[:] = new_streams(np.arange(seed, seed + n, dtype=np.uint64))
+    rows.reset()
     return rows
 
 
-def again(rows, which):
-    tasks = rows.tasks
-    reset_rows(which, rows.state, rows.queue, rows.streams, rows.task_index, rows.vehicles, tasks.parameters, tasks.weights)
-
-
 def observations(rows, noise):
-    mean, std = (np.repeat(values[:, None], rows.n, axis=1) for values in (DEFAULT_MEAN, DEFAULT_STD))
-    out = np.empty((rows.n, OBSERVATION_SIZE), dtype=np.float32)
-    observe(rows.state, rows.streams, mean, std, np.full(rows.n, noise), out)
-    return out
+    rows.set_noise(noise)
+    return rows.observe()
 
 
 def scores(rows):
-    result = SimpleNamespace(
-        reward=np.zeros(rows.n),
-        collided=np.zeros(rows.n, dtype=np.bool_),
-        out_of_range=np.zeros(rows.n, dtype=np.bool_),
-        distance=np.zeros(rows.n),
-    )
-    score(
-        rows.state,
-        rows.vehicles,
-        rows.task_index,
-        rows.tasks.parameters,
-        result.reward,
-        result.collided,
-        result.out_of_range,
-        result.distance,
-    )
-    return result
+    """The outcome of a control step that has left the rows as they are."""
+    rows.score()
+    return rows.outcome
 
 
 # --- random numbers
@@ -133,7 +104,7 @@ def test_noise_belongs_to_key_episode_and_step():
 
 def test_features_in_their_order():
     rows = start(200, "state_recovery", seed=5)
-    rows.state[17:20] += np.random.default_rng(0).normal(size=(3, 200))
+    rows.state[TARGET] += np.random.default_rng(0).normal(size=(3, 200))
     state = QuadcopterState(rows.state)
     body_to_world = state.rotation
     expected = np.concatenate(
@@ -147,6 +118,7 @@ def test_features_in_their_order():
     )
     np.testing.assert_allclose(observations(rows, 0.0), expected / DEFAULT_STD, atol=1e-6)
     assert len(FEATURE_NAMES) == OBSERVATION_SIZE == 18
+    assert FEATURE_NAMES[GROUPS["body_rates"]] == ("body_rate_x", "body_rate_y", "body_rate_z")
 
 
 def test_noise_is_relative_to_the_feature():
@@ -187,7 +159,7 @@ def test_state_recovery_starts():
     for values, std in ((state.velocity, 2.0), (state.body_rates, 4.0)):
         np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=5 * std / math.sqrt(20_000))
         np.testing.assert_allclose(values.std(axis=0), std, rtol=5 / math.sqrt(2 * 20_000))
-    together = np.corrcoef(np.concatenate([rows.state[QUATERNION], rows.state[7:13]]))
+    together = np.corrcoef(np.concatenate([rows.state[QUATERNION], rows.state[VELOCITY.start : BODY_RATES.stop]]))
     assert np.abs(together - np.eye(10)).max() < 0.04
 
 
@@ -216,14 +188,14 @@ def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():
     rows = start(5, "state_recovery")
     before, streams = rows.state.copy(), rows.streams.copy()
     rows.streams[STEP] = 9
-    again(rows, np.array([1, 3]))
+    rows.reset(np.array([1, 3]))
     np.testing.assert_array_equal(rows.state[:, [0, 2, 4]], before[:, [0, 2, 4]])
-    assert (rows.state[3:13, [1, 3]] != before[3:13, [1, 3]]).all()
+    assert (rows.state[QUATERNION.start : BODY_RATES.stop, [1, 3]] != before[QUATERNION.start : BODY_RATES.stop, [1, 3]]).all()
     assert rows.streams[EPISODE].tolist() == [1, 2, 1, 2, 1] and rows.streams[STEP].tolist() == [9, 0, 9, 0, 9]
     np.testing.assert_array_equal(rows.streams[:2], streams[:2])
 
 
-def test_a_mixture_draws_tasks_by_their_weights():
+def test_a_mixture_samples_tasks_by_their_weights():
     rows = start(20_000, {"target_tracking": 3.0, "state_recovery": 1.0})
     recovery = rows.task_index == 1
     assert recovery.mean() == pytest.approx(0.25, abs=0.02)
@@ -241,24 +213,24 @@ def test_reward_and_ends_of_each_task():
     rows = start(300, {"target_tracking": 1.0, "state_recovery": 1.0})
     rng = np.random.default_rng(0)
     rows.state[:3] += rng.normal(size=(3, 300)) * 12
-    rows.tasks.parameters[1, TASK_PARAMETERS.index("tilt_cost")] = 0.5
+    rows.tasks.parameters[1, T.tilt_cost] = 0.5
     got, state = scores(rows), QuadcopterState(rows.state)
     tilt_cost = np.where(rows.task_index == 1, 0.5, 0.002)
     collided, away = state.position[:, 2] <= 0.135, state.distance > 30.0
     assert 3 < collided.sum() < 100 and 3 < away.sum() < 100
     expected = -0.003 * state.distance - tilt_cost * np.arccos(np.clip(state.rotation[:, 2, 2], -1, 1))
     expected -= 0.0005 * np.linalg.norm(state.body_rates, axis=1) + 15.0 * collided + 15.0 * away
-    np.testing.assert_allclose(got.reward, expected, atol=1e-12)
-    np.testing.assert_allclose(got.distance, state.distance)
-    np.testing.assert_array_equal(got.collided, collided)
-    np.testing.assert_array_equal(got.out_of_range, away)
+    np.testing.assert_allclose(got["reward"], expected, atol=1e-12)
+    np.testing.assert_allclose(got["distance"], state.distance)
+    np.testing.assert_array_equal(got["collision"], collided)
+    np.testing.assert_array_equal(got["out_of_range"], away)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.7, math.pi / 2, 2.5, math.pi - 1e-6, math.pi])
 def test_tilt_is_exact_at_every_angle(angle):
     rows = start(1, "target_tracking", tilt_cost=1.0, position_cost=0.0, body_rates_cost=0.0)
     rows.state[QUATERNION, 0] = math.cos(angle / 2), 0.6 * math.sin(angle / 2), 0.8 * math.sin(angle / 2), 0.0
-    assert scores(rows).reward[0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
+    assert scores(rows)["reward"][0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
 
 
 # --- tasks as data
@@ -269,7 +241,8 @@ def test_tasks_of_the_thesis():
     assert tracking.target_distance == 10.0 and not tracking.random_attitude
     assert recovery.target_distance == 0.0 and recovery.random_attitude
     assert (recovery.velocity_std, recovery.body_rates_std) == (2.0, 4.0)
-    assert len(tracking.parameters()) == len(TASK_PARAMETERS) == TASK_COLUMNS
+    assert tracking.parameters().shape == (sum(TASK.values()),)
+    assert list(TASK)[-len(SCORED) :] == SCORED  # the engine copies them as one piece
 
 
 def test_task_specifications():
@@ -278,7 +251,7 @@ def test_task_specifications():
     table = resolve_tasks({"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50})
     assert table.weights.tolist() == [0.25, 1.0]
     assert [task.max_distance for task in table.tasks] == [50.0, 50.0]
-    assert table.parameters.shape == (2, len(TASK_PARAMETERS))
+    assert table.parameters.shape == (2, sum(TASK.values()))
 
 
 @pytest.mark.parametrize(

@@ -337,7 +337,7 @@ def test_vehicles_by_row():
         ({"n_envs": 0}, "n_envs 0"),
         ({"n_envs": 2.5}, "n_envs 2.5"),
         ({"n_envs": 2, "task": "target_trackin"}, "did you mean 'target_tracking'"),
-        ({"n_envs": 2, "task_kwargs": {"distance": 3}}, "unknown field 'distance'"),
+        ({"n_envs": 2, "task_kwargs": {"distance": 3}}, "unknown key 'distance'"),
         ({"n_envs": 2, "noise": -0.1}, "noise -0.1"),
         ({"n_envs": 2, "noise": float("nan")}, "finite"),
         ({"n_envs": 2, "observation_std": np.zeros(18)}, "observation_std"),

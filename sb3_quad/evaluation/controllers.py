@@ -88,8 +88,7 @@ def build(spec: ControllerSpec, vehicle: str, mean: Sequence[float] | None = Non
     _check_spaces(controller, spec.spec)
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
-    policy = controller if hasattr(controller, "predict") else _Function(controller)
-    return AdaptiveScaling(policy, (0.0, 0.0, 0.0) if mean is None else mean)
+    return AdaptiveScaling(controller, (0.0, 0.0, 0.0) if mean is None else mean)
 
 
 def measured(spec: ControllerSpec, record: ControllerRecord, vehicle: str) -> ControllerRecord:
@@ -104,17 +103,6 @@ def measured(spec: ControllerSpec, record: ControllerRecord, vehicle: str) -> Co
         return record.model_copy(update={"scaling": "none"})
     offset = tuple(measure_mean(controller.policy, vehicle=vehicle).tolist())
     return record.model_copy(update={"offset": offset})
-
-
-class _Function:
-    """``predict`` for a function from observations to actions."""
-
-    def __init__(self, function: Any) -> None:
-        self._function = function
-
-    def predict(self, observation: Any, deterministic: bool = True) -> tuple[Any, Any]:
-        """The function's actions, and None."""
-        return self._function(observation), None
 
 
 def _named(text: str) -> tuple[str | None, str]:

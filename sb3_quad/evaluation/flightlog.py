@@ -31,27 +31,23 @@ Trajectory i is that of episode i: all episodes of a scenario that is the same e
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.state import QuadcopterState
-
-if TYPE_CHECKING:
-    from sb3_quad.evaluation.flights import Flights
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray
+from sb3_quad.base.files import read_arrays
+from sb3_quad.evaluation.flights import Flights, Hook
+from sb3_quad.simulation.state import FORCE_BODY, FORCE_WORLD, TORQUE_BODY, TORQUE_WORLD, QuadcopterState
+from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
+STATES = ("position", "quaternion", "velocity", "body_rates", "target")
 TRAJECTORIES = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "action": 4, "target": 3, "wrench": 6}
-Arrays = dict[str, npt.NDArray[Any]]
 
 
-class Recorder:
+class Recorder(Hook):
     """Samples the first ``m`` flights at 50 Hz; float32, since it is for looking at.
 
     :param m: flights to record.
@@ -62,38 +58,33 @@ class Recorder:
     def __init__(self, m: int, max_steps: int, rate: float = SAMPLE_RATE) -> None:
         self._m, self._max_steps, self._rate = m, max_steps, rate
 
-    def begin(self, state: QuadcopterState, control_step: float) -> None:
-        """The start is sample 0."""
-        self._control_step = control_step
-        self._stride = max(1, round(1.0 / (self._rate * control_step)))
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self._control_step = vehicle.control_step
+        self._stride = max(1, round(1.0 / (self._rate * vehicle.control_step)))
         k = self._max_steps // self._stride + 1
         self._arrays = {name: np.full((self._m, k, size), np.nan, np.float32) for name, size in TRAJECTORIES.items()}
         self._samples = np.zeros(self._m, dtype=np.int64)
-        self._wrench, self._steps = np.zeros((self._m, 6)), 0
+        self._wrench, self._steps = np.zeros((self._m, TRAJECTORIES["wrench"])), 0
         self._write(0, state, np.ones(self._m, dtype=np.bool_))
 
-    def push(self, state: QuadcopterState, wrench: npt.NDArray[np.float64]) -> None:
-        """The wrench, (n, 12), that acts during the control step which begins at ``state``."""
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray) -> None:
         self._steps += 1
         if not wrench.any():
             return
         rows = wrench[: self._m]
         rotation = QuadcopterState(state.array[:, : self._m]).rotation
-        self._wrench[:, 0:3] += rows[:, 0:3] + np.einsum("nij,nj->ni", rotation, rows[:, 3:6])
-        self._wrench[:, 3:6] += rows[:, 9:12] + np.einsum("nji,nj->ni", rotation, rows[:, 6:9])
+        self._wrench[:, :3] += rows[:, FORCE_WORLD] + np.einsum("nij,nj->ni", rotation, rows[:, FORCE_BODY])
+        self._wrench[:, 3:] += rows[:, TORQUE_BODY] + np.einsum("nji,nj->ni", rotation, rows[:, TORQUE_WORLD])
 
-    def sample(
-        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
-    ) -> None:
-        """The state at the end of control step ``step``, of the flights that go on."""
+    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         if step % self._stride:
             return
         rows, number = flying[: self._m], step // self._stride
         self._arrays["action"][rows, number] = actions[: self._m][rows]
         self._write(number, state, rows)
 
-    def _write(self, number: int, state: QuadcopterState, rows: npt.NDArray[np.bool_]) -> None:
-        for name in ("position", "quaternion", "velocity", "body_rates", "target"):
+    def _write(self, number: int, state: QuadcopterState, rows: BoolArray) -> None:
+        for name in STATES:
             self._arrays[name][rows, number] = getattr(state, name)[: self._m][rows]
         self._arrays["wrench"][rows, number] = self._wrench[rows] / max(1, self._steps)
         self._wrench[:], self._steps = 0.0, 0
@@ -125,21 +116,10 @@ def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     }
 
 
-def flight_file(arrays: Mapping[str, npt.NDArray[Any]]) -> bytes:
-    """The content of a flight file."""
-    buffer = io.BytesIO()
-    np.savez_compressed(buffer, **arrays)  # type: ignore[arg-type]
-    return buffer.getvalue()
-
-
 def read_flights(path: str | Path, prefix: str = "") -> Arrays:
     """The arrays of a flight file, by the names of this module's table.
 
     :param prefix: only those whose names begin with it, such as ``episode_``; the others are not even read.
     :raises ConfigError: a missing or damaged file.
     """
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files if name.startswith(prefix)}
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
+    return read_arrays(path, prefix)

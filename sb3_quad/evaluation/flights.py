@@ -7,30 +7,30 @@ step after which |r - r_T| is within it; the path is that of the whole episode, 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium import spaces
 
+from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
-from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from sb3_quad.experts.controller import Controller
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-
-FloatArray = npt.NDArray[np.float64]
-BoolArray = npt.NDArray[np.bool_]
-Pilot = Callable[[npt.NDArray[np.float32]], Any]
+ACTIONS = spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """The figures of n episodes, one per row.
+    """The metrics of n episodes, one per row.
 
     ================  ==========  ==================================================================================
     name              shape       meaning
@@ -54,7 +54,7 @@ class Flights:
     success: BoolArray
     collision: BoolArray
     reward: FloatArray
-    length: npt.NDArray[np.int64]
+    length: IntArray
     flown: FloatArray
     time_to: Mapping[float, FloatArray]
     path_length: FloatArray
@@ -82,7 +82,7 @@ class Flights:
 class Plan:
     """What happens to n episodes whoever flies them.
 
-    :param start: what replaces the environments' own draw, as of :meth:`Fleet.reset`.
+    :param start: what replaces the environments' own sample, as of :meth:`Fleet.reset`.
     :param wrenches: from the control steps before which the external wrench changes to the new one, (n, 12).
     :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its target.
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
@@ -92,6 +92,19 @@ class Plan:
     wrenches: Mapping[int, FloatArray] = field(default_factory=dict)
     waypoints: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     radius: float = 0.5
+
+
+class Hook:
+    """What is done along a flight; a subclass writes what it needs."""
+
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        """The state that the flights start in."""
+
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray) -> None:
+        """The state before a control step, its observations (n, 18), and the wrench (n, WRENCH_SIZE) that acts during it."""
+
+    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+        """The state after control step ``step``, the actions (n, 4) that led to it, and the flights (n,) that go on."""
 
 
 def fly(
@@ -106,28 +119,61 @@ def fly(
     max_steps: int = MAX_EPISODE_STEPS,
     tolerances: tuple[float, ...] = TOLERANCES,
     observation_std: npt.ArrayLike | None = None,
+    observation_mean: npt.ArrayLike | None = None,
+    hooks: Sequence[Hook] = (),
 ) -> Flights:
     """Fly ``n_episodes`` episodes; number k is the first one of the environment seeded with ``seed + k``.
 
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
         ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
-    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise``, ``task_kwargs``
-        and ``observation_std``.
+    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise``, ``task_kwargs``,
+        ``observation_std`` and ``observation_mean``.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
+    :param hooks: see :func:`fly_fleet`.
     :raises ConfigError: an unknown backend, fewer than one episode, or a controller that is none of the three.
     :raises ControllerError: a controller that fails in flight.
     """
-    if backend not in FLEETS:
-        raise ConfigError(unknown("backend", backend, FLEETS))
-    if n_episodes < 1 or max_steps < 1:
-        raise ConfigError(f"n_episodes {n_episodes}, max_steps {max_steps}: must be at least 1")
-    seeds = range(seed, seed + n_episodes)
-    fleet = FLEETS[backend](seeds, task, task_kwargs, vehicle, noise, max_steps, observation_std)
+    settings = FlightSettings().with_changes(
+        task=task,
+        task_kwargs=task_kwargs,
+        vehicle=vehicle,
+        noise=noise,
+        observation_mean=observation_mean,
+        observation_std=observation_std,
+        max_episode_steps=max_steps,
+    )
+    return fly_settings(controller, settings, n_episodes, seed, backend, tolerances, hooks)
+
+
+def fly_settings(
+    controller: Any,
+    settings: FlightSettings,
+    n_episodes: int,
+    seed: int = 0,
+    backend: str = "batch",
+    tolerances: Sequence[float] = TOLERANCES,
+    hooks: Sequence[Hook] = (),
+    plan: Plan | None = None,
+) -> Flights:
+    """As :func:`fly`, by one record of how the episodes are flown, and a plan."""
+    if n_episodes < 1:
+        raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
+    fleet = make_fleet(backend, range(seed, seed + n_episodes), settings)
     try:
-        return fly_fleet(fleet, controller, Plan(), max_steps, tolerances)
+        return fly_fleet(fleet, controller, plan or Plan(), settings.max_episode_steps, tolerances, hooks)
     finally:
         fleet.close()
+
+
+def make_fleet(backend: str, seeds: Sequence[int], settings: FlightSettings) -> Fleet:
+    """The episodes of some seeds, in the environment of that name.
+
+    :raises ConfigError: an unknown backend, or settings that the environment refuses.
+    """
+    if backend not in FLEETS:
+        raise ConfigError(unknown("backend", backend, FLEETS))
+    return FLEETS[backend](seeds, settings)
 
 
 def fly_fleet(
@@ -135,58 +181,54 @@ def fly_fleet(
     controller: Any,
     plan: Plan,
     max_steps: int,
-    tolerances: Sequence[float],
-    recorder: Recorder | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
+    hooks: Sequence[Hook] = (),
 ) -> Flights:
     """Fly the episodes of a fleet from their start to their ends.
 
     :param controller: see :func:`fly`.
-    :param recorder: is shown every control step.
+    :param hooks: are called along the way.
     :raises ConfigError: a controller that cannot be asked.
     :raises ControllerError: a controller that fails in flight.
     """
-    pilot = _pilot(controller, fleet)
-    n, control_step, count = fleet.n, fleet.control_step, len(plan.waypoints)
+    asked = Controller(controller, ACTIONS, true_state=fleet.true_state)
+    n, control_step, count = fleet.n, fleet.vehicle.control_step, len(plan.waypoints)
     observation = fleet.reset(plan.start)
     state = fleet.true_state()
-    start, first_target = _start(state.array), state.target.copy()
-    position, error = state.position.copy(), state.distance
+    start = np.concatenate([state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES)]).T.copy()
+    first_target, position, error = state.target.copy(), state.position.copy(), state.distance
     flying, success, collision = np.ones(n, dtype=np.bool_), np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    reward, path = np.zeros(n), np.zeros(n)
-    length = np.zeros(n, dtype=np.int64)
+    reward, path, length = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
     final_error, final_offset = error.copy(), np.full((n, 3), np.nan)
     limits = np.array(tolerances)[:, None]
     on_last = np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     waypoint, waypoint_times = np.zeros(n, dtype=np.int64), np.full((n, count), np.nan)
-    wrench = np.zeros((n, 12))
-    if recorder is not None:
-        recorder.begin(state, control_step)
+    wrench = np.zeros((n, WRENCH_SIZE))
+    for hook in hooks:
+        hook.on_start(state, fleet.vehicle)
 
     for step in range(1, max_steps + 1):
         if step - 1 in plan.wrenches:
             wrench = plan.wrenches[step - 1]
             fleet.set_wrench(wrench)
-        actions = _ask(pilot, observation, flying, (step - 1) * control_step)
-        speed = np.linalg.norm(state.velocity, axis=1)
-        if recorder is not None:
-            recorder.push(state, wrench)
-        observation, step_reward, terminated, error = fleet.step(actions, flying)
+        actions = _ask(asked, observation, flying, (step - 1) * control_step)
+        for hook in hooks:
+            hook.before_step(state, observation, wrench)
+        observation, step_reward, lost, error = fleet.step(actions, flying)
         state = fleet.true_state()
         reward[flying] += step_reward[flying]
-        # A row that ended may show its next episode already: its last stretch is its speed times the step.
-        stretch = np.where(terminated, speed * control_step, np.linalg.norm(state.position - position, axis=1))
-        path[flying] += stretch[flying]
+        path[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
         position = state.position.copy()
         final_error[flying] = error[flying]
         length[flying] = step
         times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
-        ended = flying & terminated
+        ended = flying & lost
         collision |= ended & fleet.collided
         success &= ~ended
-        flying &= ~terminated
-        if recorder is not None:
-            recorder.sample(step, state, actions, flying)
+        flying &= ~lost
+        for hook in hooks:
+            hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
         if count:
@@ -196,7 +238,7 @@ def fly_fleet(
             on_last |= waypoint >= count - 1
             onward = reached[waypoint[reached] < count]
             if onward.size:
-                observation = fleet.retarget(onward, plan.waypoints[waypoint[onward]])
+                observation = fleet.set_targets(onward, plan.waypoints[waypoint[onward]])
     final_offset[flying] = (state.position - state.target)[flying]
     return Flights(
         success=success,
@@ -214,37 +256,16 @@ def fly_fleet(
     )
 
 
-def _start(array: FloatArray) -> FloatArray:
-    return np.concatenate([array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES)]).T.copy()
-
-
-def _ask(pilot: Pilot, observation: npt.NDArray[np.float32], flying: BoolArray, time: float) -> npt.NDArray[np.float32]:
+def _ask(controller: Controller, observation: Float32Array, flying: BoolArray, time: float) -> Float32Array:
     """Actions (n, 4) of a controller; zero for rows that are over.
 
     :raises ControllerError: it raises something, or gives what are no actions.
     """
     try:
-        actions = np.array(pilot(observation), dtype=np.float32)
+        return controller.actions(observation, flying)
+    except ControllerError as error:
+        raise ControllerError(f"{error}, after {time:.2f} s") from error
     except SB3QuadError:
         raise
     except Exception as error:  # a controller of the user's may raise anything
         raise ControllerError(f"fails after {time:.2f} s with {type(error).__name__}: {error}") from error
-    if actions.shape != (flying.size, 4):
-        raise ControllerError(f"gives actions of shape {actions.shape} after {time:.2f} s, must be ({flying.size}, 4)")
-    actions[~flying] = 0.0
-    if not np.isfinite(actions).all():
-        row = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
-        raise ControllerError(f"gives {actions[row].tolist()} after {time:.2f} s; every number must be finite")
-    return actions
-
-
-def _pilot(controller: Any, fleet: Fleet) -> Pilot:
-    if isinstance(controller, type):
-        raise ConfigError(f"controller {controller.__name__}: is a class; give an instance, such as {controller.__name__}()")
-    if hasattr(controller, "actions"):
-        return lambda observation: controller.actions(fleet.true_state())
-    if hasattr(controller, "predict"):
-        return lambda observation: controller.predict(observation, deterministic=True)[0]
-    if callable(controller):
-        return lambda observation: controller(observation)
-    raise ConfigError(f"controller {controller!r}: needs actions(state) or predict(observation), or must be callable")

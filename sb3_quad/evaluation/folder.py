@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.base.files import write_arrays, write_text
 from sb3_quad.evaluation.controllers import file_name
-from sb3_quad.evaluation.flightlog import Arrays, flight_file, read_flights
+from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.records import Entry, Results
 
 RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
@@ -62,7 +63,7 @@ class ResultFolder:
         """
         path = self.path / entry.flights
         path.with_suffix(".json").unlink(missing_ok=True)  # an entry is there once its last file is
-        write_bytes(path, flight_file(arrays))
+        write_arrays(path, compressed=True, **arrays)
         write_text(path.with_suffix(".json"), entry.model_dump_json(indent=2) + "\n")
 
     def read_results(self) -> Results | None:

@@ -11,17 +11,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.simulation.observation import DEFAULT_STD
+from sb3_quad.base.seeds import seed_for
+from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.experts.controller import observation_function
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS
 
-FloatArray = npt.NDArray[np.float64]
-Observation = npt.NDArray[np.float32]
 N_FLIGHTS = 120  # to random targets, of which the final offset is the mean
 STEPS = 1500  # control steps until the offset is read: 15 s, as an episode
 ROUNDS = 3  # the offset is measured anew after each correction
-OFFSET_SEED = 2**21  # of the flights that measure; those of the figures are others
-_POSITION = slice(0, 3)
+_POSITION = GROUPS["position"]
 
 
 def adaptive_factor(distance: npt.ArrayLike) -> FloatArray:
@@ -29,7 +30,7 @@ def adaptive_factor(distance: npt.ArrayLike) -> FloatArray:
     return 0.5 * (1.0 + np.asarray(distance, dtype=np.float64) / 10.0)
 
 
-def adapt_observation(observation: Observation, mean: FloatArray, std: FloatArray) -> Observation:
+def adapt_observation(observation: Float32Array, mean: FloatArray, std: FloatArray) -> Float32Array:
     """Observations scaled anew: (s - μ) / (α σ) in the position components, where s / σ is what the environment gives.
 
     The distance in Eq. 4.10 is the observed one, noise and all, so that a policy needs nothing but its observation.
@@ -46,9 +47,9 @@ def adapt_observation(observation: Observation, mean: FloatArray, std: FloatArra
 
 
 class AdaptiveScaling:
-    """A controller behind the thesis's scaling: asked by ``predict(observation)`` as the policy inside is.
+    """A policy behind the thesis's scaling: a function from observations (n, 18) to actions (n, 4).
 
-    :param policy: an SB3 model, or anything else with its ``predict``.
+    :param policy: an SB3 model, or a function of observations.
     :param mean: position components of μ, (3,), m; zero: only α.
     :param std: position components of the σ the environment scales by, (3,), m; None: Table A.2.
     """
@@ -57,21 +58,22 @@ class AdaptiveScaling:
         self.policy = policy
         self.mean = np.asarray(mean, dtype=np.float64)
         self.std = np.asarray(DEFAULT_STD[_POSITION] if std is None else std, dtype=np.float64)
+        self._ask = observation_function(policy)
 
-    def predict(self, observation: Observation, deterministic: bool = True) -> tuple[Any, Any]:
-        """Actions (n, 4) for observations (n, 18), and None as SB3 has it."""
-        adapted = adapt_observation(np.asarray(observation), self.mean, self.std)
-        return self.policy.predict(adapted, deterministic=deterministic)[0], None
+    def __call__(self, observation: Float32Array) -> Any:
+        return self._ask(adapt_observation(np.asarray(observation), self.mean, self.std))
 
 
-def hover_offset(controller: Any, n_flights: int = N_FLIGHTS, seed: int = 0, **keywords: Any) -> FloatArray:
+def hover_offset(
+    controller: Any, n_flights: int = N_FLIGHTS, seed: int = 0, settings: FlightSettings | None = None, **changes: Any
+) -> FloatArray:
     """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking, over the flights that last.
 
-    :param keywords: further arguments of :func:`~sb3_quad.evaluation.flights.fly`: ``vehicle``, ``noise``,
-        ``observation_std``.
+    :param settings: how it flies; task and episode length are those of this measurement. ``changes`` are put over them.
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
-    flights = fly(controller, "target_tracking", n_flights, seed, max_steps=STEPS, **keywords)
+    own = {"task": "target_tracking", "task_kwargs": None, "max_episode_steps": STEPS, **changes}
+    flights = fly_settings(controller, (settings or FlightSettings()).with_changes(**own), n_flights, seed)
     lost = 1.0 - float(flights.success.mean())
     if lost > 0.5:
         raise ConfigError(
@@ -80,15 +82,16 @@ def hover_offset(controller: Any, n_flights: int = N_FLIGHTS, seed: int = 0, **k
     return np.asarray(flights.final_offset[flights.success].mean(axis=0))
 
 
-def measure_mean(policy: Any, **keywords: Any) -> FloatArray:
+def measure_mean(policy: Any, n_flights: int = N_FLIGHTS, **changes: Any) -> FloatArray:
     """The position components of μ, (3,), m, with which a policy behind :class:`AdaptiveScaling` stops at its target.
 
     Eq. 4.10 shrinks the offset, too, so it is measured with α at work, and again after each correction.
 
-    :param keywords: see :func:`hover_offset`.
+    :param changes: as of :func:`hover_offset`, such as ``vehicle``.
     :raises ConfigError: see :func:`hover_offset`.
     """
     mean = np.zeros(3)
     for number in range(ROUNDS):
-        mean = mean - hover_offset(AdaptiveScaling(policy, mean), seed=OFFSET_SEED + number * N_FLIGHTS, **keywords)
+        seed = seed_for("offset") + number * N_FLIGHTS
+        mean = mean - hover_offset(AdaptiveScaling(policy, mean), n_flights, seed, **changes)
     return mean

@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.evaluation.fleets import FLEETS
-from sb3_quad.evaluation.flightlog import Arrays, Recorder
-from sb3_quad.evaluation.flights import Flights, Plan, fly_fleet
-from sb3_quad.scenarios.draw import draw_episodes, wrench_changes
+from sb3_quad.base.arrays import Arrays, FloatArray
+from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.evaluation.flights import Flights, Plan, fly_fleet, make_fleet
+from sb3_quad.scenarios.draw import Episodes, draw_episodes, wrench_changes
 from sb3_quad.scenarios.scenario import Scenario
+from sb3_quad.settings.flight import FlightSettings
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
 RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most
@@ -24,7 +21,7 @@ def fly_scenario(
     scenario: Scenario,
     backend: str = "batch",
     seeds: Sequence[int] | None = None,
-    factors: npt.NDArray[np.float64] | None = None,
+    factors: FloatArray | None = None,
     recorded: int | None = 0,
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
@@ -33,31 +30,34 @@ def fly_scenario(
     :param seeds: of the episodes; None: the scenario's own.
     :param factors: of each episode's wrenches, (n,); None: 1.
     :param recorded: flights to sample; None: all of a scenario that is the same each time, the first few of others.
-    :return: the figures, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
+    :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
     :raises ConfigError: an unknown backend, or a controller that cannot be asked.
     :raises ControllerError: a controller that fails in flight.
     """
-    if backend not in FLEETS:
-        raise ConfigError(unknown("backend", backend, FLEETS))
     chosen = range(scenario.seed, scenario.seed + scenario.episodes) if seeds is None else seeds
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
-    size = PART_SIZES[backend]
+    size = PART_SIZES.get(backend, 1)
     parts, trajectories = [], None
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
         episodes = draw_episodes(scenario, chosen[part], None if factors is None else factors[part])
         recorder = Recorder(min(recorded, len(episodes.seeds)), episodes.steps) if recorded and first == 0 else None
-        plan = Plan(
-            episodes.start,
-            wrench_changes(episodes.wrenches, episodes.steps) if episodes.wrenches else {},
-            episodes.waypoints,
-            episodes.radius,
-        )
-        fleet = FLEETS[backend](episodes.seeds, episodes.task, None, episodes.vehicle, episodes.noise, episodes.steps)
+        settings, plan = flown_as(episodes)
+        fleet = make_fleet(backend, episodes.seeds, settings)
+        hooks = () if recorder is None else (recorder,)
         try:
-            parts.append(fly_fleet(fleet, controller, plan, episodes.steps, scenario.tolerances, recorder))
+            parts.append(fly_fleet(fleet, controller, plan, episodes.steps, scenario.tolerances, hooks))
         finally:
             fleet.close()
         trajectories = recorder.arrays() if recorder is not None else trajectories
     return Flights.concatenate(parts), trajectories or {}
+
+
+def flown_as(episodes: Episodes) -> tuple[FlightSettings, Plan]:
+    """How the episodes of a scenario are flown, and what happens along the way."""
+    settings = FlightSettings(
+        task=episodes.task, vehicle=episodes.vehicle, noise=episodes.noise, max_episode_steps=episodes.steps
+    )
+    wrenches = wrench_changes(episodes.wrenches, episodes.steps) if episodes.wrenches else {}
+    return settings, Plan(episodes.start, wrenches, episodes.waypoints, episodes.radius)

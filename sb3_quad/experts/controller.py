@@ -1,113 +1,135 @@
-"""Expert labels: the expert's action for the state an environment is in now."""
+"""One way to ask a controller, whatever it is: an expert, an SB3 model, a function."""
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ExpertError
+from sb3_quad.base.arrays import BoolArray, Float32Array
+from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
 from sb3_quad.simulation.state import QuadcopterState
 
-FloatArray = npt.NDArray[np.float32]
+Ask = Callable[[npt.NDArray[Any]], Any]
 
 
-class _Source(Protocol):
-    """Where raw labels come from: observations (n, ...) to actions (n, ...)."""
-
-    def __call__(self, observation: npt.NDArray[Any]) -> Any: ...
-
-
-class ExpertLabeller:
-    """Asks any kind of expert for labels and checks what it says.
+class Controller:
+    """Asks anything that flies for its actions, and checks what it says.
 
     The first of these that fits is used:
 
-    1. ``expert.actions(state)`` (such as ``PIDExpert``), where the environment offers ``true_state()``: the true state,
-       free of observation noise.
-    2. ``expert.predict(observation, deterministic=True)``: another SB3 model, or an ``Expert`` of this package in an
-       environment without a true state.
-    3. ``expert(observation)``: a function from observations (n, ...) to actions (n, ...).
+    1. ``source.actions(state)`` (such as ``PIDExpert``), where the true state is to be had: it is free of noise.
+    2. ``source.predict(observation, deterministic=…)``: an SB3 model, or an ``Expert`` of this package without a true state.
+    3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
-    2 and 3 get the observations that the policy sees, as they come out of the outermost vector environment; where that
-    is a ``VecNormalize``, normalised ones. Experts with a memory (recurrent policies) are not supported.
+    2 and 3 get the observations that a policy sees. Controllers with a memory (recurrent policies) are not supported.
 
-    :param expert: the expert, as above
-    :param env: the vector environment whose states are labelled
-    :raises ExpertError: an expert that is none of the three, or whose spaces do not fit the environment
+    :param source: the controller, as above.
+    :param action_space: a Box.
+    :param observation_space: None: not checked.
+    :param true_state: gives the present true state; None: there is none.
+    :param kind: what messages call it.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample.
+    :raises ConfigError: a source that is none of the three, or whose spaces do not fit; ``ExpertError`` of an expert.
     """
 
-    def __init__(self, expert: Any, env: VecEnv) -> None:
+    def __init__(
+        self,
+        source: Any,
+        action_space: spaces.Space[Any],
+        observation_space: spaces.Space[Any] | None = None,
+        true_state: Callable[[], QuadcopterState] | None = None,
+        kind: str = "controller",
+        deterministic: bool = True,
+    ) -> None:
+        error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
+        self.source, self.kind = source, kind
+        self.name = getattr(source, "__name__", type(source).__name__)
+        if isinstance(source, type):
+            raise error(f"{kind} {self.name}: is a class; give an instance, such as {self.name}()")
+        if not isinstance(action_space, spaces.Box):
+            raise error(f"action space {action_space}: a {kind} gives Box actions only")
+        self._space, self._action_dim = action_space, int(np.prod(action_space.shape))
+        self._low, self._high = (np.float32(bound.reshape(-1)) for bound in (action_space.low, action_space.high))
+        for what, ours in (("observation_space", observation_space), ("action_space", action_space)):
+            theirs = getattr(source, what, None)
+            if isinstance(theirs, spaces.Space) and ours is not None and theirs.shape != ours.shape:
+                label = what.replace("_", " ")
+                raise error(f"{kind} {self.name}: its {label} has shape {theirs.shape}, the environment's {ours.shape}")
+        self.needs_state = hasattr(source, "actions") and true_state is not None
+        if self.needs_state:
+            assert true_state is not None
+            state = true_state
+            self._ask: Ask = lambda observation: source.actions(state())
+        elif hasattr(source, "predict") or callable(source):
+            self._ask = observation_function(source, deterministic)
+        elif hasattr(source, "actions"):
+            raise error(f"{kind} {self.name}: needs the true state, and this environment has no true_state()")
+        else:
+            raise error(
+                f"{kind} {source!r}: needs actions(state) or predict(observation), or must be a function of observations"
+            )
+
+    @staticmethod
+    def for_env(expert: Any, env: VecEnv) -> Controller:
+        """An expert that labels the states of a vector environment; with ``VecNormalize`` it sees normalised observations.
+
+        :raises ExpertError: an expert that is none of the three, or whose spaces do not fit the environment.
+        """
         if expert is None:
             raise ExpertError("no expert: give expert=... when building or loading the model, or call set_expert(expert)")
-        if isinstance(expert, type):
-            raise ExpertError(f"expert {expert.__name__}: is a class; give an instance, such as {expert.__name__}()")
-        if not isinstance(env.action_space, spaces.Box):
-            raise ExpertError(f"action space {env.action_space}: experts label Box action spaces only")
-        self.expert = expert
-        self.name = getattr(expert, "__name__", type(expert).__name__)
-        self._space = env.action_space
-        self._action_dim = int(np.prod(self._space.shape))
-        self._low = self._space.low.reshape(-1).astype(np.float32)
-        self._high = self._space.high.reshape(-1).astype(np.float32)
-        self._check_spaces(env)
-        self._needs_state = hasattr(expert, "actions") and _offers_state(env)
-        self._source = self._choose_source(env)
+        return Controller(expert, env.action_space, env.observation_space, true_state_of(env), "expert")
 
-    @property
-    def needs_state(self) -> bool:
-        """Whether labels come from the environment's true state rather than from observations."""
-        return self._needs_state
+    def actions(self, observation: npt.NDArray[Any], rows: BoolArray | None = None) -> Float32Array:
+        """The actions for the present state, float32 of shape (n, action_dim); ask before ``env.step``.
 
-    def labels(self, observation: npt.NDArray[Any]) -> FloatArray:
-        """The expert's actions for the environment's present state, so call it before ``env.step``.
-
-        :param observation: shape (n, ...): the observations of that state
-        :return: float32 of shape (n, action_dim), clipped to the action space
-        :raises ExpertError: labels that are not finite, or not of this shape
+        :param observation: (n, ...): the observations of that state.
+        :param rows: bool (n,): the rows that matter; the others get zeros. None: all.
+        :raises ExpertError: of an expert, actions that are not finite, or not of this shape; ``ControllerError`` of others.
         """
-        raw = np.asarray(self._source(observation))
+        error = ExpertError if self.kind == "expert" else ControllerError
+        raw = np.asarray(self._ask(observation))
         n = len(observation)
         if raw.shape not in ((n, *self._space.shape), (n, self._action_dim)):
-            raise ExpertError(
-                f"expert {self.name}: gave labels of shape {raw.shape}, expected {(n, *self._space.shape)} (row, action)"
-            )
-        labels = raw.reshape(n, self._action_dim).astype(np.float32)
-        if not np.isfinite(labels).all():
-            row = int(np.flatnonzero(~np.isfinite(labels).all(axis=1))[0])
-            raise ExpertError(f"expert {self.name}: its label of row {row} is not finite: {labels[row].tolist()}")
-        np.clip(labels, self._low, self._high, out=labels)
-        return labels
+            raise error(f"{self.kind} {self.name}: gives actions of shape {raw.shape}, must be {(n, *self._space.shape)}")
+        actions = raw.reshape(n, self._action_dim).astype(np.float32)
+        if rows is not None:
+            actions[~rows] = 0.0
+        if not np.isfinite(actions).all():
+            row = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
+            raise error(f"{self.kind} {self.name}: gives {actions[row].tolist()} in row {row}; every number must be finite")
+        return actions
 
-    def _check_spaces(self, env: VecEnv) -> None:
-        for kind in ("observation_space", "action_space"):
-            theirs, ours = getattr(self.expert, kind, None), getattr(env, kind)
-            if isinstance(theirs, spaces.Space) and theirs.shape != ours.shape:
-                raise ExpertError(
-                    f"expert {self.name}: its {kind.replace('_', ' ')} has shape {theirs.shape}, "
-                    f"the environment's {ours.shape}"
-                )
+    def labels(self, observation: npt.NDArray[Any]) -> Float32Array:
+        """As :meth:`actions`, clipped to the action space: what an agent is to learn."""
+        actions = self.actions(observation)
+        np.clip(actions, self._low, self._high, out=actions)
+        return actions
 
-    def _choose_source(self, env: VecEnv) -> _Source:
-        expert = self.expert
-        if self.needs_state:
-            base = env.unwrapped
-            if hasattr(base, "true_state"):
-                return lambda observation: expert.actions(base.true_state())
-            return lambda observation: expert.actions(QuadcopterState.concatenate(env.env_method("true_state")))
-        if hasattr(expert, "predict"):
-            return lambda observation: expert.predict(observation, deterministic=True)[0]
-        if callable(expert):
-            return lambda observation: expert(observation)
-        if hasattr(expert, "actions"):
-            raise ExpertError(f"expert {self.name}: needs the true state, and this environment has no true_state()")
-        raise ExpertError(
-            f"expert {expert!r}: has neither actions(state) nor predict(observation), and is no function of observations"
-        )
+    def predict(self, observation: npt.NDArray[Any], *arguments: Any, **keywords: Any) -> tuple[Float32Array, None]:
+        """SB3's ``predict``, for ``evaluate_policy``; the labels."""
+        return self.labels(observation), None
 
 
-def _offers_state(env: VecEnv) -> bool:
-    return hasattr(env.unwrapped, "true_state") or env.has_attr("true_state")
+def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
+    """What gives the true state of all rows of a vector environment; None if there is none."""
+    base: Any = env.unwrapped
+    if hasattr(base, "true_state"):
+        return base.true_state  # type: ignore[no-any-return]
+    if env.has_attr("true_state"):
+        return lambda: QuadcopterState.concatenate(env.env_method("true_state"))
+    return None
+
+
+def observation_function(source: Any, deterministic: bool = True) -> Ask:
+    """A policy or a function as a function from observations (n, ...) to actions (n, ...)."""
+    if hasattr(source, "predict"):
+        return lambda observation: source.predict(observation, deterministic=deterministic)[0]
+    return lambda observation: source(observation)
+
+
+ExpertLabeller = Controller.for_env

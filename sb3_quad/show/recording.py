@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.evaluation.fleets import PyBulletFleet
-from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import Plan, fly_fleet
+from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
+from sb3_quad.experts.controller import observation_function
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.state import POSITION, TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
@@ -99,47 +99,36 @@ def record(
     :raises ConfigError: a controller that cannot be asked, keywords that the environment refuses.
     :raises ControllerError: a controller that fails in flight.
     """
-    pilot = controller if deterministic or not hasattr(controller, "predict") else _Sampling(controller)
+    pilot = controller if deterministic or not hasattr(controller, "predict") else observation_function(controller, False)
     recorder = _EveryStep()
-    fleet = PyBulletFleet([seed], task, task_kwargs, vehicle, noise, n_steps, observation_std)
-    try:
-        flights = fly_fleet(fleet, pilot, plan or Plan(), n_steps, (), recorder)
-    finally:
-        fleet.close()
+    settings = FlightSettings(
+        task=task,
+        task_kwargs=None if task_kwargs is None else dict(task_kwargs),
+        vehicle=vehicle,
+        noise=noise,
+        observation_std=observation_std,
+        max_episode_steps=n_steps,
+    )
+    flights = fly_settings(pilot, settings, 1, seed, "pybullet", (), [recorder], plan)
     lost = "" if flights.success[0] else "collision" if flights.collision[0] else "out of range"
     states, wrenches = np.stack(recorder.states, axis=1), np.stack(recorder.wrenches, axis=1)
     times = np.arange(states.shape[1], dtype=np.float64) * recorder.control_step
     return Recording(name, load_vehicle(vehicle), times, states, wrenches, float(flights.reward[0]), lost)
 
 
-class _Sampling:
-    """A policy whose actions are drawn, not their mean."""
-
-    def __init__(self, policy: Any) -> None:
-        self._policy = policy
-
-    def predict(self, observation: Any, deterministic: bool = True) -> tuple[Any, Any]:
-        """The policy's sample."""
-        actions, state = self._policy.predict(observation, deterministic=False)
-        return actions, state
-
-
-class _EveryStep(Recorder):
+class _EveryStep(Hook):
     """Keeps all there is of one flight, its last state included."""
 
     def __init__(self) -> None:
-        super().__init__(1, 1)
         self.states: list[FloatArray] = []
         self.wrenches: list[FloatArray] = [np.zeros(12)]
 
-    def begin(self, state: QuadcopterState, control_step: float) -> None:
-        self.control_step = control_step
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self.control_step = vehicle.control_step
         self.states.append(state.array[:, 0].copy())
 
-    def push(self, state: QuadcopterState, wrench: FloatArray) -> None:
+    def before_step(self, state: QuadcopterState, observation: Any, wrench: FloatArray) -> None:
         self.wrenches.append(wrench[0].copy())
 
-    def sample(
-        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
-    ) -> None:
+    def after_step(self, step: int, state: QuadcopterState, actions: Any, flying: Any) -> None:
         self.states.append(state.array[:, 0].copy())

@@ -73,7 +73,10 @@ if hasattr(os, "register_at_fork"):
 
 
 def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
-    """Do a job, see :func:`~.work.work`, by up to ``threads`` threads; False if an action is not finite, and then nothing has happened."""
+    """Do a job, see :func:`~.work.work`, by up to ``threads`` threads.
+
+    :return: False if an action is not finite, and then nothing has happened.
+    """
     workers = _workers
     blocks = -(-len(arrays.dones) // LANES)
     count = min(threads, blocks, MOST) - 1 if blocks >= WORTHWHILE else 0

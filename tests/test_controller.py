@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.experts.controller import ExpertLabeller
+from sb3_quad.experts.controller import Controller
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
 
@@ -47,7 +47,7 @@ class FromState:
 
 def test_the_true_state_is_collected_from_single_environments():
     env = VecMonitor(DummyVecEnv([lambda n=n: Stateful(n) for n in (0.25, 0.75)]))
-    labeller = ExpertLabeller(FromState(), env)
+    labeller = Controller.for_env(FromState(), env)
     assert labeller.needs_state
     np.testing.assert_array_equal(labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1))
 
@@ -62,7 +62,7 @@ def test_a_state_can_come_from_another_process():
 def test_the_true_state_of_the_batched_environment(wrap):
     env = wrap(QuadcopterVecEnv(5, seed=0))
     observation = env.reset()
-    labeller = ExpertLabeller(PIDExpert(), env)
+    labeller = Controller.for_env(PIDExpert(), env)
     state = env.unwrapped.true_state()
     np.testing.assert_array_equal(labeller.labels(observation), PIDExpert().actions(state))
     before = state.copy()
@@ -74,7 +74,7 @@ def test_the_true_state_of_the_batched_environment(wrap):
 
 
 def test_without_a_true_state_predict_is_asked():
-    labeller = ExpertLabeller(FromState(), make_vec_env(lambda: Blind(), 3))
+    labeller = Controller.for_env(FromState(), make_vec_env(lambda: Blind(), 3))
     assert not labeller.needs_state
     np.testing.assert_array_equal(labeller.labels(np.zeros((3, 18))), np.full((3, 4), -0.5))
 
@@ -95,20 +95,20 @@ def test_an_sb3_model_and_its_policy():
     model = PPO("MlpPolicy", env, device="cpu", seed=0)
     expected = model.predict(observation, deterministic=True)[0]
     for expert in (model, model.policy):
-        np.testing.assert_array_equal(ExpertLabeller(expert, env).labels(observation), expected)
+        np.testing.assert_array_equal(Controller.for_env(expert, env).labels(observation), expected)
 
 
 def test_a_function_sees_what_the_policy_sees():
     env = VecNormalize(make_vec_env("Pendulum-v1", 3, seed=0))
     observation = env.reset()
     seen = []
-    ExpertLabeller(lambda given: seen.append(given) or given[:, :1], env).labels(observation)
+    Controller.for_env(lambda given: seen.append(given) or given[:, :1], env).labels(observation)
     np.testing.assert_array_equal(seen[0], observation)
 
 
 def test_labels_are_clipped_to_the_action_space():
     env = make_vec_env("Pendulum-v1", 2, seed=0)
-    labels = ExpertLabeller(lambda observation: np.array([[9.0], [-9.0]]), env).labels(env.reset())
+    labels = Controller.for_env(lambda observation: np.array([[9.0], [-9.0]]), env).labels(env.reset())
     np.testing.assert_array_equal(labels, [[2.0], [-2.0]])
     assert labels.dtype == np.float32
 
@@ -116,15 +116,15 @@ def test_labels_are_clipped_to_the_action_space():
 @pytest.mark.parametrize(
     ("expert", "message"),
     [
-        (lambda observation: np.zeros(2), r"shape \(2,\), expected \(2, 1\)"),
+        (lambda observation: np.zeros(2), r"shape \(2,\), must be \(2, 1\)"),
         (lambda observation: np.zeros((2, 4)), r"shape \(2, 4\)"),
-        (lambda observation: np.array([[0.0], [np.inf]]), "row 1 is not finite"),
+        (lambda observation: np.array([[0.0], [np.inf]]), r"\[inf\] in row 1; every number must be finite"),
     ],
 )
 def test_unfit_labels_are_named(expert, message):
     env = make_vec_env("Pendulum-v1", 2, seed=0)
     with pytest.raises(ExpertError, match=message):
-        ExpertLabeller(expert, env).labels(env.reset())
+        Controller.for_env(expert, env).labels(env.reset())
 
 
 class OnlyState:
@@ -134,13 +134,18 @@ class OnlyState:
 
 @pytest.mark.parametrize(
     ("expert", "message"),
-    [(None, "no expert"), (PIDExpert, r"PIDExpert\(\)"), ("pid", "neither"), (OnlyState(), "true_state")],
+    [
+        (None, "no expert"),
+        (PIDExpert, r"PIDExpert\(\)"),
+        ("pid", "must be a function"),
+        (OnlyState(), "true_state"),
+    ],
 )
 def test_unfit_experts_are_refused_at_once(expert, message):
     with pytest.raises(ExpertError, match=message):
-        ExpertLabeller(expert, make_vec_env("Pendulum-v1", 1))
+        Controller.for_env(expert, make_vec_env("Pendulum-v1", 1))
 
 
 def test_a_model_of_another_environment_is_refused():
     with pytest.raises(ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"):
-        ExpertLabeller(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), QuadcopterVecEnv(2))
+        Controller.for_env(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), QuadcopterVecEnv(2))
