@@ -9,6 +9,7 @@ from stable_baselines3 import PPO
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import DEFAULT_STD
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.training.hover import trim_hover
@@ -37,7 +38,7 @@ def at_target(heading):
 def test_the_agent_hovers_at_its_target_with_every_heading(model):
     observations = at_target(np.linspace(-np.pi, np.pi, 50))
     before = model.predict(observations, deterministic=True)[0]
-    result = trim_hover(model, seed=3, noise=0.0)
+    result = trim_hover(model, seed=3, settings=FlightSettings(noise=0.0))
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after).mean() < 0.1 * np.square(before).mean()
     assert result.before == pytest.approx(np.sqrt(np.square(before).mean()), rel=0.05) and result.after < result.before
@@ -47,7 +48,7 @@ def test_hover_of_a_vehicle_whose_middle_thrust_is_another(model):
     observations = at_target(np.linspace(-np.pi, np.pi, 50))
     hover = load_vehicle("hummingbird").hover_action
     assert hover < -0.2
-    result = trim_hover(model, seed=3, noise=0.0, vehicle="hummingbird")
+    result = trim_hover(model, seed=3, settings=FlightSettings(noise=0.0, vehicle="hummingbird"))
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after - hover).mean() < 0.1 * np.square(after).mean()
     assert result.after == pytest.approx(np.sqrt(np.square(after - hover).mean()), abs=0.02)
@@ -68,6 +69,18 @@ def test_what_is_trimmed_already_is_left_alone(model):
     weight = model.policy.action_net.weight.clone()
     again = trim_hover(model, seed=3)
     assert again.before < 0.05 and (model.policy.action_net.weight - weight).norm() < 0.05 * weight.norm()
+
+
+@pytest.mark.parametrize("shifted", ["observation_mean", "observation_std"])
+def test_the_scaling_that_the_agent_flies_with_is_taken_into_account(model, shifted):
+    """Observations at the target are other numbers with another μ or σ; there, too, the agent hovers afterwards."""
+    scaling = {"observation_mean": np.zeros(18), "observation_std": DEFAULT_STD, shifted: np.linspace(0.5, 2.0, 18)}
+    heading = at_target(np.linspace(-np.pi, np.pi, 50)) * DEFAULT_STD
+    observations = ((heading - scaling["observation_mean"]) / scaling["observation_std"]).astype(np.float32)
+    before = model.predict(observations, deterministic=True)[0]
+    trim_hover(model, seed=3, settings=FlightSettings(noise=0.0, **scaling))
+    after = model.predict(observations, deterministic=True)[0]
+    assert np.square(after).mean() < 0.2 * np.square(before).mean()
 
 
 def test_an_agent_of_other_observations_is_refused():

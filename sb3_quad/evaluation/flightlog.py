@@ -67,7 +67,7 @@ class Recorder(Hook):
         self._wrench, self._steps = np.zeros((self._m, TRAJECTORIES["wrench"])), 0
         self._write(0, state, np.ones(self._m, dtype=np.bool_))
 
-    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray) -> None:
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
         self._steps += 1
         if not wrench.any():
             return

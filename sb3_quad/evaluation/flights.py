@@ -100,8 +100,8 @@ class Hook:
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         """The state that the flights start in."""
 
-    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray) -> None:
-        """The state before a control step, its observations (n, 18), and the wrench (n, WRENCH_SIZE) that acts during it."""
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
+        """The state before a control step, its observations (n, 18), the wrench (n, WRENCH_SIZE) during it, who flies (n,)."""
 
     def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         """The state after control step ``step``, the actions (n, 4) that led to it, and the flights (n,) that go on."""
@@ -214,7 +214,7 @@ def fly_fleet(
             fleet.set_wrench(wrench)
         actions = _ask(asked, observation, flying, (step - 1) * control_step)
         for hook in hooks:
-            hook.before_step(state, observation, wrench)
+            hook.before_step(state, observation, wrench, flying)
         observation, step_reward, lost, error = fleet.step(actions, flying)
         state = fleet.true_state()
         reward[flying] += step_reward[flying]

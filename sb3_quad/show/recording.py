@@ -127,7 +127,7 @@ class _EveryStep(Hook):
         self.control_step = vehicle.control_step
         self.states.append(state.array[:, 0].copy())
 
-    def before_step(self, state: QuadcopterState, observation: Any, wrench: FloatArray) -> None:
+    def before_step(self, state: QuadcopterState, observation: Any, wrench: FloatArray, flying: Any) -> None:
         self.wrenches.append(wrench[0].copy())
 
     def after_step(self, step: int, state: QuadcopterState, actions: Any, flying: Any) -> None:

@@ -15,22 +15,23 @@ one heading.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.simulation.observation import DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.evaluation.flights import Hook, fly_settings
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import load_vehicle
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-
 STIFFNESS = 0.1  # λ
-N_HEADINGS, N_DRAWS = 72, 256  # headings, and observations of each with noise of their own
+N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
 TASKS = {"state_recovery": 0.5, "recovery_and_tracking": 0.5}
 N_FLIGHTS, STEPS, EVERY = 240, 300, 3  # flights whose states must not see a change: their first 3 s, every third step
 
@@ -47,23 +48,24 @@ class HoverTrim:
     after: float
 
 
-def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, noise: float = 0.05, **env_kwargs: Any) -> HoverTrim:
+def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> HoverTrim:
     """Correct an agent's last layer, in place, so that it hovers at its target with every heading.
 
     :param seed: of the flights and of the observation noise.
-    :param noise: relative, of the observations that the agent will get.
-    :param env_kwargs: ``vehicle`` and ``observation_std``, as of the environments.
+    :param settings: vehicle, noise and scaling that the agent flies with.
     :raises ConfigError: an agent whose last layer is not linear, or that does not read the 18 features.
     """
     layer = getattr(model.policy, "action_net", None)
     if not isinstance(layer, th.nn.Linear) or model.observation_space.shape != (OBSERVATION_SIZE,):
         raise ConfigError("trimming needs an MlpPolicy that reads the 18 features")
-    given = env_kwargs.get("observation_std")
-    std = np.asarray(DEFAULT_STD if given is None else given, dtype=np.float64)
-    at_target = _features(model, _at_target(noise, std, np.random.default_rng(seed)))
-    at_target = at_target.reshape(N_HEADINGS, N_DRAWS, -1).mean(dim=1)
-    flown = _features(model, _flown(model, seed, noise, env_kwargs))
-    hover = load_vehicle(env_kwargs.get("vehicle", "itm")).hover_action
+    own = settings or FlightSettings()
+    at_target = _features(model, _at_target(own, np.random.default_rng(seed)))
+    at_target = at_target.reshape(N_HEADINGS, N_SAMPLES, -1).mean(dim=1)
+    seen = _Observations()
+    changes = {"task": TASKS, "task_kwargs": None, "max_episode_steps": STEPS}
+    fly_settings(model, own.with_changes(**changes), N_FLIGHTS, seed, hooks=[seen])
+    flown = _features(model, np.concatenate(seen.kept))
+    hover = load_vehicle(own.vehicle).hover_action
     with th.no_grad():
         weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()  # (inputs + 1, actions)
         action = at_target @ weights - hover
@@ -75,11 +77,24 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, noise: float = 0.05, **e
     return HoverTrim(_size(action), _size(at_target @ weights - hover))
 
 
+class _Observations(Hook):
+    """Every third observation of flights."""
+
+    def __init__(self) -> None:
+        self.kept: list[Float32Array] = []
+        self._steps = 0
+
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
+        if self._steps % EVERY == 0:
+            self.kept.append(observation[flying])
+        self._steps += 1
+
+
 def _size(action: th.Tensor) -> float:
     return float(action.square().mean().sqrt())
 
 
-def _features(model: OnPolicyAlgorithm, observations: np.ndarray[Any, np.dtype[np.float32]]) -> th.Tensor:
+def _features(model: OnPolicyAlgorithm, observations: Float32Array) -> th.Tensor:
     """Inputs of the actor's last layer and a 1, float64, (n, inputs + 1)."""
     policy: Any = model.policy
     with th.no_grad():
@@ -89,28 +104,14 @@ def _features(model: OnPolicyAlgorithm, observations: np.ndarray[Any, np.dtype[n
     return th.cat([latent, th.ones(len(latent), 1, dtype=th.float64)], dim=1)
 
 
-def _at_target(
-    noise: float, std: np.ndarray[Any, np.dtype[np.float64]], rng: np.random.Generator
-) -> np.ndarray[Any, np.dtype[np.float32]]:
-    """Observations at the target, level and at rest: N_HEADINGS headings, N_DRAWS of each."""
-    heading = np.repeat(np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False), N_DRAWS)
+def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Array:
+    """Observations at the target, level and at rest: N_HEADINGS headings, N_SAMPLES of each."""
+    heading = np.repeat(np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False), N_SAMPLES)
     features = np.zeros((heading.size, OBSERVATION_SIZE))
-    features[:, 3] = features[:, 7] = np.cos(heading)  # world to body, row by row
-    features[:, 4], features[:, 6] = np.sin(heading), -np.sin(heading)
-    features[:, 11] = 1.0
-    features *= 1.0 + noise * rng.standard_normal(features.shape)
-    return (features / std).astype(np.float32)
-
-
-def _flown(
-    model: OnPolicyAlgorithm, seed: int, noise: float, env_kwargs: dict[str, Any]
-) -> np.ndarray[Any, np.dtype[np.float32]]:
-    env = QuadcopterVecEnv(N_FLIGHTS, TASKS, noise=noise, max_episode_steps=STEPS, seed=seed, **env_kwargs)
-    observation: Any = env.reset()
-    seen = []
-    for step in range(STEPS):
-        if step % EVERY == 0:
-            seen.append(observation.copy())
-        observation = env.step(model.predict(observation, deterministic=True)[0])[0]
-    env.close()
-    return np.concatenate(seen)
+    cosine, sine = np.cos(heading), np.sin(heading)
+    rotation = np.stack([cosine, sine, 0 * sine, -sine, cosine, 0 * sine, 0 * sine, 0 * sine, 0 * sine + 1], axis=1)
+    features[:, GROUPS["rotation"]] = rotation  # world to body, row by row
+    features *= 1.0 + settings.noise * rng.standard_normal(features.shape)
+    mean = DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
+    std = DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
+    return ((features - mean) / std).astype(np.float32)

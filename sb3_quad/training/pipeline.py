@@ -36,36 +36,33 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, PositiveInt
 
-from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import save_model, write_text
+from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.report.curves import read_curve
 from sb3_quad.settings.algorithms import get_algorithm
-from sb3_quad.settings.config import load_config, read_settings, with_vehicle_path
+from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.hover import trim_hover
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import resume, train
+from sb3_quad.training.trainer import for_evaluation, resume, train
 from sb3_quad.training.trim import trim
 
 STATUS_FILE = "pipeline.yml"
-TRIM_SEED = 3 * 2**17  # added to the seed for the flights that measure an agent's offset; seen neither before nor after
-Share = Annotated[float, Field(ge=0, le=1)]
 
 
-class Requirement(BaseModel):
+class Requirement(Frozen):
     """What the best evaluation of a stage must reach before the next one begins."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    success_rate: Share = 0.0
-    mean_reward: float = -np.inf
+    success_rate: Annotated[float, Field(ge=0, le=1)] = 0.0
+    mean_reward: float | None = None
 
 
-class Stage(BaseModel):
+class Stage(Frozen):
     """One stage of a pipeline; see the module for its keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(min_length=1)
     algo: str
@@ -76,13 +73,11 @@ class Stage(BaseModel):
     trim: Literal["position", "hover"] | None = None
     require: Requirement = Requirement()
     eval_freq: int | None = None
-    eval_episodes: int | None = Field(default=None, ge=1)
+    eval_episodes: PositiveInt | None = None
 
 
-class Pipeline(BaseModel):
+class Pipeline(Frozen):
     """The stages, in order."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stages: tuple[Stage, ...] = Field(min_length=1)
 
@@ -113,8 +108,7 @@ class PipelineResult:
 
 def is_pipeline(conf_file: str | Path) -> bool:
     """Whether a settings file holds stages rather than the settings of one run."""
-    content, _ = read_settings(conf_file)
-    return isinstance(content, dict) and "stages" in content
+    return "stages" in SETTINGS.read(conf_file)[0]
 
 
 def load_pipeline(conf_file: str | Path) -> Pipeline:
@@ -122,23 +116,7 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
 
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
     """
-    content, where = read_settings(conf_file)
-    return _parse(content, where)
-
-
-def _parse(content: Any, where: str) -> Pipeline:
-    try:
-        return Pipeline.model_validate(content)
-    except ValidationError as error:
-        problems = []
-        for item in error.errors():
-            key = ".".join(str(part) for part in item["loc"])
-            if item["type"] == "extra_forbidden":
-                valid = Requirement if "require" in item["loc"] else Stage if "stages" in item["loc"] else Pipeline
-                problems.append(f"{key}: {unknown('key', item['loc'][-1], valid.model_fields)}")
-            else:
-                problems.append(f"{key}: {item['msg']}")
-        raise ConfigError(f"{where}: {'; '.join(problems)}") from None
+    return validate(Pipeline, *SETTINGS.read(conf_file))
 
 
 def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
@@ -209,10 +187,10 @@ def first_job(folder: Path) -> TrainingJob:
 
 
 def _read_status(folder: Path) -> tuple[Pipeline, dict[str, Any]]:
-    content, where = read_settings(folder / STATUS_FILE)
-    if not isinstance(content, dict) or not {"stages", "job", "done", "current"} <= content.keys():
+    content, where = SETTINGS.read(folder / STATUS_FILE)
+    if not {"stages", "job", "done", "current"} <= content.keys():
         raise ConfigError(f"{where}: holds no pipeline's status")
-    return _parse({"stages": content["stages"]}, where), content
+    return validate(Pipeline, {"stages": content["stages"]}, where), content
 
 
 def _go_on(
@@ -230,7 +208,7 @@ def _go_on(
             result = resume(current, report, **changes)
         else:
             start = replace(job, trained_agent=str(done[-1].agent)) if done else job
-            result = train(start, report, started=lambda run: _write_status(folder, pipeline, jobs, done, str(run.path)))
+            result = train(start, report, on_start=lambda run: _write_status(folder, pipeline, jobs, done, str(run.path)))
         current = None
         if result.exit_code != 0:
             report(f"to go on with the whole pipeline: --resume {folder}")
@@ -249,17 +227,14 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     :raises TrainingError: its best evaluation misses the stage's requirement.
     """
     if run.evaluations.is_file():
-        with np.load(run.evaluations) as file:
-            scores = [
-                (float(np.mean(successes)), float(np.mean(results)))
-                for successes, results in zip(file["successes"], file["results"], strict=True)
-            ]
+        curve = read_curve(run.path)
+        scores = list(zip(curve.success.tolist(), curve.reward.tolist(), strict=True))
         success, reward = max(scores) if stage.pass_on == "best" else scores[-1]
-        if success < stage.require.success_rate or reward < stage.require.mean_reward:
+        wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
+        if success < stage.require.success_rate or reward < wanted:
             raise TrainingError(
                 f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires "
-                f"(success_rate {stage.require.success_rate:g}, mean_reward {stage.require.mean_reward:g}); "
-                f"its run is {run.path}"
+                f"(success_rate {stage.require.success_rate:g}, mean_reward {wanted:g}); its run is {run.path}"
             )
     return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
 
@@ -267,12 +242,12 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
 def _trimmed(agent: Path, job: TrainingJob, kind: str, report: Callable[[str], None]) -> Path:
     """Trim the agent in a zip; the trimmed one lies beside it."""
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
-    kept = job.config.flight_kwargs
+    seed, settings = seed_for("trim", job.seed), for_evaluation(job).flight_settings
     if kind == "hover":
-        hover = trim_hover(model, job.seed + TRIM_SEED, **kept)
+        hover = trim_hover(model, seed, settings)
         done = f"action at the target {hover.before:.4f} from hover, now {hover.after:.4f}"
     else:
-        result = trim(model, job.seed + TRIM_SEED, **kept)
+        result = trim(model, seed, settings)
         done = f"steady offset {result.offset_before:.3f} m, now {result.offset_after:.3f} m; position scale {result.scale:g}"
     trimmed = agent.with_name("trimmed_model.zip")
     save_model(model, trimmed)
@@ -284,10 +259,9 @@ def _write_status(
     folder: Path, pipeline: Pipeline, jobs: list[TrainingJob], done: list[StageResult], current: str | None
 ) -> None:
     own = ("algo", "env", "trained_agent", "eval_freq", "eval_episodes")  # the stages hold theirs
-    shared = {key: value for key, value in jobs[0].arguments().items() if key not in own}
     status = {
         "stages": [stage.model_dump(mode="json", exclude_defaults=True) for stage in pipeline.stages],
-        "job": shared,
+        "job": {key: value for key, value in jobs[0].arguments().items() if key not in own},
         "done": [
             {"run": str(r.run.path), "agent": str(r.agent), "timesteps": r.timesteps, "seconds": r.seconds} for r in done
         ],

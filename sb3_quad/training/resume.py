@@ -6,23 +6,17 @@ resumed run is bit for bit the one that was not interrupted; elsewhere episodes 
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_bytes
+from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
+from sb3_quad.callbacks.last_good import ENVIRONMENT, Snapshot, set_random_state
 from sb3_quad.settings.algorithms import get_algorithm
-from sb3_quad.training.environments import set_environment_state
-from sb3_quad.training.last_good import ENVIRONMENT, Snapshot, set_random_state
 from sb3_quad.training.runs import RunFolder
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-    from stable_baselines3.common.vec_env import VecEnv
 
 
 def write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm, resumable: bool) -> None:
@@ -31,12 +25,9 @@ def write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm,
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     if resumable:
-        save_dataset: Callable[..., None] | None = getattr(model, "save_dataset", None)
-        if save_dataset is not None:
-            save_dataset(run.dataset)
-        buffer = io.BytesIO()
-        np.savez(buffer, timesteps=np.array(snapshot.timesteps), **snapshot.state)  # type: ignore[arg-type]
-        write_bytes(run.resume_state, buffer.getvalue())
+        if hasattr(model, "save_dataset"):
+            model.save_dataset(run.dataset)
+        write_arrays(run.resume_state, timesteps=np.array(snapshot.timesteps), **snapshot.state)
     write_bytes(run.model, snapshot.model)
 
 
@@ -54,27 +45,25 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
     """
     if not run.resume_state.is_file():
         raise ConfigError(f"run folder {run.path}: holds no interrupted run; to train its model further use -i {run.model}")
-    try:
-        with np.load(run.resume_state, allow_pickle=False) as file:
-            state = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{run.resume_state}: cannot be read ({error})") from None
+    state = read_arrays(run.resume_state)
     environment = {name.removeprefix(ENVIRONMENT): array for name, array in state.items() if name.startswith(ENVIRONMENT)}
     try:
         model = get_algorithm(algo).load(run.model, env=env, device=device, force_reset=not environment, **attributes)
     except ConfigError:
         raise
     except Exception as error:  # what a damaged archive raises depends on where the damage is
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{run.model}: not a complete SB3 zip ({reason[:160]})") from None
+        raise ConfigError(f"{run.model}: not a complete SB3 zip ({one_line(error)})") from None
     if model.num_timesteps != int(state["timesteps"]):
         raise ConfigError(
-            f"run folder {run.path}: {run.model.name} is after {model.num_timesteps:,} transitions, "
+            f"run folder {run.path}: {run.model.name} is after {model.num_timesteps:,} timesteps, "
             f"{run.resume_state.name} after {int(state['timesteps']):,}; they belong to different interruptions"
         )
-    load_dataset: Callable[..., None] | None = getattr(model, "load_dataset", None)
-    if load_dataset is not None:
-        load_dataset(run.dataset)
-    set_environment_state(env, environment)
+    if hasattr(model, "load_dataset"):
+        model.load_dataset(run.dataset)
+    batch: Any = getattr(env.unwrapped, "batch", None)
+    if environment and batch is None:
+        raise ConfigError(f"{run.resume_state}: holds the state of batched environments; use the run's own settings")
+    if environment:
+        batch.restore(environment)
     set_random_state(state)
     return model

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import os
 import uuid
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,61 +26,48 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
-from sb3_quad.settings.config import read_yaml
+from sb3_quad.base.yaml_files import parse_mapping_file
+from sb3_quad.settings.flight import FlightSettings, flight_settings
 from sb3_quad.settings.zoo_yaml import ZooLoader
 
 
-@dataclass(frozen=True)
 class RunFolder:
-    """The paths of one run."""
+    """The files of one run; see the table of this module.
 
-    path: Path
-    name: str  # the environment id, as file names take it
+    :param path: the folder.
+    :param name: the environment id, as file names take it.
+    """
 
-    @property
-    def model(self) -> Path:
-        return self.path / f"{self.name}.zip"
-
-    @property
-    def best_model(self) -> Path:
-        return self.path / "best_model.zip"
-
-    @property
-    def trimmed_model(self) -> Path:
-        return self.path / "trimmed_model.zip"
+    def __init__(self, path: Path, name: str) -> None:
+        self.path, self.name = path, name
+        self.model = path / f"{name}.zip"
+        self.best_model = path / "best_model.zip"
+        self.trimmed_model = path / "trimmed_model.zip"
+        self.evaluations = path / "evaluations.npz"
+        self.episodes = path / "0.monitor.csv"
+        self.dataset = path / "dataset.npz"
+        self.resume_state = path / "resume.npz"
+        self.config = path / name / "config.yml"
+        self.arguments = path / name / "args.yml"
 
     @property
     def result(self) -> Path:
         """What the run has to offer: its trimmed agent, else its best one, else its last one."""
         return next((path for path in (self.trimmed_model, self.best_model) if path.is_file()), self.model)
 
-    @property
-    def evaluations(self) -> Path:
-        return self.path / "evaluations.npz"
-
-    @property
-    def episodes(self) -> Path:
-        return self.path / "0.monitor.csv"
-
-    @property
-    def dataset(self) -> Path:
-        return self.path / "dataset.npz"
-
-    @property
-    def resume_state(self) -> Path:
-        return self.path / "resume.npz"
-
-    @property
-    def config(self) -> Path:
-        return self.path / self.name / "config.yml"
-
-    @property
-    def arguments(self) -> Path:
-        return self.path / self.name / "args.yml"
-
     def checkpoint(self, timesteps: int) -> Path:
-        """Where the model after ``timesteps`` transitions goes."""
+        """Where the model after ``timesteps`` goes."""
         return self.path / f"rl_model_{timesteps}_steps.zip"
+
+    def latest_checkpoint(self) -> Path:
+        """The checkpoint after most timesteps.
+
+        :raises ConfigError: there is none.
+        """
+        steps = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
+        if not steps:
+            raise ConfigError(f"{self.path}: holds no checkpoint; train with --save-freq to have some")
+        return self.checkpoint(max(int(step) for step in steps if step.isdigit()))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
         """Write config.yml and args.yml."""
@@ -94,16 +80,14 @@ class RunFolder:
 
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
-        contents = []
-        for path in (self.config, self.arguments):
-            try:
-                content = read_yaml(path.read_text(encoding="utf-8"), str(path), ZooLoader)
-            except (OSError, UnicodeDecodeError) as error:
-                raise ConfigError(f"{path}: cannot be read ({error})") from None
-            if not isinstance(content, dict):
-                raise ConfigError(f"{path}: must hold keys and values")
-            contents.append(content)
-        return contents[0], contents[1]
+        return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
+
+    def flight_settings(self) -> FlightSettings:
+        """How the run's agent was judged, and is to be flown.
+
+        :raises ConfigError: as :meth:`read_yaml`; or values that do not fit.
+        """
+        return flight_settings(*self.read_yaml(), str(self.config))
 
 
 def file_name(env_id: str) -> str:
@@ -180,14 +164,3 @@ def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) ->
     there = ", ".join(entry.name for entry in found) or "no run of this environment"
     wanted = f"{name}_{number}" if number else name
     raise ConfigError(f"{parent}: there is no run {wanted}, but {there}; give another with --env, --algo, -f or --exp-id")
-
-
-def latest_checkpoint(run: RunFolder) -> Path:
-    """The checkpoint after most transitions.
-
-    :raises ConfigError: there is none.
-    """
-    steps = [entry.name.split("_")[2] for entry in run.path.glob("rl_model_*_steps.zip")]
-    if not steps:
-        raise ConfigError(f"{run.path}: holds no checkpoint; train with --save-freq to have some")
-    return run.checkpoint(max(int(step) for step in steps if step.isdigit()))
