@@ -12,7 +12,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Arrays, Recorder
 from sb3_quad.evaluation.flights import Flights, Plan, fly_fleet
-from sb3_quad.scenarios.draw import draw_episodes, wrench_changes
+from sb3_quad.scenarios.sample import sample_episodes
 from sb3_quad.scenarios.scenario import Scenario
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
@@ -46,14 +46,9 @@ def fly_scenario(
     parts, trajectories = [], None
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
-        episodes = draw_episodes(scenario, chosen[part], None if factors is None else factors[part])
+        episodes = sample_episodes(scenario, chosen[part], None if factors is None else factors[part])
         recorder = Recorder(min(recorded, len(episodes.seeds)), episodes.steps) if recorded and first == 0 else None
-        plan = Plan(
-            episodes.start,
-            wrench_changes(episodes.wrenches, episodes.steps) if episodes.wrenches else {},
-            episodes.waypoints,
-            episodes.radius,
-        )
+        plan = Plan(episodes.start, episodes.wrenches, episodes.waypoints, episodes.radius)
         fleet = FLEETS[backend](episodes.seeds, episodes.task, None, episodes.vehicle, episodes.noise, episodes.steps)
         try:
             parts.append(fly_fleet(fleet, controller, plan, episodes.steps, scenario.tolerances, recorder))

@@ -28,7 +28,7 @@ def axis_name(key: str) -> str:
 
 
 def axis_label(key: str) -> str:
-    """The name of a varied key with its unit, as axes of figures carry it."""
+    """The name of a varied key with its unit, as the axes of plots carry it."""
     name = axis_name(key)
     return f"{name} ({_UNITS[name]})" if name in _UNITS else name
 
@@ -73,15 +73,11 @@ def _is_number(value: Any) -> bool:
 def _put(entry: dict[str, Any], key: str, value: Any, where: str) -> None:
     *path, last = key.split(".")
     place: Any = entry
-    for number, part in enumerate(path):
+    for part in path:
         if isinstance(place, list) and part.isdigit() and int(part) < len(place):
             place = place[int(part)]
-        elif isinstance(place, dict):
-            place = place.setdefault(part, {})
         else:
-            place = None
-        if not isinstance(place, (dict, list)):
-            raise ConfigError(f"{where}: vary.{key}: {'.'.join(path[: number + 1])} holds no keys here")
+            place = place.setdefault(part, {}) if isinstance(place, dict) else None
     if not isinstance(place, dict):
         raise ConfigError(f"{where}: vary.{key}: {'.'.join(path)} holds no keys here")
     place[last] = value

@@ -10,10 +10,10 @@ from typing import Annotated, Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.quantities import Finite
+from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.episodes import reset_rows, score
 
 __all__ = ["TASKS", "TASK_PARAMETERS", "Task", "TaskSpec", "TaskTable", "reset_rows", "resolve_tasks", "score"]
@@ -21,19 +21,17 @@ __all__ = ["TASKS", "TASK_PARAMETERS", "Task", "TaskSpec", "TaskTable", "reset_r
 FloatArray = npt.NDArray[np.float64]
 
 
-NotNegative = Annotated[Finite, Field(ge=0)]
+NotNegative = Annotated[float, Field(ge=0)]
 
 
-class Task(BaseModel):
+class Task(Frozen):
     """A task: start distribution, reward coefficients (Eqs. 4.5-4.9) and limits; units m, s, rad.
 
     Frozen. ``task_kwargs`` of the environments override its fields by name.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     name: str = Field(default="custom", min_length=1, description="what the task is called")
-    start_position: tuple[Finite, Finite, Finite] = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
+    start_position: tuple[float, float, float] = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
     target_distance: NotNegative = Field(default=0.0, description="|r_T - r0|, m; 0: the target is r0")
     nearest_target: NotNegative | None = Field(
         default=None, description="if given, |r_T - r0| is uniform between this and target_distance, m"
@@ -44,7 +42,7 @@ class Task(BaseModel):
     random_attitude: bool = Field(default=False, description="start attitude uniform on SO(3), else level")
     velocity_std: NotNegative = Field(default=0.0, description="standard deviation of v at the start, per axis, m/s")
     body_rates_std: NotNegative = Field(default=0.0, description="of the body rates at the start, per axis, rad/s")
-    max_distance: Annotated[Finite, Field(gt=0)] = Field(default=30.0, description="farther from the target ends, m")
+    max_distance: Annotated[float, Field(gt=0)] = Field(default=30.0, description="farther from the target ends, m")
     position_cost: NotNegative = Field(default=0.003, description="per m and control step (Eq. 4.5)")
     tilt_cost: NotNegative = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
     body_rates_cost: NotNegative = Field(default=0.0005, description="per rad/s and control step (Eq. 4.7)")
