@@ -18,7 +18,11 @@ def summarise(flights: Flights) -> Metrics:
     """The metrics of some flights, at least one."""
     done = flights.success
     error, offset = flights.final_error[done], flights.final_offset[done]
-    some = bool(done.any())
+    some, reached = bool(done.any()), np.isfinite(flights.waypoint_times)
+    course = None
+    if reached.shape[1]:
+        times = mean(flights.waypoint_times[:, -1])
+        course = Course(reached=_present(mean(reached.sum(axis=1))), completed=share(reached.all(axis=1)), time=times)
     return Metrics(
         n=flights.n,
         success=share(done),
@@ -35,7 +39,7 @@ def summarise(flights: Flights) -> Metrics:
         final_error_median=float(np.median(error)) if some else None,
         final_error_max=float(error.max()) if some else None,
         final_offset=tuple(offset.mean(axis=0).tolist()) if some else None,
-        course=_course(flights) if flights.waypoint_times.shape[1] else None,
+        course=course,
     )
 
 
@@ -66,15 +70,6 @@ def mean(values: npt.ArrayLike) -> Estimate | None:
     rows = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
     low, high = np.percentile(array[rows].mean(axis=1), [2.5, 97.5])
     return Estimate(value=middle, low=min(middle, float(low)), high=max(middle, float(high)), n=n)
-
-
-def _course(flights: Flights) -> Course:
-    reached = np.isfinite(flights.waypoint_times)
-    return Course(
-        reached=_present(mean(reached.sum(axis=1))),
-        completed=share(reached.all(axis=1)),
-        time=mean(flights.waypoint_times[:, -1]),
-    )
 
 
 def _present(estimate: Estimate | None) -> Estimate:

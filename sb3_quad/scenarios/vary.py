@@ -46,8 +46,8 @@ def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
     if not isinstance(axes, Mapping) or not axes:
         raise ConfigError(f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'")
     for key, values in axes.items():
-        numbers = isinstance(values, list) and values and all(_is_number(value) for value in values)
-        if not numbers or len(set(values)) != len(values):
+        numbers = isinstance(values, list) and all(type(each) in (int, float) and math.isfinite(each) for each in values)
+        if not numbers or not values or len(set(values)) != len(values):
             raise ConfigError(f"{where}: vary.{key} must be a list of different numbers, not {values!r}")
     count = math.prod(len(values) for values in axes.values())
     if count > MAX_CELLS:
@@ -64,10 +64,6 @@ def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         cell["cell"] = {str(key): float(value) for key, value in zip(axes, values, strict=True)}
         cells.append(cell)
     return cells
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _put(entry: dict[str, Any], key: str, value: Any, where: str) -> None:
