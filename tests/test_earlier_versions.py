@@ -1,4 +1,5 @@
-"""What version 0.1 has left on a disk still opens: an interrupted run goes on to the same agent, a zip flies the same."""
+"""What version 0.1 has left on a disk still opens: an interrupted run goes on to the same agent, a zip flies the same,
+results are read, and nothing in them is flown again."""
 
 from __future__ import annotations
 
@@ -11,6 +12,8 @@ import pytest
 from stable_baselines3 import PPO
 
 from sb3_quad.cli import main
+from sb3_quad.evaluation.flightlog import read_flights
+from sb3_quad.evaluation.folder import load_results, write_results
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.training.trainer import resume
 
@@ -47,3 +50,41 @@ def test_its_agent_is_shown_with_the_settings_of_its_run(tmp_path, capsys, monke
     shutil.copytree(OLD / run.name, run)
     assert main(["enjoy", "--algo", "dagger", "--env", "QuadTargetTracking-v0", "--no-render"]) == 0
     assert "0.60 s" in capsys.readouterr().out  # 60 control steps, as its env_kwargs say
+
+
+def test_results_are_read_and_written_alike(tmp_path):
+    results = load_results(OLD / "results")
+    entry = results.entry("agent", "hit")
+    assert entry.metrics.success.n == 1 and entry.metrics.arrivals[0].tolerance == 0.5
+    assert entry.figures is entry.metrics  # as documented in version 0.1
+    assert len(entry.hit_limit.trials) == 17 and results.failures[0].controller == "missing"
+    assert results.scenarios[0].reference["expert"].time_to == {"0.5": 1.25}
+    assert read_flights(OLD / "results" / entry.flights)["position"].shape == (1, 11, 3)
+    shutil.copytree(OLD / "results" / "flights", tmp_path / "flights")
+    write_results(tmp_path, results)
+    for name in ("results.json", "episodes.csv"):
+        assert (tmp_path / name).read_bytes() == (OLD / "results" / name).read_bytes()
+
+
+def test_what_is_there_is_not_flown_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sb3_quad.evaluation.evaluate.__version__", "0.1.0")  # another version flies anew
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(OLD / "results", tmp_path / "results")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.npz")}
+    command = ["evaluate", str(OLD / "agent.zip"), "--suite", str(OLD / "small.yaml"), "-o", "results", "--no-report"]
+    assert main(command) == 0
+    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.npz")} and len(before) == 3
+    table = capsys.readouterr().out
+    for part in ("paper", "expert 50 %", "tilt 60", "half survive up to", "waypoints reached"):
+        assert part in table
+
+
+def test_names_that_were_documented_can_still_be_imported():
+    from sb3_quad.base.errors import ConfigError
+    from sb3_quad.dynamics.state import QuadcopterState
+    from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
+    from sb3_quad.errors import ConfigError as Same
+    from sb3_quad.vehicles import Vehicle as Short
+
+    assert isinstance(load_vehicle("itm"), Vehicle) and Vehicle is Short and Same is ConfigError
+    assert QuadcopterState(np.zeros((20, 2))).position.shape == (2, 3)

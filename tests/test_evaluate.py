@@ -104,9 +104,9 @@ def test_table_results_and_episodes_agree(here, capsys):
     assert len(episodes) == 2 * (5 + 2 + 3 + 3)
     for entry in results.entries:
         own = [row for row in episodes if (row["controller"], row["scenario"]) == (entry.controller, entry.scenario)]
-        assert len(own) == entry.figures.n
-        assert np.mean([row["outcome"] == "success" for row in own]) == entry.figures.success.value
-        assert np.mean([float(row["reward"]) for row in own]) == pytest.approx(entry.figures.reward.value)
+        assert len(own) == entry.metrics.n
+        assert np.mean([row["outcome"] == "success" for row in own]) == entry.metrics.success.value
+        assert np.mean([float(row["reward"]) for row in own]) == pytest.approx(entry.metrics.reward.value)
         assert [int(row["seed"]) for row in own] == list(range(entry.seed, entry.seed + len(own)))
         arrays = read_flights(f"out/{entry.flights}")
         assert len(arrays["episode_seed"]) == len(own)
@@ -115,8 +115,8 @@ def test_table_results_and_episodes_agree(here, capsys):
     names = [name for name in episodes[0] if name.startswith(("start_", "target_"))]
     pid, still = ([[row[name] for name in names] for row in episodes if row["controller"] == who] for who in ("pid", "still"))
     assert pid == still
-    course = results.entry("pid", "course").figures.course
-    assert course.completed.value == 1.0 and results.entry("still", "course").figures.course.completed.value == 0.0
+    course = results.entry("pid", "course").metrics.course
+    assert course.completed.value == 1.0 and results.entry("still", "course").metrics.course.completed.value == 0.0
     assert [row["waypoints_reached"] for row in episodes if row["scenario"] == "course"] == ["2", "2", "0", "0"]
 
 
@@ -196,7 +196,7 @@ def test_failures_are_one_line_each_and_the_others_fly(here, capsys):
         (["--backend", "bulet"], "did you mean 'pybullet'"),
         (["--scaling", "adaptiv"], "did you mean 'adaptive'"),
         (["--scenario", "trackin"], "did you mean 'tracking'"),
-        (["--episodes", "0"], "at least one"),
+        (["--episodes", "0"], "episodes: Input should be greater than or equal to 1"),
         (["--workers", "0"], "at least 1"),
         (["pid"], "two are called so"),
         (["=pid"], "name=path"),

@@ -11,7 +11,6 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.evaluation.evaluate import with_changes
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.settings.config import load_config
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -110,8 +109,8 @@ def test_a_suite_flown_by_another_vehicle(here, capsys):
 def test_scenarios_that_a_vehicle_cannot_fly_are_named(here):
     suite = load_suite("quick")
     with pytest.raises(ConfigError, match="did you mean 'hummingbird'"):
-        with_changes(suite, vehicle="humingbird")
+        suite.with_changes(vehicle="humingbird")
     data = yaml.safe_load((here / "my.yaml").read_text())
     (here / "huge.yaml").write_text(yaml.safe_dump({**data, "collision_radius": 16.0}))
     with pytest.raises(ConfigError, match=r"scenario tracking, flown by huge\.yaml: .*touches the ground"):
-        with_changes(suite, vehicle="huge.yaml")
+        suite.with_changes(vehicle="huge.yaml")

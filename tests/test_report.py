@@ -106,7 +106,7 @@ def test_the_page_holds_the_results(folder, page):
     for scenario in results.scenarios:
         assert scenario.heading.split(":")[0].lower() in text.lower()
     assert LABEL in text and results.description in text
-    figures = results.entry("pid", "tracking").figures
+    figures = results.entry("pid", "tracking").metrics
     assert f"{figures.reward.value:.2f}".replace("-", "−") in text
     assert f"{figures.arrivals[0].time.value:.2f}" in text and f"{figures.final_error_max:.3f}" in text
     low, high = figures.success.low, figures.success.high
@@ -169,7 +169,7 @@ def test_a_lost_flight_counts_as_far_away(folder):
     results = load_results(folder)
     (section,) = (section for section in sections(results, folder) if section.anchor == "upside_down")
     (figure,) = (figure for figure in section.figures if isinstance(figure, LineFigure))
-    lost = results.entry("pid", "upside_down").figures.collisions == 2
+    lost = results.entry("pid", "upside_down").metrics.collisions == 2
     (line,) = (line for line in figure.lines if line.name == "pid" and not line.faint)
     assert lost and line.x[-1] < 2.0
     paths = next(figure for figure in section.figures if isinstance(figure, PathFigure))

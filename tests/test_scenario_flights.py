@@ -12,10 +12,9 @@ from sb3_quad.base.files import write_arrays
 from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.hits import find_limit
-from sb3_quad.evaluation.intervals import mean, share
 from sb3_quad.evaluation.scaling import AdaptiveScaling, adapt_observation, adaptive_factor, hover_offset, measure_mean
 from sb3_quad.evaluation.scenario_flights import fly_scenario
-from sb3_quad.evaluation.summary import summarise
+from sb3_quad.evaluation.summary import mean, share, summarise
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.load import load_suite, parse_suite
 from sb3_quad.scenarios.scenario import Scenario

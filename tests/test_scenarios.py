@@ -1,4 +1,4 @@
-"""Scenarios: what a file says is what is drawn, impossible ones are refused in one line, the shipped suites hold together."""
+"""Scenarios: what a file says is what is flown, impossible ones are refused in one line, the shipped suites hold together."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.scenarios.draw import draw_episodes, wrench_changes
-from sb3_quad.scenarios.load import load_suite, parse_suite, suite_names
+from sb3_quad.scenarios.load import SUITES, load_suite, parse_suite
 from sb3_quad.scenarios.parts import VehicleChanges
+from sb3_quad.scenarios.sample import sample_episodes
 from sb3_quad.scenarios.scenario import Scenario, Suite
 from sb3_quad.scenarios.vary import axis_label
 from sb3_quad.simulation.state import QuadcopterState
@@ -31,7 +31,7 @@ def scenario(entry: str) -> Scenario:
     return suite(entry).scenarios[0]
 
 
-@pytest.mark.parametrize("name", suite_names())
+@pytest.mark.parametrize("name", SUITES.names())
 def test_shipped_suites_survive_json(name):
     loaded = load_suite(name)
     assert loaded.name == name
@@ -146,23 +146,23 @@ def test_vary_is_a_grid_of_named_cells():
 
 @settings(max_examples=20)
 @given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))
-def test_draws_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
+def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"
-    drawn, again = (draw_episodes(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
+    sampled, again = (sample_episodes(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
     state = np.zeros((20, 3))
-    state[3:7] = drawn["quaternion"].T
+    state[3:7] = sampled["quaternion"].T
     cosines = QuadcopterState(state).rotation[:, 2, 2]
     np.testing.assert_allclose(cosines, math.cos(math.radians(tilt)), atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(drawn["velocity"], axis=1), speed, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(drawn["body_rates"], axis=1), rate, atol=1e-9)
-    for name, values in drawn.items():
+    np.testing.assert_allclose(np.linalg.norm(sampled["velocity"], axis=1), speed, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(sampled["body_rates"], axis=1), rate, atol=1e-9)
+    for name, values in sampled.items():
         np.testing.assert_array_equal(values, again[name])
         if name == "velocity" and speed > 0:
             assert len(np.unique(values[:, 0])) == 3
 
 
-def test_the_tasks_own_draws_stay_with_the_environment():
-    recovery = draw_episodes(load_suite("thesis").scenario("recovery"))
+def test_what_a_task_samples_itself_stays_with_the_environment():
+    recovery = sample_episodes(load_suite("thesis").scenario("recovery"))
     assert recovery.start == {}
     assert recovery.task.random_attitude and recovery.task.velocity_std == 2.0 and recovery.task.body_rates_std == 4.0
 
@@ -178,11 +178,10 @@ def test_the_wrench_at_any_time_is_the_sum_of_those_that_act(times, factor):
         f" force: [{k + 1}, 0, 0], torque: [0, {k + 1}, 0]}}"
         for k, (first, length, frame) in enumerate(times)
     )
-    episodes = draw_episodes(scenario(f"duration: 0.5, wrenches: [{entries}]"), [0, 1], np.array([1.0, factor]))
-    changes = wrench_changes(episodes.wrenches, episodes.steps)
+    episodes = sample_episodes(scenario(f"duration: 0.5, wrenches: [{entries}]"), [0, 1], np.array([1.0, factor]))
     now = np.zeros((2, 12))
     for step in range(episodes.steps):
-        now = changes.get(step, now)
+        now = episodes.wrenches.get(step, now)
         expected = np.zeros(12)
         for k, (first, length, frame) in enumerate(times):
             if first <= step < first + length:

@@ -14,12 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.cli import main, tune_expert
-from sb3_quad.evaluation.expert_figures import by_start, start_groups, start_states
+from sb3_quad.evaluation.expert_figures import by_start, start_states
 from sb3_quad.tuning import expert_objective
 from sb3_quad.tuning.expert_objective import ExpertObjective
 from sb3_quad.tuning.expert_search import ExpertSearch
 from sb3_quad.tuning.vehicle_files import vehicle_text, with_gains
-from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricFigures, GeometricGains
+from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
@@ -46,7 +46,7 @@ def slow_itm(tmp_path):
 
 
 figures = st.builds(
-    GeometricFigures,
+    GeometricMetrics,
     recovery_success=st.floats(0, 1),
     recovery_episodes=st.integers(1, 10**6),
     tracking_success=st.floats(0, 1),
@@ -91,14 +91,18 @@ def test_the_cost_tells_better_gains_from_worse_and_repeats_itself():
     assert careless.too_low > good.too_low and careless.value > good.value
 
 
-def test_figures_by_start_count_each_flight_once_per_quantity():
+def test_recoveries_by_start_count_each_flight_once_per_quantity():
     state = start_states("state_recovery", 200, 5, ITM)
     recovered = np.random.default_rng(0).random(200) < 0.7
     counts = by_start(recovered, state)
-    for quantity, groups in start_groups(state).items():
+    for quantity in ("tilt", "falling", "body rate"):
         assert sum(counts.flown[quantity].values()) == 200
         assert sum(counts.lost[quantity].values()) == (~recovered).sum()
-        assert (np.sum(list(groups.values()), axis=0) == 1).all()
+    upside_down = state.rotation[:, 2, 2] < -0.5
+    assert counts.flown["tilt"]["above 120°"] == upside_down.sum()
+    assert counts.lost["tilt"]["above 120°"] == (upside_down & ~recovered).sum()
+    assert counts.flown["falling"]["below 2 m/s"] == (state.velocity[:, 2] > -2).sum()
+    assert counts.flown["body rate"]["above 10 rad/s"] == (np.linalg.norm(state.body_rates, axis=1) >= 10).sum()
 
 
 def test_it_writes_a_vehicle_that_flies_and_goes_on_where_it_was_left(slow_itm, tmp_path, capsys):

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
 
 from sb3_quad.base.errors import ConfigError, unknown
 
@@ -33,8 +34,8 @@ def validate(model: type[Model], data: Any, where: str) -> Model:
         return model.model_validate(data)
     except ValidationError as error:
         kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
-        kind = kinds.pop() if len(kinds) == 1 else ConfigError
-        raise (kind if issubclass(kind, ConfigError) else ConfigError)(f"{where}: {explain(error, model)}") from None
+        kind = next((each for each in kinds if len(kinds) == 1 and issubclass(each, ConfigError)), ConfigError)
+        raise kind(f"{where}: {explain(error, model)}") from None
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -44,7 +45,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         inside, names, meaning = _walk(model, item["loc"])
         key = ".".join(names)
         if item["type"] == "extra_forbidden":
-            text = unknown("key", item["loc"][-1], [*inside.model_fields, *getattr(inside, "other_keys", ())])
+            text = unknown("key", item["loc"][-1], [*_fields(inside), *getattr(inside, "other_keys", ())])
         else:
             text = _message(item) + (f" ({meaning})" if meaning else "")
         found.setdefault(key, f"{key}: {text}" if key else text)  # of a union only the first alternative
@@ -67,12 +68,17 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[type
     for part in location:
         if isinstance(part, int):
             names.append(str(part))
-        elif part in model.model_fields:
-            field = model.model_fields[part]
+        elif part in _fields(model):
+            field = _fields(model)[part]
             names.append(part)
             meaning = field.description or ""
             model = _model_in(field.annotation) or model
     return model, names, meaning
+
+
+def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
+    """The fields of a model by the keys that its data have."""
+    return {str(field.validation_alias or name): field for name, field in model.model_fields.items()}
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:

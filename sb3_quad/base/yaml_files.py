@@ -56,10 +56,13 @@ class YamlFolder:
         return [name for folder in ("", *self.folders) for name in sorted(self._files(folder))]
 
     def is_path(self, source: str | Path) -> bool:
-        """Whether a source is the path of a file rather than a name."""
-        if isinstance(source, Path) or Path(source).is_file():
+        """Whether a source is the path of a file rather than a name.
+
+        A name that could be a path, since it ends as one, stands for the user's file if there is one.
+        """
+        if isinstance(source, Path) or (self.in_name and Path(source).is_file()):
             return True
-        return source not in self.names() and not self.in_name and (source.endswith(SUFFIXES) or "/" in source)
+        return not self.in_name and (source.endswith(SUFFIXES) or "/" in source)
 
     def text(self, source: str | Path) -> tuple[str, str]:
         """The text of a file by name or path, and what messages call it.

@@ -23,11 +23,12 @@ def task_table(
     :param beside: the columns of the thesis that stand beside them.
     :param keywords: further arguments of :func:`~sb3_quad.evaluation.flights.fly`, such as ``vehicle``.
     """
-    from sb3_quad.evaluation.summary import fly_all
+    from sb3_quad.evaluation.flights import fly
+    from sb3_quad.evaluation.summary import summarise
     from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
     from sb3_quad.scenarios.load import load_suite
 
-    columns = fly_all(pilots, task, n_episodes, seed, **keywords)
+    columns = {name: summarise(fly(pilot, task, n_episodes, seed, **keywords)) for name, pilot in pilots.items()}
     scenario = load_suite("thesis").scenario(TASK_SCENARIOS[task])
     return comparison(f"{task}: {n_episodes} fresh episodes, {title}", columns, scenario, beside)
 

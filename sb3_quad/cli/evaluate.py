@@ -5,18 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console
 from sb3_quad.cli.report import report
-
-if TYPE_CHECKING:
-    from sb3_quad.evaluation.evaluate import Progress
-    from sb3_quad.evaluation.records import Results
 
 HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
 EXAMPLES = """controllers:
@@ -54,24 +47,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
     add("--overwrite", action="store_true", help="replace results of these controllers that were flown otherwise")
-    add("--report", action=argparse.BooleanOptionalAction, default=True, help="renew report.html and its figures (yes)")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="renew report.html and its plots (yes)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
 
 
 def run(options: argparse.Namespace) -> int:
     """Fly, print the table, tell where everything is. Returns the exit code."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
     from sb3_quad.evaluation.controllers import SCALINGS, parse_controllers
-    from sb3_quad.evaluation.evaluate import evaluate, with_changes
+    from sb3_quad.evaluation.evaluate import evaluate
     from sb3_quad.evaluation.tables import overview
     from sb3_quad.scenarios.load import load_suite
 
     if options.scaling not in SCALINGS:
         raise ConfigError(unknown("scaling", options.scaling, SCALINGS))
-    suite = with_changes(load_suite(options.suite), options.scenario, options.episodes, options.seed, options.vehicle)
+    suite = load_suite(options.suite).with_changes(options.scenario, options.episodes, options.seed, options.vehicle)
     controllers = parse_controllers(options.controllers, options.scaling)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
     start = time.perf_counter()
-    with _progress(options) as progress:
+    shown = sys.stderr.isatty() if options.progress is None else options.progress
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
+    with Progress(*columns, console=Console(file=sys.stderr), transient=True, disable=not shown) as bar:
+        task = bar.add_task("loading", total=None)
+
+        def progress(done: int, total: int, name: str) -> None:
+            bar.update(task, completed=done, total=total, description=name)
+
         results = evaluate(suite, controllers, folder, options.backend, options.workers, options.overwrite, progress)
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
@@ -80,27 +83,9 @@ def run(options: argparse.Namespace) -> int:
     print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and results.entries:
         report(folder, overwrite=True, pictures=True)
-    return _report_failures(results, {spec.label for spec in controllers})
-
-
-def _report_failures(results: Results, labels: set[str]) -> int:
-    failures = [failure for failure in results.failures if failure.controller in labels]
+    asked = {spec.label for spec in controllers}
+    failures = [failure for failure in results.failures if failure.controller in asked]
     for failure in failures:
         where = "" if failure.scenario is None else f", scenario {failure.scenario}"
         print(f"failed: {failure.controller}{where}: {failure.message}", file=sys.stderr)
     return 1 if failures else 0
-
-
-@contextmanager
-def _progress(options: argparse.Namespace) -> Iterator[Progress]:
-    """A progress bar on stderr, if one is wanted."""
-    if not (sys.stderr.isatty() if options.progress is None else options.progress):
-        yield lambda done, total, name: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
-    with Progress(*columns, console=Console(file=sys.stderr), transient=True) as bar:
-        task = bar.add_task("loading", total=None)
-        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)

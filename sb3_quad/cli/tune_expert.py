@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from sb3_quad.evaluation.expert_figures import Recoveries
     from sb3_quad.tuning.expert_search import ExpertSearch
-    from sb3_quad.vehicles.gains import GeometricFigures
+    from sb3_quad.vehicles.gains import GeometricMetrics
 
 HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the figures they reach."
 EXAMPLES = """examples:
@@ -107,7 +107,7 @@ def _search(search: ExpertSearch, trials: int, progress: bool | None, goes_on: C
         search.run(trials, after_each)
 
 
-def _figures_table(figures: GeometricFigures) -> Table:
+def _figures_table(figures: GeometricMetrics) -> Table:
     from rich.table import Table
 
     table = Table(title="on fresh episodes, true state", title_justify="left")

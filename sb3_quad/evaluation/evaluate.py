@@ -2,22 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import hashlib
+import itertools
+import json
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
-from pydantic import ValidationError
+import numpy as np
 
+from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
-from sb3_quad.evaluation.controllers import ControllerSpec, describe, measured
+from sb3_quad.base.signals import ignore_interrupts
+from sb3_quad.evaluation.controllers import ControllerSpec, build, describe, measured
 from sb3_quad.evaluation.fleets import FLEETS
-from sb3_quad.evaluation.folder import ResultFolder
-from sb3_quad.evaluation.jobs import Job, make_job, run_jobs
-from sb3_quad.evaluation.records import ControllerRecord, Failure, Results
-from sb3_quad.scenarios.load import explain
+from sb3_quad.evaluation.flightlog import episode_arrays
+from sb3_quad.evaluation.folder import RESULTS, flights_path, load_results, read_entries, write_entry, write_results
+from sb3_quad.evaluation.hits import find_limit
+from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry, Failure, Results
+from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.summary import summarise
 from sb3_quad.scenarios.scenario import Scenario, Suite
-from sb3_quad.vehicles.vehicle import is_vehicle_file, load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
+_SILENT = {"title", "description", "reference", "group", "cell"}  # fields of a scenario that change no flight
+
+
+@dataclass(frozen=True)
+class Job:
+    """A controller in a scenario.
+
+    :param folder: path of the folder that its :class:`Entry` is left in.
+    """
+
+    spec: ControllerSpec
+    record: ControllerRecord
+    scenario: Scenario
+    backend: str
+    folder: str
+
+    @cached_property
+    def scenario_key(self) -> str:
+        """A hash of all that the flights depend on but the controller: equal keys, equal episodes."""
+        scenario = self.scenario
+        vehicles = [vehicle.model_dump(mode="json") for vehicle in (scenario.nominal_vehicle(), scenario.flown_vehicle())]
+        content = scenario.model_dump(mode="json", exclude=_SILENT)
+        return _digest([SCHEMA_VERSION, __version__, self.backend, content, vehicles])
+
+    @cached_property
+    def key(self) -> str:
+        """A hash of all that the flights depend on: equal keys, equal flights."""
+        return _digest([self.scenario_key, self.record.content, self.record.scaling, self.record.offset])
 
 
 def evaluate(
@@ -44,135 +85,73 @@ def evaluate(
         raise ConfigError(unknown("backend", backend, FLEETS))
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
-    store = ResultFolder(folder)
-    before = store.read_results()
-    records, failures = _load(controllers, suite.scenarios[0].vehicle)
-    jobs = [
-        make_job(spec, records[spec.label], scenario, backend, folder)
-        for scenario in suite.scenarios
-        for spec in controllers
-        if spec.label in records
-    ]
-    missing = _missing(store, jobs, overwrite)
+    place = Path(folder)
+    before = load_results(place) if (place / RESULTS).is_file() else None
+    records: dict[str, ControllerRecord] = {}
+    failures: dict[str, list[Failure]] = {spec.label: [] for spec in controllers}
+    for spec in controllers:
+        try:
+            records[spec.label] = measured(spec, describe(spec), suite.scenarios[0].vehicle)
+        except SB3QuadError as error:
+            failures[spec.label].append(_failure(spec.label, None, error))
+    loaded = [spec for spec in controllers if spec.label in records]
+    jobs = [Job(spec, records[spec.label], each, backend, folder) for each in suite.scenarios for spec in loaded]
+    missing = _missing(place, jobs, overwrite)
+    done = len(jobs) - len(missing)
     try:
-        done = len(jobs) - len(missing)
         progress(done, len(jobs), "")
         for job, outcome in run_jobs(missing, workers):
             done += 1
             if isinstance(outcome, Failure):
-                failures.append(outcome)
+                failures[job.record.label].append(outcome)
             progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
     finally:  # an interrupt, too, leaves what is done in order
-        results = _collect(store, before, suite, list(records.values()), failures, {spec.label for spec in controllers})
+        results = _collect(place, before, suite, records, failures)
         if results.entries or results.failures:
-            store.write_results(results)
+            write_results(place, results)
     return results
 
 
-def with_changes(
-    suite: Suite,
-    names: Sequence[str] = (),
-    episodes: int | None = None,
-    seed: int | None = None,
-    vehicle: str | None = None,
-) -> Suite:
-    """A suite with some of its scenarios, other numbers of episodes or seeds, or another vehicle.
-
-    :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
-    :param vehicle: name, or path of a YAML file, that flies all scenarios; forces and torques stay what they are, in N and
-        N m, and reference figures, which are of another vehicle, go.
-    :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible for the vehicle.
-    """
-    known = [name for scenario in suite.scenarios for name in (scenario.name, scenario.group) if name is not None]
-    for name in names:
-        if name not in known:
-            raise ConfigError(unknown("scenario", name, sorted(set(known))))
-    if (episodes is not None and episodes < 1) or (seed is not None and not 0 <= seed < 2**32):
-        raise ConfigError(f"episodes {episodes}, seed {seed}: at least one episode, a seed of 0 to {2**32 - 1}")
-    changes = {key: value for key, value in (("episodes", episodes), ("seed", seed)) if value is not None}
-    kept = [each for each in suite.scenarios if not names or each.name in names or each.group in names]
-    scenarios = tuple(_changed(scenario, changes) for scenario in kept)
-    if vehicle is not None:
-        scenarios = tuple(_flown_by(vehicle, scenario) for scenario in scenarios)
-    return suite.model_copy(update={"scenarios": scenarios})
-
-
-def _changed(scenario: Scenario, changes: dict[str, int]) -> Scenario:
-    search = scenario.hit_search
-    if search is not None and "episodes" in changes:
-        search = search.model_copy(update={"episodes": min(search.episodes, changes["episodes"])})
-    return scenario.model_copy(update={**changes, "hit_search": search})
-
-
-def _flown_by(vehicle: str, scenario: Scenario) -> Scenario:
-    load_vehicle(vehicle)  # whatever is wrong with it
-    name = str(Path(vehicle).absolute()) if is_vehicle_file(vehicle) else vehicle
-    try:
-        return Scenario.model_validate({**scenario.model_dump(), "vehicle": name, "reference": {}})
-    except ValidationError as error:
-        raise ConfigError(f"scenario {scenario.name}, flown by {vehicle}: {explain(error, Scenario)}") from None
-
-
-def _load(controllers: Sequence[ControllerSpec], vehicle: str) -> tuple[dict[str, ControllerRecord], list[Failure]]:
-    records, failures = {}, []
-    for spec in controllers:
-        try:
-            records[spec.label] = measured(spec, describe(spec), vehicle)
-        except SB3QuadError as error:
-            failures.append(Failure(controller=spec.label, scenario=None, message=" ".join(str(error).split())))
-    return records, failures
-
-
-def _missing(store: ResultFolder, jobs: Sequence[Job], overwrite: bool) -> list[Job]:
+def _missing(folder: Path, jobs: Sequence[Job], overwrite: bool) -> list[Job]:
     """The jobs whose flights are not there.
 
     :raises ConfigError: flights of the same names are there that were flown otherwise.
     """
-    there = {(entry.controller, entry.scenario): entry for entry in store.entries()}
-    asked = {(job.record.label, job.scenario.name) for job in jobs}
+    there = {(entry.controller, entry.scenario): entry for entry in read_entries(folder)}
+    asked = {(job.record.label, job.scenario.name): job for job in jobs}
     keys = {job.scenario.name: job.scenario_key for job in jobs}
     for name, entry in there.items():
-        other = entry.scenario_key != keys.get(entry.scenario, entry.scenario_key)
-        if other and not (overwrite and name in asked):
-            raise ConfigError(
-                f"{store.path}: holds flights of {entry.controller} in {entry.scenario} with other seeds, numbers or another"
-                " scenario; give another folder with -o" + ("" if name not in asked else ", or replace them with --overwrite")
-            )
-    missing = []
-    for job in jobs:
-        found = there.get((job.record.label, job.scenario.name))
-        if found is not None and found.key == job.key:
+        job = asked.get(name)
+        if overwrite and job is not None:
             continue
-        if found is not None and not overwrite:
+        if entry.scenario_key != keys.get(entry.scenario, entry.scenario_key):
             raise ConfigError(
-                f"{store.path}: holds flights of another controller called {job.record.label}; label this one"
+                f"{folder}: holds flights of {entry.controller} in {entry.scenario} with other seeds, numbers or another"
+                " scenario; give another folder with -o" + ("" if job is None else ", or replace them with --overwrite")
+            )
+        if job is not None and entry.key != job.key:
+            raise ConfigError(
+                f"{folder}: holds flights of another controller called {entry.controller}; label this one"
                 f" (name={job.spec.spec}), give another folder with -o, or replace them with --overwrite"
             )
-        missing.append(job)
-    return missing
+    return [job for name, job in asked.items() if name not in there or there[name].key != job.key]
 
 
 def _collect(
-    store: ResultFolder,
+    folder: Path,
     before: Results | None,
     suite: Suite,
-    records: list[ControllerRecord],
-    failures: list[Failure],
-    asked: set[str],
+    records: Mapping[str, ControllerRecord],
+    failures: Mapping[str, Sequence[Failure]],
 ) -> Results:
-    from sb3_quad import __version__
-
-    scenarios = {scenario.name: scenario for scenario in suite.scenarios}
-    controllers = {record.label: record for record in records}
-    kept: list[Failure] = []
+    """All that the folder holds by now; what was there before comes first."""
+    flown = {scenario.name: scenario for scenario in suite.scenarios}
+    scenarios, controllers, kept = dict(flown), dict(records), list[Failure]()
     if before is not None:
-        flown_now = set(scenarios)
-        scenarios = {scenario.name: scenario for scenario in before.scenarios} | scenarios
+        scenarios = {scenario.name: scenario for scenario in before.scenarios} | flown
         controllers = {record.label: record for record in before.controllers} | controllers
-        kept = [each for each in before.failures if each.controller not in asked or each.scenario not in {None, *flown_now}]
-    order = {name: number for number, name in enumerate(scenarios)}
-    entries = [entry for entry in store.entries() if entry.scenario in order and entry.controller in controllers]
-    labels = list(controllers)
+        kept = [each for each in before.failures if each.controller not in failures or each.scenario not in {None, *flown}]
+    entries = {(entry.scenario, entry.controller): entry for entry in read_entries(folder)}
     return Results(
         suite=suite.name,
         description=suite.description,
@@ -180,6 +159,67 @@ def _collect(
         package_version=__version__,
         controllers=list(controllers.values()),
         scenarios=list(scenarios.values()),
-        entries=sorted(entries, key=lambda entry: (order[entry.scenario], labels.index(entry.controller))),
-        failures=kept + failures,
+        entries=[entries[key] for key in itertools.product(scenarios, controllers) if key in entries],
+        failures=[*kept, *itertools.chain.from_iterable(failures.values())],
     )
+
+
+def run_job(job: Job) -> Entry | Failure:
+    """Fly, sum up, write; a controller that fails leaves a :class:`Failure`."""
+    label, scenario = job.record.label, job.scenario
+    start = time.perf_counter()
+    try:
+        controller = build(job.spec, scenario.vehicle, job.record.offset)
+        flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None)
+        limit = find_limit(controller, scenario, job.backend) if scenario.hit_search is not None else None
+    except SB3QuadError as error:
+        return _failure(label, scenario.name, error)
+    entry = Entry(
+        controller=label,
+        scenario=scenario.name,
+        key=job.key,
+        scenario_key=job.scenario_key,
+        seed=scenario.seed,
+        backend=job.backend,
+        seconds=round(time.perf_counter() - start, 3),
+        metrics=summarise(flights),
+        hit_limit=limit,
+        flights=flights_path(label, scenario.name),
+    )
+    seeds = np.arange(scenario.seed, scenario.seed + scenario.episodes)
+    write_entry(Path(job.folder), entry, {**episode_arrays(flights, seeds), **trajectories})
+    return entry
+
+
+def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | Failure]]:
+    """Do jobs, one after another or by worker processes, and hand out each as it is done.
+
+    :raises SB3QuadError: a folder that cannot be written.
+    """
+    if workers <= 1 or len(jobs) <= 1:
+        yield from ((job, run_job(job)) for job in jobs)
+        return
+    pool = ProcessPoolExecutor(min(workers, len(jobs)), multiprocessing.get_context("spawn"), _begin_worker)
+    try:
+        waiting = {pool.submit(run_job, job): job for job in jobs}
+        for future in as_completed(waiting):
+            yield waiting[future], future.result()
+    except BrokenProcessPool:
+        raise SB3QuadError("a worker process ended unexpectedly (out of memory?); try --workers 1") from None
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin_worker() -> None:
+    import torch  # takes a second, which the process that started the workers need not wait for
+
+    ignore_interrupts()  # the process that started the workers ends them
+    torch.set_num_threads(1)
+
+
+def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:
+    return Failure(controller=controller, scenario=scenario, message=" ".join(str(error).split()))
+
+
+def _digest(content: Any) -> str:
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.evaluation.intervals import share
 from sb3_quad.evaluation.records import Estimate, HitLimit, HitTrial
 from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.summary import share
 from sb3_quad.scenarios.scenario import Scenario
 
 FIRST_GRID, GRID = 16, 8  # factors that are flown side by side, in the first round and in those after it
@@ -44,8 +44,12 @@ def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> H
     trials = [HitTrial(factor=factor, survived=tried[factor]) for factor in sorted(tried)]
     sure = [trial.factor for trial in trials if trial.survived.low > 0.5 and (lost is None or trial.factor < lost)]
     gone = [trial.factor for trial in trials if trial.survived.high < 0.5 and lost is not None and trial.factor >= lost]
+    factor = None if lost is None else high
+    if lost is not None and low < high:  # where the line between the two shares passes a half
+        above, below = tried[low].value, tried[high].value
+        factor = low + (high - low) * (above - 0.5) / (above - below)
     return HitLimit(
-        factor=None if lost is None else _half(low, high, tried),
+        factor=factor,
         low=max(sure, default=0.0),
         high=min(gone, default=None),
         force=max(wrench.force.largest for wrench in scenario.wrenches),
@@ -60,9 +64,3 @@ def _survival(controller: Any, scenario: Scenario, grid: Any, episodes: int, bac
     flights, _ = fly_scenario(controller, scenario, backend, seeds, factors)
     rows = flights.success.reshape(len(grid), episodes)
     return {float(factor): share(row) for factor, row in zip(grid, rows, strict=True)}
-
-
-def _half(low: float, high: float, tried: dict[float, Estimate]) -> float:
-    """Where the line between the survival shares of two factors passes a half; 0 if half are lost without any hit."""
-    above, below = tried[low].value, tried[high].value
-    return low + (high - low) * (above - 0.5) / (above - below) if low < high else high

@@ -1,35 +1,29 @@
 """What an evaluation leaves behind, as validated objects: ``results.json`` is one :class:`Results`.
 
-A folder of results:
+A folder of results holds
 
-==========================================  ==========================================================================
-file                                        what
-==========================================  ==========================================================================
-results.json                                :class:`Results`: scenarios, controllers, figures with their intervals
-episodes.csv                                one line per flight: seed, start, outcome, times, path, final error
-flights/<controller>/<scenario>.json        one :class:`Entry`, written when its flights are done
-flights/<controller>/<scenario>.npz         the same flights in numbers, and the sampled trajectories (``flightlog.py``)
-==========================================  ==========================================================================
+- ``results.json``, a :class:`Results`: scenarios, controllers, metrics with their intervals;
+- ``episodes.csv``, one line per flight: seed, start, outcome, times, path, final error;
+- ``flights/<controller>/<scenario>.json``, an :class:`Entry`, written when its flights are done;
+- ``flights/<controller>/<scenario>.npz``, the same flights in numbers, and the sampled trajectories (``flightlog.py``).
+
+A number that does not exist is None, never NaN.
 """
 
 from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import ConfigDict, Field
 
+from sb3_quad.base.validate import Frozen
 from sb3_quad.scenarios.scenario import Scenario
 
 SCHEMA_VERSION: Literal[1] = 1
+Vector = tuple[float, float, float]
 
 
-class Record(BaseModel):
-    """Base of all records: frozen, no unknown keys. Numbers that there are none of are None, never NaN."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Estimate(Record):
+class Estimate(Frozen):
     """A mean or a share with its 95 % interval: Wilson's for shares, the bootstrap percentiles for means."""
 
     value: float
@@ -38,7 +32,7 @@ class Estimate(Record):
     n: int = Field(description="flights it is taken over")
 
 
-class Arrival(Record):
+class Arrival(Frozen):
     """Arrival within one tolerance."""
 
     tolerance: float = Field(description="m")
@@ -46,7 +40,7 @@ class Arrival(Record):
     time: Estimate | None = Field(description="mean time of those flights, s; None: no flight arrived")
 
 
-class Course(Record):
+class Course(Frozen):
     """A course of waypoints."""
 
     reached: Estimate = Field(description="mean number of waypoints reached")
@@ -54,8 +48,8 @@ class Course(Record):
     time: Estimate | None = Field(description="mean time until the last waypoint of those flights, s")
 
 
-class Figures(Record):
-    """The figures of one controller in one scenario; path and errors are of the flights that were not lost."""
+class Metrics(Frozen):
+    """What one controller reached in one scenario; path and errors are of the flights that were not lost."""
 
     n: int = Field(description="flights")
     success: Estimate = Field(description="share that neither touched the ground nor left the range")
@@ -68,18 +62,18 @@ class Figures(Record):
     final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
     final_error_median: float | None = Field(description="m")
     final_error_max: float | None = Field(description="m")
-    final_offset: tuple[float, float, float] | None = Field(description="mean r - r_T at the end, world frame, m")
+    final_offset: Vector | None = Field(description="mean r - r_T at the end, world frame, m")
     course: Course | None = Field(default=None, description="of scenarios with waypoints")
 
 
-class HitTrial(Record):
+class HitTrial(Frozen):
     """The flights with one factor of the wrenches."""
 
     factor: float
     survived: Estimate
 
 
-class HitLimit(Record):
+class HitLimit(Frozen):
     """How large the wrenches of a scenario may get: the factor at which half of the flights are lost."""
 
     factor: float | None = Field(description="None: more than half survive even the greatest factor tried")
@@ -90,7 +84,7 @@ class HitLimit(Record):
     trials: list[HitTrial] = Field(description="all factors tried, rising")
 
 
-class ControllerRecord(Record):
+class ControllerRecord(Frozen):
     """Who flew."""
 
     label: str = Field(description="column title; unique in a folder")
@@ -99,13 +93,15 @@ class ControllerRecord(Record):
     algorithm: str | None = Field(description="SB3 class that loaded a zip")
     content: str = Field(description="SHA-256 of the zip, or of the source and version of an expert or factory")
     scaling: Literal["none", "adaptive"] = Field(description="of its observation (4.3.1)")
-    offset: tuple[float, float, float] | None = Field(
+    offset: Vector | None = Field(
         default=None, description="with adaptive scaling: the position components of μ, measured beforehand, m"
     )
 
 
-class Entry(Record):
+class Entry(Frozen):
     """One controller in one scenario."""
+
+    model_config = ConfigDict(populate_by_name=True)
 
     controller: str = Field(description="label")
     scenario: str = Field(description="name")
@@ -114,12 +110,17 @@ class Entry(Record):
     seed: int = Field(description="of episode 0; episode k has seed + k")
     backend: str
     seconds: float = Field(description="wall-clock time it took")
-    figures: Figures
+    metrics: Metrics = Field(validation_alias="figures", serialization_alias="figures")  # the key in files
     hit_limit: HitLimit | None = None
     flights: str = Field(description="path of the .npz, relative to the folder")
 
+    @property
+    def figures(self) -> Metrics:
+        """The metrics, by the name that files give them."""
+        return self.metrics
 
-class Failure(Record):
+
+class Failure(Frozen):
     """A controller that could not be loaded, or did not get through a scenario."""
 
     controller: str
@@ -127,13 +128,13 @@ class Failure(Record):
     message: str
 
 
-class Results(Record):
+class Results(Frozen):
     """A folder of results."""
 
     schema_version: Literal[1] = SCHEMA_VERSION
     suite: str
     description: str
-    source: str = Field(default="reference", description="where the scenarios' reference figures come from")
+    source: str = Field(default="reference", description="where the scenarios' reference comes from")
     package_version: str
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]

@@ -8,7 +8,7 @@ from typing import Any
 from sb3_quad.base.arrays import Arrays, FloatArray
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import Flights, Plan, fly_fleet, make_fleet
-from sb3_quad.scenarios.draw import Episodes, draw_episodes, wrench_changes
+from sb3_quad.scenarios.sample import Episodes, sample_episodes
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
 
@@ -41,7 +41,7 @@ def fly_scenario(
     parts, trajectories = [], None
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
-        episodes = draw_episodes(scenario, chosen[part], None if factors is None else factors[part])
+        episodes = sample_episodes(scenario, chosen[part], None if factors is None else factors[part])
         recorder = Recorder(min(recorded, len(episodes.seeds)), episodes.steps) if recorded and first == 0 else None
         settings, plan = flown_as(episodes)
         fleet = make_fleet(backend, episodes.seeds, settings)
@@ -59,5 +59,4 @@ def flown_as(episodes: Episodes) -> tuple[FlightSettings, Plan]:
     settings = FlightSettings(
         task=episodes.task, vehicle=episodes.vehicle, noise=episodes.noise, max_episode_steps=episodes.steps
     )
-    wrenches = wrench_changes(episodes.wrenches, episodes.steps) if episodes.wrenches else {}
-    return settings, Plan(episodes.start, wrenches, episodes.waypoints, episodes.radius)
+    return settings, Plan(episodes.start, episodes.wrenches, episodes.waypoints, episodes.radius)

@@ -1,23 +1,29 @@
-"""The figures of many flights in a few numbers."""
+"""Many flights in a few metrics, with 95 % intervals: Wilson's for shares, the bootstrap for means."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+import math
 
 import numpy as np
+import numpy.typing as npt
 
-from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.intervals import mean, share
-from sb3_quad.evaluation.records import Arrival, Course, Estimate, Figures
+from sb3_quad.evaluation.flights import Flights
+from sb3_quad.evaluation.records import Arrival, Course, Estimate, Metrics
+
+Z = 1.959963984540054  # 97.5 % of the normal distribution lie below
+RESAMPLES = 1000
 
 
-def summarise(flights: Flights) -> Figures:
-    """The figures of some flights, at least one."""
+def summarise(flights: Flights) -> Metrics:
+    """The metrics of some flights, at least one."""
     done = flights.success
     error, offset = flights.final_error[done], flights.final_offset[done]
-    some = bool(done.any())
-    return Figures(
+    some, reached = bool(done.any()), np.isfinite(flights.waypoint_times)
+    course = None
+    if reached.shape[1]:
+        times = mean(flights.waypoint_times[:, -1])
+        course = Course(reached=_present(mean(reached.sum(axis=1))), completed=share(reached.all(axis=1)), time=times)
+    return Metrics(
         n=flights.n,
         success=share(done),
         collisions=int(flights.collision.sum()),
@@ -33,28 +39,40 @@ def summarise(flights: Flights) -> Figures:
         final_error_median=float(np.median(error)) if some else None,
         final_error_max=float(error.max()) if some else None,
         final_offset=tuple(offset.mean(axis=0).tolist()) if some else None,
-        course=_course(flights) if flights.waypoint_times.shape[1] else None,
+        course=course,
     )
 
 
-def fly_all(pilots: Mapping[str, Any], task: Any, n_episodes: int, seed: int, **keywords: Any) -> dict[str, Figures]:
-    """The figures of several controllers on the same episodes, by name.
+def share(hits: npt.ArrayLike) -> Estimate:
+    """The share of True with Wilson's score interval (Wilson, JASA 22, 1927).
 
-    :param keywords: further arguments of :func:`~sb3_quad.evaluation.flights.fly`, such as ``vehicle``.
+    :param hits: bool, (n,), n at least 1.
     """
-    return {name: summarise(fly(pilot, task, n_episodes, seed, **keywords)) for name, pilot in pilots.items()}
+    array = np.asarray(hits, dtype=np.bool_)
+    n = array.size
+    p = float(array.mean())
+    centre, half = p + Z * Z / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
+    scale = 1 + Z * Z / n
+    return Estimate(value=p, low=min(p, (centre - half) / scale), high=max(p, (centre + half) / scale), n=n)
 
 
-def _course(flights: Flights) -> Course:
-    reached = np.isfinite(flights.waypoint_times)
-    return Course(
-        reached=_present(mean(reached.sum(axis=1))),
-        completed=share(reached.all(axis=1)),
-        time=mean(flights.waypoint_times[:, -1]),
-    )
+def mean(values: npt.ArrayLike) -> Estimate | None:
+    """The mean of the finite values with the percentile bootstrap's interval (Efron, 1979); None if there are none.
+
+    The same values give the same interval: the resamples are those of a fixed seed.
+    """
+    array = np.asarray(values, dtype=np.float64)
+    array = array[np.isfinite(array)]
+    n = array.size
+    if n == 0:
+        return None
+    middle = float(array.mean())
+    rows = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
+    low, high = np.percentile(array[rows].mean(axis=1), [2.5, 97.5])
+    return Estimate(value=middle, low=min(middle, float(low)), high=max(middle, float(high)), n=n)
 
 
 def _present(estimate: Estimate | None) -> Estimate:
     if estimate is None:
-        raise ValueError("no flight has a finite figure")
+        raise ValueError("no flight has a finite value")
     return estimate

@@ -8,8 +8,8 @@ from itertools import groupby
 from rich.markup import escape
 from rich.table import Table
 
-from sb3_quad.evaluation.records import Arrival, Estimate, Figures, HitLimit, Results
-from sb3_quad.scenarios.scenario import Figure, Reference, Scenario
+from sb3_quad.evaluation.records import Arrival, Estimate, HitLimit, Metrics, Results
+from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 from sb3_quad.scenarios.vary import axis_name
 
 SUCCESS, REWARD, PATH, MEDIAN, LARGEST = "success", "mean reward", "mean path", "final error, median", "final error, largest"
@@ -26,7 +26,7 @@ def time_row(tolerance: float | str) -> str:
     return f"mean time to {float(tolerance):g} m"
 
 
-def rows(figures: Figures, limit: HitLimit | None = None) -> dict[str, str]:
+def rows(figures: Metrics, limit: HitLimit | None = None) -> dict[str, str]:
     """Figures as text, by the names of the rows; each with its 95 % interval, where that is wider than the last digit."""
     cells = {SUCCESS: _share(figures.success), REWARD: _mean(figures.reward), FLOWN: _mean(figures.flown, " s")}
     cells |= {time_row(arrival.tolerance): _arrival(arrival) for arrival in figures.arrivals}
@@ -68,7 +68,7 @@ def shown_rows(scenario: Scenario) -> list[str]:
     return names + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
 
 
-def comparison(title: str, columns: Mapping[str, Figures], scenario: Scenario, only: Iterable[str] | None = None) -> Table:
+def comparison(title: str, columns: Mapping[str, Metrics], scenario: Scenario, only: Iterable[str] | None = None) -> Table:
     """A table of controllers side by side in one scenario, and the columns of its reference figures.
 
     :param columns: from the name of each controller to its figures.
@@ -112,7 +112,7 @@ def overview(results: Results, controllers: Sequence[str], source: str = "refere
 
 def _add_scenario(table: Table, results: Results, scenario: Scenario, controllers: Sequence[str], referenced: bool) -> None:
     entries = [results.entry(label, scenario.name) for label in controllers]
-    cells = [rows(entry.figures, entry.hit_limit) if entry is not None else None for entry in entries]
+    cells = [rows(entry.metrics, entry.hit_limit) if entry is not None else None for entry in entries]
     others = {name: reference_rows(reference) for name, reference in scenario.reference.items()}
     cell = ", ".join(f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items())
     names = shown_rows(scenario)
@@ -151,7 +151,7 @@ def _limit(limit: HitLimit) -> tuple[str, str]:
     return f"{factor:.2f} x ({limit.low:.2f}-{high})", size
 
 
-def _figure(figure: Figure, unit: str) -> str:
+def _figure(figure: NumberOrRange, unit: str) -> str:
     values = figure if isinstance(figure, tuple) else (figure,)
     return "-".join(_percent(value) if unit == " %" else f"{value:g}" for value in values) + unit
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.records import Estimate, Figures
+from sb3_quad.evaluation.records import Estimate, Metrics
 from sb3_quad.evaluation.summary import summarise
 
 FIRST_SEED = 20_000_000  # of the judged episodes; far from any that a training or the tables of the docs have seen
@@ -29,7 +29,7 @@ class Origin:
     facts: Mapping[str, str]
 
 
-def measure(policy: Any, n_episodes: int = N_EPISODES, **settings: Any) -> dict[str, Figures]:
+def measure(policy: Any, n_episodes: int = N_EPISODES, **settings: Any) -> dict[str, Metrics]:
     """The rows of the table, by name: recoveries, then targets at each distance.
 
     :param settings: ``vehicle``, ``noise`` and ``observation_std``, as :func:`~sb3_quad.evaluation.flights.fly` takes them.
@@ -43,7 +43,7 @@ def measure(policy: Any, n_episodes: int = N_EPISODES, **settings: Any) -> dict[
     return rows
 
 
-def write_card(name: str, rows: Mapping[str, Figures], origin: Origin, settings: Mapping[str, Any]) -> str:
+def write_card(name: str, rows: Mapping[str, Metrics], origin: Origin, settings: Mapping[str, Any]) -> str:
     """The card of a policy, Markdown."""
     vehicle, noise = settings["vehicle"], settings["noise"]
     return "\n".join(
@@ -82,12 +82,12 @@ def write_card(name: str, rows: Mapping[str, Figures], origin: Origin, settings:
     )
 
 
-def _counts(rows: Mapping[str, Figures]) -> str:
+def _counts(rows: Mapping[str, Metrics]) -> str:
     targets = [figures.n for row, figures in rows.items() if row != RECOVERY]
     return f"{rows[RECOVERY].n:,} fresh recoveries and {targets[0]:,} fresh targets at each distance"
 
 
-def _table(rows: Mapping[str, Figures]) -> Sequence[str]:
+def _table(rows: Mapping[str, Metrics]) -> Sequence[str]:
     lines = [
         f"| | success | mean reward | time to {NEAR:g} m | final error: median | largest |",
         "|---|---|---|---|---|---|",

@@ -72,11 +72,11 @@ def _arrivals(scenario: Scenario, flown: Sequence[Flown], source: str) -> BarFig
     """Mean times to each tolerance, cf. Figs. 4.6 and 4.7."""
     groups = []
     for each in flown:
-        times = [arrival.time for arrival in each.entry.figures.arrivals]
+        times = [arrival.time for arrival in each.entry.metrics.arrivals]
         values, low, high = (
             np.array([np.nan if time is None else getattr(time, name) for time in times]) for name in ("value", "low", "high")
         )
-        notes = [f"({100 * arrival.share.value:.3g} % of flights)" for arrival in each.entry.figures.arrivals]
+        notes = [f"({100 * arrival.share.value:.3g} % of flights)" for arrival in each.entry.metrics.arrivals]
         groups.append(BarGroup(each.label, each.colour, values, low, high, notes))
     names = [f"{tolerance:g}" for tolerance in scenario.tolerances]
     references = []
@@ -185,7 +185,7 @@ def _sweep(group: str, key: str, scenarios: Sequence[Scenario], flown: Sequence[
     success, error = [], []
     for label, colour in _controllers(flown):
         cells = [
-            (scenario.cell[key], each.entry.figures)
+            (scenario.cell[key], each.entry.metrics)
             for scenario, entries in zip(scenarios, flown, strict=True)
             for each in entries
             if each.label == label
@@ -232,7 +232,7 @@ def _heat_map(group: str, keys: Sequence[str], scenarios: Sequence[Scenario], fl
             for each in entries:
                 if each.label == label:
                     place = y_values.index(scenario.cell[keys[1]]), x_values.index(scenario.cell[keys[0]])
-                    grid[place] = 100.0 * each.entry.figures.success.value
+                    grid[place] = 100.0 * each.entry.metrics.success.value
     names = ", ".join(axis_name(key).replace("_", " ") for key in keys)
     return HeatFigure(
         f"{group}_success",

@@ -75,7 +75,7 @@ def render(results: Results, parts: list[Section], with_pictures: bool) -> str:
             figure.name for section in parts for figure in section.figures if isinstance(figure, LineFigure) and figure.marks
         },
         colours=colours_of([record.label for record in results.controllers]),
-        flights=sum(entry.figures.n for entry in results.entries),
+        flights=sum(entry.metrics.n for entry in results.entries),
         backends=sorted({entry.backend for entry in results.entries}),
         pictures=PICTURES if with_pictures else "",
         figures_json=_for_script(kept),

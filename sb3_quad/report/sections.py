@@ -90,7 +90,7 @@ def _overview(results: Results, colours: dict[str, str], source: str) -> Section
         cells = []
         for label in colours:
             entries = [results.entry(label, scenario.name) for scenario in scenarios]
-            shares = [entry.figures.success for entry in entries if entry is not None]
+            shares = [entry.metrics.success for entry in entries if entry is not None]
             if not shares:
                 cells.append(Cell(words="failed"))
             elif len(scenarios) == 1:
@@ -118,7 +118,7 @@ def _sweep_table(results: Results, scenarios: Sequence[Scenario], colours: dict[
     rows = []
     for scenario in scenarios:
         entries = [results.entry(label, scenario.name) for label in colours]
-        cells = [Cell(words="failed") if each is None else estimate_cell(each.figures.success, 1, 100.0) for each in entries]
+        cells = [Cell(words="failed") if each is None else estimate_cell(each.metrics.success, 1, 100.0) for each in entries]
         (key, value) = next(iter(scenario.cell.items()))
         rows.append(Row(f"{value:g}", "", mark_best(SUCCESS, cells)))
     corner = f"{axis_label(key).replace('_', ' ')}: success (%)"

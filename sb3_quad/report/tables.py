@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from sb3_quad.evaluation.records import Entry, Estimate, Figures, HitLimit
+from sb3_quad.evaluation.records import Entry, Estimate, HitLimit, Metrics
 from sb3_quad.evaluation.tables import (
     COMPLETED,
     COURSE_TIME,
@@ -21,7 +21,7 @@ from sb3_quad.evaluation.tables import (
     shown_rows,
     time_row,
 )
-from sb3_quad.scenarios.scenario import Figure, Reference, Scenario
+from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 
 UNITS = {SUCCESS: "%", FLOWN: "s", PATH: "m", MEDIAN: "m", LARGEST: "m", COMPLETED: "%", COURSE_TIME: "s", HIT: "×"}
 DECIMALS = {SUCCESS: 1, MEDIAN: 3, LARGEST: 3, COMPLETED: 1}
@@ -104,11 +104,11 @@ def scenario_table(scenario: Scenario, entries: Sequence[tuple[str, str, Entry |
     :param entries: label, colour and results of each controller; None: it failed.
     :param source: where reference figures come from.
     """
-    found = [_cells(entry.figures, entry.hit_limit) if entry is not None else None for _, _, entry in entries]
+    found = [_cells(entry.metrics, entry.hit_limit) if entry is not None else None for _, _, entry in entries]
     others = {name: reference_cells(reference) for name, reference in scenario.reference.items()}
     rows = []
     left_out = _left_out(scenario)
-    none_lost = all(entry is None or entry.figures.success.value == 1.0 for _, _, entry in entries)
+    none_lost = all(entry is None or entry.metrics.success.value == 1.0 for _, _, entry in entries)
     for name in shown_rows(scenario):
         if name in left_out or not any(cells and name in cells for cells in found):
             continue
@@ -160,7 +160,7 @@ def _ends(cell: Cell) -> tuple[float, float] | None:
     return (cell.value if cell.low is None else cell.low), (cell.value if cell.high is None else cell.high)
 
 
-def _cells(figures: Figures, limit: HitLimit | None) -> dict[str, Cell]:
+def _cells(figures: Metrics, limit: HitLimit | None) -> dict[str, Cell]:
     cells = {
         SUCCESS: estimate_cell(figures.success, 1, 100.0),
         REWARD: estimate_cell(figures.reward),
@@ -204,7 +204,7 @@ def reference_cells(reference: Reference) -> dict[str, Cell]:
     return cells
 
 
-def _figure(name: str, figure: Figure) -> Cell:
+def _figure(name: str, figure: NumberOrRange) -> Cell:
     factor = 100.0 if name == SUCCESS else 1.0
     if isinstance(figure, tuple):
         return Cell(words=" to ".join(f"{factor * value:g}" for value in figure).replace("-", "−"))

@@ -3,51 +3,49 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, ValidationInfo, field_validator, model_validator
 
 from sb3_quad.base.errors import unknown
-from sb3_quad.base.quantities import Finite
+from sb3_quad.base.validate import Frozen
 from sb3_quad.vehicles.vehicle import Vehicle
 
-Vector = tuple[Finite, Finite, Finite]
-NotNegative = Annotated[Finite, Field(ge=0)]
-Positive = Annotated[Finite, Field(gt=0)]
+Vector = tuple[float, float, float]
 Frame = Literal["world", "body"]
+Factor = Annotated[float, Field(ge=0.1, le=10)]
 
 
-class Part(BaseModel):
-    """Base of all parts: frozen, and unknown keys are refused."""
+class OneOf(Frozen):
+    """A part with several ways to be given, of which a file uses exactly one; a list alone is the first way."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-def _exactly_one(part: Part, names: tuple[str, ...]) -> None:
-    given = [name for name in names if getattr(part, name) is not None]
-    if len(given) != 1:
-        raise ValueError(f"give exactly one of {', '.join(names)}" + (f", not {' and '.join(given)}" if given else ""))
-
-
-class Draw(Part):
-    """A vector: fixed, written as ``[x, y, z]``, or drawn anew for each episode.
-
-    ``{std: 2}`` is normal in each component, ``{magnitude: 3}`` has that length and a uniformly random direction.
-    """
-
-    value: Vector | None = Field(default=None, description="the vector itself, in the unit of what it is for")
-    std: NotNegative | None = Field(default=None, description="standard deviation of each component, in the same unit")
-    magnitude: NotNegative | None = Field(default=None, description="length, in the same unit; the direction is random")
+    ways: ClassVar[tuple[str, ...]]
 
     @model_validator(mode="before")
     @classmethod
     def _from_list(cls, data: Any) -> Any:
-        return {"value": data} if isinstance(data, (list, tuple)) else data
+        return {cls.ways[0]: data} if isinstance(data, (list, tuple)) else data
 
     @model_validator(mode="after")
-    def _one(self) -> Draw:
-        _exactly_one(self, ("value", "std", "magnitude"))
+    def _exactly_one(self) -> OneOf:
+        given = [name for name in self.ways if getattr(self, name) is not None]
+        if len(given) != 1:
+            but = f", not {' and '.join(given)}" if given else ""
+            raise ValueError(f"give exactly one of {', '.join(self.ways)}{but}")
         return self
+
+
+class VectorDistribution(OneOf):
+    """A vector: fixed, written as ``[x, y, z]``, or sampled anew for each episode.
+
+    ``{std: 2}`` is normal in each component, ``{magnitude: 3}`` has that length and a uniformly random direction.
+    """
+
+    ways = ("value", "std", "magnitude")
+
+    value: Vector | None = Field(default=None, description="the vector itself, in the unit of what it is for")
+    std: NonNegativeFloat | None = Field(default=None, description="standard deviation of each component, in the same unit")
+    magnitude: NonNegativeFloat | None = Field(default=None, description="length, in the same unit; the direction is random")
 
     @property
     def largest(self) -> float:
@@ -57,16 +55,18 @@ class Draw(Part):
         return self.magnitude if self.magnitude is not None else 3.0 * math.sqrt(3.0) * (self.std or 0.0)
 
 
-ZERO = Draw(value=(0.0, 0.0, 0.0))
+ZERO = VectorDistribution(value=(0.0, 0.0, 0.0))
 
 
-class Attitude(Part):
+class Attitude(OneOf):
     """The attitude at the start: ``level``, ``uniform`` on SO(3), ``{quaternion: [w, x, y, z]}`` or ``{tilt: 60}``."""
 
-    quaternion: tuple[Finite, Finite, Finite, Finite] | None = Field(
+    ways = ("quaternion", "tilt", "distribution")
+
+    quaternion: tuple[float, float, float, float] | None = Field(
         default=None, description="w, x, y, z, body to world; is normalised"
     )
-    tilt: Annotated[Finite, Field(ge=0, le=180)] | None = Field(
+    tilt: Annotated[float, Field(ge=0, le=180)] | None = Field(
         default=None, description="angle between body z and world z, deg; about a random horizontal axis"
     )
     distribution: Literal["uniform"] | None = Field(default=None, description="uniform on SO(3), as in state recovery")
@@ -80,12 +80,7 @@ class Attitude(Part):
             return {"distribution": "uniform"}
         if isinstance(data, str):
             raise ValueError(f"{unknown('attitude', data, ('level', 'uniform'))}, or {{quaternion: …}}, or {{tilt: …}}")
-        return {"quaternion": data} if isinstance(data, (list, tuple)) else data
-
-    @model_validator(mode="after")
-    def _one(self) -> Attitude:
-        _exactly_one(self, ("quaternion", "tilt", "distribution"))
-        return self
+        return data
 
     @field_validator("quaternion")
     @classmethod
@@ -95,58 +90,50 @@ class Attitude(Part):
         return value
 
 
-class Start(Part):
+class Start(Frozen):
     """Where and how an episode starts; rotors turn at hover speed."""
 
     position: Vector = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
     attitude: Attitude = Field(default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}")
-    velocity: Draw = Field(default=ZERO, description="world frame, m/s: [x, y, z], {std: …} or {magnitude: …}")
-    body_rates: Draw = Field(default=ZERO, description="body frame, rad/s: [x, y, z], {std: …} or {magnitude: …}")
+    velocity: VectorDistribution = Field(default=ZERO, description="world frame, m/s: [x, y, z], {std: …} or {magnitude: …}")
+    body_rates: VectorDistribution = Field(
+        default=ZERO, description="body frame, rad/s: [x, y, z], {std: …} or {magnitude: …}"
+    )
 
-    @field_validator("body_rates")
+    @field_validator("velocity", "body_rates")
     @classmethod
-    def _radians(cls, value: Draw) -> Draw:
-        if value.largest > 200.0:
-            raise ValueError(f"{value.largest:g} is beyond 200 rad/s; the unit is rad/s, not deg/s")
-        return value
-
-    @field_validator("velocity")
-    @classmethod
-    def _metres_per_second(cls, value: Draw) -> Draw:
-        if value.largest > 100.0:
-            raise ValueError(f"{value.largest:g} is beyond 100 m/s; the unit is m/s")
+    def _in_si_units(cls, value: VectorDistribution, info: ValidationInfo) -> VectorDistribution:
+        most, unit = (100.0, "m/s") if info.field_name == "velocity" else (200.0, "rad/s, not deg/s")
+        if value.largest > most:
+            raise ValueError(f"{value.largest:g} is beyond {most:g}; the unit is {unit}")
         return value
 
 
-class Target(Part):
+class Target(OneOf):
     """Where to fly: ``[x, y, z]``, ``{distance: 10}`` in a random direction, or ``{waypoints: [[x, y, z], …]}``."""
 
+    ways = ("position", "distance", "waypoints")
+
     position: Vector | None = Field(default=None, description="r_T, world frame, m")
-    distance: NotNegative | None = Field(
+    distance: NonNegativeFloat | None = Field(
         default=None, description="from the start in a uniformly random direction above ground, m; 0: the start itself"
     )
     waypoints: tuple[Vector, ...] | None = Field(
         default=None, min_length=1, description="targets one after the other, world frame, m"
     )
-    radius: Positive | None = Field(
+    radius: PositiveFloat | None = Field(
         default=None, description="the next waypoint is the target once |r - r_T| is within this, m (0.5)"
     )
 
-    @model_validator(mode="before")
-    @classmethod
-    def _from_list(cls, data: Any) -> Any:
-        return {"position": data} if isinstance(data, (list, tuple)) else data
-
     @model_validator(mode="after")
-    def _one(self) -> Target:
-        _exactly_one(self, ("position", "distance", "waypoints"))
+    def _radius_with_waypoints(self) -> Target:
         if self.radius is not None and self.waypoints is None:
             raise ValueError("radius goes with waypoints; the tolerances of a single target are the scenario's tolerances")
         return self
 
     @property
     def points(self) -> tuple[Vector, ...]:
-        """The fixed targets, in order; none if the target is drawn."""
+        """The fixed targets, in order; none if the target is random."""
         return self.waypoints if self.waypoints is not None else () if self.position is None else (self.position,)
 
     @property
@@ -155,35 +142,32 @@ class Target(Part):
         return 0.5 if self.radius is None else self.radius
 
 
-class Wrench(Part):
+class Wrench(Frozen):
     """An external force and torque at the centre of mass for some time; those that overlap add up."""
 
-    start: NotNegative = Field(default=0.0, description="when it begins, s")
-    duration: Positive | None = Field(default=None, description="how long it acts, s; left out: to the end")
-    force: Draw = Field(default=ZERO, description="N: [x, y, z], {std: …} or {magnitude: …}")
-    torque: Draw = Field(default=ZERO, description="N m: [x, y, z], {std: …} or {magnitude: …}")
+    start: NonNegativeFloat = Field(default=0.0, description="when it begins, s")
+    duration: PositiveFloat | None = Field(default=None, description="how long it acts, s; left out: to the end")
+    force: VectorDistribution = Field(default=ZERO, description="N: [x, y, z], {std: …} or {magnitude: …}")
+    torque: VectorDistribution = Field(default=ZERO, description="N m: [x, y, z], {std: …} or {magnitude: …}")
     force_frame: Frame = Field(default="world", description="world or body: the axes of force")
     torque_frame: Frame = Field(default="body", description="world or body: the axes of torque")
 
 
-class VehicleChanges(Part):
+class VehicleChanges(Frozen):
     """How the vehicle that flies differs from the one its controller was made for; motors and limits stay what they are."""
 
-    mass: Positive = Field(default=1.0, description="factor of the mass; thrust limits in N stay")
-    inertia: Positive | tuple[Positive, Positive, Positive] = Field(
+    mass: Factor = Field(
+        default=1.0, description="is a factor: 1.3 is 30 % more than the vehicle's own; thrust limits in N stay"
+    )
+    inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         default=1.0, description="factor of Ixx, Iyy and Izz, or one for each"
     )
-    motor_gain: Positive = Field(default=1.0, description="factor of k_m (Eq. 4.1)")
+    motor_gain: Factor = Field(
+        default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more than the vehicle's own"
+    )
     delay: Annotated[int, Field(ge=0, le=100)] | None = Field(
         default=None, description="control steps from a command to its effect; left out: the vehicle's own"
     )
-
-    @field_validator("mass", "motor_gain")
-    @classmethod
-    def _factor(cls, value: float) -> float:
-        if not 0.1 <= value <= 10.0:
-            raise ValueError(f"{value:g} is a factor, from 0.1 to 10: 1.3 is 30 % more than the vehicle's own")
-        return value
 
     def apply(self, vehicle: Vehicle) -> Vehicle:
         """The changed vehicle.

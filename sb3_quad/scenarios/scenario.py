@@ -4,34 +4,35 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.quantities import Finite
-from sb3_quad.scenarios.parts import Part, Positive, Start, Target, VehicleChanges, Wrench
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.base.seeds import SUITE
+from sb3_quad.base.validate import Frozen, explain, validate
+from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
+from sb3_quad.vehicles.vehicle import Vehicle, is_vehicle_file, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
-Figure = Finite | tuple[Finite, Finite]
-TimeTo = Figure | None
+NumberOrRange = float | tuple[float, float]
 
 
-class Reference(Part):
-    """Figures from elsewhere, printed beside the measured ones; a pair is a range."""
+class Reference(Frozen):
+    """What others measured, printed beside our own metrics; a pair is a range."""
 
-    success: Figure | None = Field(default=None, description="share of flights, 0 to 1")
-    reward: Figure | None = Field(default=None, description="mean per episode")
-    time_to: dict[str, TimeTo] = Field(
+    success: NumberOrRange | None = Field(default=None, description="share of flights, 0 to 1")
+    reward: NumberOrRange | None = Field(default=None, description="mean per episode")
+    time_to: dict[str, NumberOrRange | None] = Field(
         default_factory=dict, description="from tolerances in m to mean times in s; null: never within it"
     )
-    path: Figure | None = Field(default=None, description="mean path, m")
-    final_error: Figure | None = Field(default=None, description="|r - r_T| at the end, m")
-    flown: Figure | None = Field(default=None, description="until the flight ended, s")
+    path: NumberOrRange | None = Field(default=None, description="mean path, m")
+    final_error: NumberOrRange | None = Field(default=None, description="|r - r_T| at the end, m")
+    flown: NumberOrRange | None = Field(default=None, description="until the flight ended, s")
     note: str = Field(default="", description="what the source says in words")
 
     @field_validator("time_to", mode="before")
@@ -40,51 +41,37 @@ class Reference(Part):
         return {f"{key:g}" if isinstance(key, float) else str(key): time for key, time in dict(value).items()}
 
 
-class HitSearch(Part):
+class HitSearch(Frozen):
     """Search for the factor of all wrenches, force and torque alike, at which half of the flights are lost."""
 
-    largest: Positive = Field(default=16.0, description="greatest factor that is tried")
-    resolution: Annotated[Finite, Field(gt=0, lt=1)] = Field(default=0.02, description="width of the answer, in its own size")
-    episodes: Annotated[int, Field(ge=1)] = Field(default=120, description="flights per factor")
+    largest: PositiveFloat = Field(default=16.0, description="greatest factor that is tried")
+    resolution: Annotated[float, Field(gt=0, lt=1)] = Field(default=0.02, description="width of the answer, in its own size")
+    episodes: PositiveInt = Field(default=120, description="flights per factor")
 
 
-class Scenario(Part):
+class Scenario(Frozen):
     """What is flown, how often, and what others measured there. Units m, s, rad, N, N m, kg."""
 
     name: str = Field(pattern=NAME, description="letters, digits, _ . -; unique in its suite")
-    title: str = Field(default="", description="heading of tables and figures; left out: the name")
+    title: str = Field(default="", description="heading of tables and plots; left out: the name")
     description: str = Field(default="", description="what it is, and where it comes from")
     start: Start = Field(default=Start(), description="where an episode starts; left out: hovering at (0, 0, 15) m")
     target: Target = Field(default=Target(distance=0.0), description="where to fly; left out: to the start")
     wrenches: tuple[Wrench, ...] = Field(default=(), description="external forces and torques")
-    noise: Annotated[Finite, Field(ge=0)] = Field(
-        default=0.05, description="relative std of the observation noise: 0.05 is 5 %"
+    noise: Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.05, description="relative std of the observation noise, a share: 0.05 is 5 %"
     )
-    duration: Positive = Field(default=15.0, description="of an episode, s")
-    max_distance: Positive = Field(default=30.0, description="farther than this from the target ends an episode, m")
+    duration: Annotated[float, Field(gt=0, le=600)] = Field(default=15.0, description="of an episode; the unit is s")
+    max_distance: PositiveFloat = Field(default=30.0, description="farther than this from the target ends an episode, m")
     vehicle: str = Field(default="itm", description="name, or path of a YAML file (relative to the suite's)")
     vehicle_changes: VehicleChanges = Field(default=VehicleChanges(), description="unknown to the controller")
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(default=240, description="how many are flown")
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=2**19, description="episode k is drawn from seed + k")
-    tolerances: tuple[Positive, ...] = Field(default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=SUITE, description="episode k is sampled from seed + k")
+    tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m")
     hit_search: HitSearch | None = Field(default=None, description="find how large the wrenches may get")
-    reference: dict[str, Reference] = Field(default_factory=dict, description="from a column's title to others' figures")
+    reference: dict[str, Reference] = Field(default_factory=dict, description="from a column's title to others' metrics")
     group: str | None = Field(default=None, description="the scenario that this one is a cell of; set by vary")
     cell: dict[str, float] = Field(default_factory=dict, description="this cell's values, by key; set by vary")
-
-    @field_validator("duration")
-    @classmethod
-    def _seconds(cls, value: float) -> float:
-        if value > 600.0:
-            raise ValueError(f"{value:g} is beyond 600 s; the unit is s")
-        return value
-
-    @field_validator("noise")
-    @classmethod
-    def _share(cls, value: float) -> float:
-        if value > 1.0:
-            raise ValueError(f"{value:g} is beyond 1; it is a share, not a percentage: 0.05 is 5 %")
-        return value
 
     @field_validator("tolerances")
     @classmethod
@@ -126,8 +113,8 @@ class Scenario(Part):
         nominal = self.nominal_vehicle()
         try:
             return self.vehicle_changes.apply(nominal)
-        except ValueError as error:
-            raise ValueError(f"vehicle_changes: no such vehicle can fly ({_first_line(error)})") from None
+        except ValidationError as error:
+            raise ValueError(f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})") from None
 
     @property
     def heading(self) -> str:
@@ -138,11 +125,11 @@ class Scenario(Part):
     def is_fixed(self) -> bool:
         """Whether every episode has the same start, target and wrenches, so that only noise tells them apart."""
         start = self.start
-        draws = [start.velocity, start.body_rates, *(wrench.force for wrench in self.wrenches)]
-        draws += [wrench.torque for wrench in self.wrenches]
-        drawn = any(draw.value is None and draw.largest > 0.0 for draw in draws)
+        vectors = [start.velocity, start.body_rates]
+        vectors += [vector for wrench in self.wrenches for vector in (wrench.force, wrench.torque)]
+        random = any(vector.value is None and vector.largest > 0.0 for vector in vectors)
         fixed_target = self.target.distance is None or self.target.distance == 0.0
-        return fixed_target and not drawn and (start.attitude.quaternion is not None or start.attitude.tilt == 0.0)
+        return fixed_target and not random and (start.attitude.quaternion is not None or start.attitude.tilt == 0.0)
 
     def _check_ground(self, vehicle: Vehicle) -> None:
         least = vehicle.collision_radius
@@ -175,12 +162,12 @@ class Scenario(Part):
             raise ValueError(f"target: cannot be reached within the duration of {self.duration:g} s at full thrust")
 
 
-class Suite(Part):
+class Suite(Frozen):
     """Scenarios that belong together."""
 
     name: str = Field(pattern=NAME, description="what the suite is called")
     description: str = Field(default="", description="what it is for")
-    source: str = Field(default="reference", description="where the reference figures come from; heads their column")
+    source: str = Field(default="reference", description="where the reference comes from; heads its column")
     scenarios: tuple[Scenario, ...] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
@@ -188,10 +175,39 @@ class Suite(Part):
 
         :raises ConfigError: there is none.
         """
-        for scenario in self.scenarios:
-            if scenario.name == name:
-                return scenario
-        raise ConfigError(unknown("scenario", name, [scenario.name for scenario in self.scenarios]))
+        scenarios = {scenario.name: scenario for scenario in self.scenarios}
+        if name not in scenarios:
+            raise ConfigError(unknown("scenario", name, scenarios))
+        return scenarios[name]
+
+    def with_changes(
+        self, names: Sequence[str] = (), episodes: int | None = None, seed: int | None = None, vehicle: str | None = None
+    ) -> Suite:
+        """A suite with some of these scenarios, other numbers of episodes or seeds, or another vehicle.
+
+        :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
+        :param vehicle: name, or path of a YAML file, that flies all scenarios; forces and torques stay what they are, in N
+            and N m, and references, which are of another vehicle, go.
+        :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible for the vehicle.
+        """
+        known = {name for scenario in self.scenarios for name in (scenario.name, scenario.group) if name is not None}
+        for name in names:
+            if name not in known:
+                raise ConfigError(unknown("scenario", name, known))
+        changes: dict[str, Any] = {"episodes": episodes, "seed": seed}
+        flown_by = ""
+        if vehicle is not None:
+            changes |= {"vehicle": str(Path(vehicle).absolute()) if is_vehicle_file(vehicle) else vehicle, "reference": {}}
+            flown_by = f", flown by {vehicle}"
+        changes = {key: value for key, value in changes.items() if value is not None}
+        kept = [each for each in self.scenarios if not names or each.name in names or each.group in names]
+        changed = []
+        for scenario in kept:
+            data = {**scenario.model_dump(), **changes}
+            if scenario.hit_search is not None and episodes is not None:
+                data["hit_search"]["episodes"] = min(scenario.hit_search.episodes, episodes)
+            changed.append(validate(Scenario, data, f"scenario {scenario.name}{flown_by}"))
+        return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")
     def _unique(self) -> Suite:
@@ -206,8 +222,3 @@ class Suite(Part):
 def _load(vehicle: str, changed: int) -> Vehicle:
     """A vehicle, read once while its file stays the same: suites have many scenarios."""
     return load_vehicle(vehicle)
-
-
-def _first_line(error: Exception) -> str:
-    errors = getattr(error, "errors", None)
-    return str(errors()[0]["msg"]).removeprefix("Value error, ") if callable(errors) else str(error)

@@ -28,7 +28,7 @@ def axis_name(key: str) -> str:
 
 
 def axis_label(key: str) -> str:
-    """The name of a varied key with its unit, as axes of figures carry it."""
+    """The name of a varied key with its unit, as the axes of plots carry it."""
     name = axis_name(key)
     return f"{name} ({_UNITS[name]})" if name in _UNITS else name
 
@@ -46,8 +46,8 @@ def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
     if not isinstance(axes, Mapping) or not axes:
         raise ConfigError(f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'")
     for key, values in axes.items():
-        numbers = isinstance(values, list) and values and all(_is_number(value) for value in values)
-        if not numbers or len(set(values)) != len(values):
+        numbers = isinstance(values, list) and all(type(each) in (int, float) and math.isfinite(each) for each in values)
+        if not numbers or not values or len(set(values)) != len(values):
             raise ConfigError(f"{where}: vary.{key} must be a list of different numbers, not {values!r}")
     count = math.prod(len(values) for values in axes.values())
     if count > MAX_CELLS:
@@ -66,22 +66,14 @@ def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
     return cells
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
 def _put(entry: dict[str, Any], key: str, value: Any, where: str) -> None:
     *path, last = key.split(".")
     place: Any = entry
-    for number, part in enumerate(path):
+    for part in path:
         if isinstance(place, list) and part.isdigit() and int(part) < len(place):
             place = place[int(part)]
-        elif isinstance(place, dict):
-            place = place.setdefault(part, {})
         else:
-            place = None
-        if not isinstance(place, (dict, list)):
-            raise ConfigError(f"{where}: vary.{key}: {'.'.join(path[: number + 1])} holds no keys here")
+            place = place.setdefault(part, {}) if isinstance(place, dict) else None
     if not isinstance(place, dict):
         raise ConfigError(f"{where}: vary.{key}: {'.'.join(path)} holds no keys here")
     place[last] = value

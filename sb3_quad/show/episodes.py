@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import ValidationError
 
 from sb3_quad.base.errors import ConfigError, ControllerError, unknown
+from sb3_quad.base.validate import validate
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.flights import Plan
-from sb3_quad.scenarios.draw import DrawnWrench, draw_episodes, wrench_changes
-from sb3_quad.scenarios.load import explain, load_suite
+from sb3_quad.scenarios.load import load_suite
 from sb3_quad.scenarios.parts import Wrench
+from sb3_quad.scenarios.sample import Generators, sample_episodes, sample_wrenches
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.show.agents import check_keywords
 from sb3_quad.show.recording import Recording, record
@@ -55,8 +55,9 @@ class Setting:
         resolve_tasks(given["task"], given.get("task_kwargs"))
         vehicle = load_vehicle(given.get("vehicle", "itm"))
         start = {} if target is None else {"target": _target(target, vehicle)[None]}
-        wrenches = {} if wrench is None else wrench_changes([_drawn(wrench, vehicle, n_steps)], n_steps)
-        return Setting(vehicle, n_steps, given, Plan(start, wrenches))
+        wrenches = [] if wrench is None else [wrench]
+        plan = Plan(start, sample_wrenches(wrenches, vehicle, n_steps, Generators([0])))
+        return Setting(vehicle, n_steps, given, plan)
 
     def fly(self, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:
         """One episode.
@@ -67,10 +68,9 @@ class Setting:
         """
         if self.scenario is None:
             return record(name, controller, seed, n_steps, plan=self.plan, deterministic=deterministic, **self.keywords)
-        drawn = draw_episodes(self.scenario, [seed])
-        wrenches = wrench_changes(drawn.wrenches, drawn.steps) if drawn.wrenches else {}
-        plan = Plan(drawn.start, wrenches, drawn.waypoints, drawn.radius)
-        keywords: dict[str, Any] = {"task": drawn.task, "vehicle": drawn.vehicle, "noise": drawn.noise}
+        episodes = sample_episodes(self.scenario, [seed])
+        plan = Plan(episodes.start, episodes.wrenches, episodes.waypoints, episodes.radius)
+        keywords: dict[str, Any] = {"task": episodes.task, "vehicle": episodes.vehicle, "noise": episodes.noise}
         return record(name, controller, seed, n_steps, plan=plan, deterministic=deterministic, **keywords)
 
 
@@ -101,11 +101,8 @@ def make_wrench(
     """
     if force is None and torque is None:
         return None
-    zero = (0.0, 0.0, 0.0)
-    try:
-        return Wrench.model_validate({"start": start, "duration": duration, "force": force or zero, "torque": torque or zero})
-    except ValidationError as error:
-        raise ConfigError(explain(error, Wrench)) from None
+    given = {"start": start, "duration": duration, "force": force or (0.0, 0.0, 0.0), "torque": torque or (0.0, 0.0, 0.0)}
+    return validate(Wrench, given, "the push")
 
 
 def fly_all(
@@ -154,11 +151,3 @@ def _target(target: Sequence[float], vehicle: Vehicle) -> npt.NDArray[np.float64
     if position[2] <= vehicle.collision_radius:
         raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
     return np.asarray(position)
-
-
-def _drawn(wrench: Wrench, vehicle: Vehicle, n_steps: int) -> DrawnWrench:
-    values = np.zeros((1, 12))
-    values[0, 0:3], values[0, 9:12] = wrench.force.value, wrench.torque.value
-    first = round(wrench.start / vehicle.control_step)
-    steps = n_steps if wrench.duration is None else max(1, round(wrench.duration / vehicle.control_step))
-    return DrawnWrench(first, first + steps, values)

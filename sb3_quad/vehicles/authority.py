@@ -6,11 +6,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.vehicles.vehicle import Vehicle
-
-FloatArray = npt.NDArray[np.float64]
 
 
 class Authority(NamedTuple):

@@ -5,24 +5,28 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
-import yaml
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import (
+    Field,
+    ModelWrapValidatorHandler,
+    NonNegativeFloat,
+    PositiveFloat,
+    TypeAdapter,
+    ValidationError,
+    model_validator,
+)
 
-from sb3_quad.base.errors import CannotHover, ConfigError, unknown
-from sb3_quad.base.quantities import Finite, Positive
-from sb3_quad.vehicles.gains import GeometricFigures, GeometricGains
-from sb3_quad.vehicles.limits import DEFAULT_GRAVITY, OTHER_LIMITS, in_hover_thrusts
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import CannotHover
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.vehicles.gains import GeometricGains
 
-FloatArray = npt.NDArray[np.float64]
-
-
-PerRotor = tuple[tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite], tuple[Finite, Finite]]
+VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
+PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
 PARAMETER_NAMES = (
@@ -30,13 +34,14 @@ PARAMETER_NAMES = (
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
 )
+OTHER_LIMITS = {
+    "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
+    "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
+}
+_PAIR = TypeAdapter(tuple[float, float])
 
 
-class _HoverOutOfReach(ValueError):
-    """Thrust limits that hover is not between."""
-
-
-class Vehicle(BaseModel):
+class Vehicle(Frozen):
     """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
 
     The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover thrusts,
@@ -47,42 +52,59 @@ class Vehicle(BaseModel):
     through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
+    other_keys = tuple(OTHER_LIMITS)
 
     name: str = Field(min_length=1, description="what the vehicle is called")
-    mass: Positive = Field(description="m, kg")
-    inertia: tuple[Positive, Positive, Positive] = Field(description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2")
+    mass: PositiveFloat = Field(description="m, kg")
+    inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
+        description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2"
+    )
     rotor_positions: PerRotor = Field(description="x, y of each rotor in the body frame (x forward, y left), m")
     rotor_directions: tuple[int, int, int, int] = Field(
         description="sign of the yaw moment of each rotor: two of 1, two of -1"
     )
-    moment_thrust_ratio: Positive = Field(description="kM / kF, m")
-    thrust_coefficient: Positive = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
-    motor_gain: Positive = Field(description="k_m, 1/s (Eq. 4.1)")
-    gravity: Positive = Field(default=DEFAULT_GRAVITY, description="g, m/s^2")
-    thrust_limits: tuple[Annotated[Finite, Field(ge=0)], Positive] = Field(
+    moment_thrust_ratio: PositiveFloat = Field(description="kM / kF, m")
+    thrust_coefficient: PositiveFloat = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
+    motor_gain: PositiveFloat = Field(description="k_m, 1/s (Eq. 4.1)")
+    gravity: PositiveFloat = Field(default=9.81, description="g, m/s^2")
+    thrust_limits: tuple[NonNegativeFloat, PositiveFloat] = Field(
         description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
     )
-    physics_step: Positive = Field(default=0.0025, description="s")
-    control_step: Positive = Field(default=0.01, description="s; a whole number of physics steps")
+    physics_step: PositiveFloat = Field(default=0.0025, description="s")
+    control_step: PositiveFloat = Field(default=0.01, description="s; a whole number of physics steps")
     delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
-    collision_radius: Positive = Field(description="radius of the collision sphere at the centre of mass, m")
+    collision_radius: PositiveFloat = Field(description="radius of the collision sphere at the centre of mass, m")
     geometric_gains: GeometricGains | None = Field(
         default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
     )
 
-    @model_validator(mode="before")
+    @model_validator(mode="wrap")
     @classmethod
-    def _limits(cls, data: Any) -> Any:
-        return in_hover_thrusts(data) if isinstance(data, Mapping) else data
+    def _limits_as_published(cls, data: Any, handler: ModelWrapValidatorHandler[Vehicle]) -> Vehicle:
+        """``rotor_thrust_limits`` or ``rotor_speed_limits`` as ``thrust_limits`` (F = kF ω²)."""
+        given = [key for key in ("thrust_limits", *OTHER_LIMITS) if isinstance(data, Mapping) and key in data]
+        if len(given) > 1:
+            raise ValueError(f"{' and '.join(given)}: give only one of them")
+        if not given or given == ["thrust_limits"]:
+            return handler(data)
+        (name,) = given
+        others = {key: value for key, value in data.items() if key != name}
+        try:
+            least, most = _PAIR.validate_python(data[name])
+        except ValidationError:
+            raise ValueError(f"{name}: must be two numbers ({OTHER_LIMITS[name]})") from None
+        if not 0.0 <= least < most < math.inf:
+            raise ValueError(f"{name} [{least:g}, {most:g}]: must rise, from at least 0 ({OTHER_LIMITS[name]})")
+        vehicle = handler({**others, "thrust_limits": (0.0, 2.0)})  # hover is possible; any other key may be wrong
+        if name == "rotor_speed_limits":
+            least, most = vehicle.thrust_coefficient * least**2, vehicle.thrust_coefficient * most**2
+        return handler({**others, "thrust_limits": (least / vehicle.hover_thrust, most / vehicle.hover_thrust)})
 
     @model_validator(mode="after")
     def _consistent(self) -> Vehicle:
         low, high = self.thrust_limits
         if not low < 1.0 < high:
-            raise _HoverOutOfReach(
-                f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover"
-            )
+            raise CannotHover(f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover")
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
             raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
         ixx, iyy, izz = self.inertia
@@ -192,69 +214,21 @@ def _mixers(positions: PerRotor, directions: tuple[int, int, int, int], ratio: f
 
 def vehicle_names() -> list[str]:
     """The vehicles that come with the package."""
-    folder = resources.files("sb3_quad.vehicles")
-    return sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    return VEHICLES.names()
 
 
 def is_vehicle_file(source: str | Path) -> bool:
     """Whether :func:`load_vehicle` takes it for the path of a file rather than for a name."""
-    return isinstance(source, Path) or source.endswith((".yaml", ".yml")) or "/" in source
+    return VEHICLES.is_path(source)
 
 
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
 
-    :raises CannotHover: all is well with the file but that hover is not between the rotors' limits.
+    :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
     """
     if isinstance(source, Vehicle):
         return source
-    text = str(source)
-    if is_vehicle_file(source if isinstance(source, Path) else text):
-        try:
-            content = Path(text).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"vehicle file {text}: cannot be read ({error})") from None
-        return _parse_vehicle(content, text)
-    if text not in vehicle_names():
-        raise ConfigError(unknown("vehicle", text, vehicle_names()) + ", or the path of a .yaml file")
-    content = resources.files("sb3_quad.vehicles").joinpath(f"{text}.yaml").read_text(encoding="utf-8")
-    return _parse_vehicle(content, f"{text}.yaml")
-
-
-def _parse_vehicle(content: str, where: str) -> Vehicle:
-    try:
-        data = yaml.safe_load(content)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"vehicle file {where}: not valid YAML ({' '.join(str(error).split())})") from None
-    if not isinstance(data, dict):
-        raise ConfigError(f"vehicle file {where}: must hold keys and values, such as 'mass: 1.727'")
-    try:
-        return Vehicle.model_validate(data)
-    except ValidationError as error:
-        wrong = error.errors()
-        only_weak = all(isinstance(item.get("ctx", {}).get("error"), _HoverOutOfReach) for item in wrong)
-        kind = CannotHover if only_weak else ConfigError
-        raise kind(f"vehicle file {where}: {'; '.join(_explain(item) for item in wrong)}") from None
-
-
-def _explain(item: Any) -> str:
-    key = ".".join(str(part) for part in item["loc"])
-    *blocks, name = item["loc"] or ("",)
-    where, fields = _fields_at(tuple(blocks))
-    if item["type"] == "extra_forbidden":
-        return where + unknown("key", name, fields if where else [*fields, *OTHER_LIMITS])
-    message = item["msg"].removeprefix("Value error, ")
-    field = fields.get(str(name)) or Vehicle.model_fields.get(key.split(".")[0])
-    meaning = f" ({field.description})" if field and field.description else ""
-    return f"{key}: {message}{meaning}" if key else message
-
-
-def _fields_at(blocks: tuple[Any, ...]) -> tuple[str, dict[str, Any]]:
-    """Where in the file some nested blocks lead (as the beginning of a message), and the fields that block has."""
-    known: dict[tuple[Any, ...], type[BaseModel]] = {
-        ("geometric_gains",): GeometricGains,
-        ("geometric_gains", "measured"): GeometricFigures,
-    }
-    model = known.get(blocks)
-    return (f"{'.'.join(blocks)}: ", model.model_fields) if model else ("", Vehicle.model_fields)
+    data, where = VEHICLES.read(source if isinstance(source, Path) else str(source))
+    return validate(Vehicle, data, where)

@@ -1,0 +1,96 @@
+"""YAML files by name or path: which of the two a text is, and one line for whatever is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.yaml_files import YamlFolder, parse_mapping_file, parse_yaml
+
+VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
+SETTINGS = YamlFolder("settings", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("thesis",))
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_names_are_those_of_the_package_folder_by_folder():
+    assert VEHICLES.names() == ["crazyflie", "hummingbird", "itm"]
+    names = SETTINGS.names()
+    first = names.index("thesis/dagger.yml")
+    assert "dagger.yml" in names[:first] and all(name.startswith("thesis/") for name in names[first:])
+
+
+@pytest.mark.parametrize(
+    ("folder", "source", "is_path"),
+    [
+        (VEHICLES, "itm", False),
+        (VEHICLES, "itn", False),
+        (VEHICLES, "itm.yaml", True),
+        (VEHICLES, "sub/itm", True),
+        (VEHICLES, Path("itm"), True),
+        (SETTINGS, "dagger.yml", False),
+        (SETTINGS, "thesis/dagger.yml", False),
+        (SETTINGS, Path("dagger.yml"), True),
+    ],
+)
+def test_paths_are_told_from_names(here, folder, source, is_path):
+    assert folder.is_path(source) == is_path
+
+
+def test_a_file_that_only_happens_to_be_called_as_a_vehicle_is_not_taken_for_it(here):
+    (here / "itm").write_text("name: mine")
+    assert not VEHICLES.is_path("itm")
+    assert VEHICLES.read("itm")[0]["name"] == "itm"
+
+
+def test_a_users_file_comes_before_the_packages_of_the_same_name(here):
+    assert SETTINGS.read("dagger.yml")[0].keys() != {"mine"}
+    (here / "dagger.yml").write_text("mine: 1")
+    assert SETTINGS.read("dagger.yml") == ({"mine": 1}, "dagger.yml")
+
+
+def test_what_messages_call_a_file(here):
+    (here / "mine.yaml").write_text("a: 1")
+    assert VEHICLES.text("mine.yaml") == ("a: 1", "mine.yaml")
+    assert VEHICLES.read(here / "mine.yaml") == ({"a": 1}, str(here / "mine.yaml"))
+    assert VEHICLES.text("itm")[1] == "itm.yaml"
+    assert SETTINGS.text("thesis/dagger.yml")[1] == "thesis/dagger.yml"
+
+
+@pytest.mark.parametrize(
+    ("source", "content", "message"),
+    [
+        (
+            "imt",
+            None,
+            "unknown vehicle 'imt': did you mean 'itm'? (valid: crazyflie, hummingbird, itm), or the path of a .yaml",
+        ),
+        ("missing.yaml", None, "missing.yaml: no such file"),
+        ("bad.yaml", b"\xff\xfe\x00\x01", "bad.yaml: cannot be read"),
+        ("bad.yaml", b"mass: [1, 2", "bad.yaml: not valid YAML"),
+        ("bad.yaml", b"- 1\n- 2", "bad.yaml: must hold keys and values"),
+        ("bad.yaml", b"", "bad.yaml: must hold keys and values"),
+    ],
+)
+def test_what_is_wrong_is_one_line(here, source, content, message):
+    if content is not None:
+        (here / source).write_bytes(content)
+    with pytest.raises(ConfigError) as caught:
+        VEHICLES.read(source)
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+
+
+def test_files_of_any_place(here):
+    (here / "a.yml").write_text("x: 1\ny: [2]")
+    assert parse_mapping_file(here / "a.yml") == {"x": 1, "y": [2]}
+    (here / "a.yml").write_text("text")
+    with pytest.raises(ConfigError, match="must hold keys and values"):
+        parse_mapping_file(here / "a.yml")
+    with pytest.raises(ConfigError, match=r"^here: not valid YAML"):
+        parse_yaml("a: [", "here")
