@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -23,10 +23,10 @@ class Frozen(BaseModel):
     """Further keys that a validator of the model understands; messages about unknown keys list them."""
 
 
-def validate(model: type[Model], data: Any, where: str) -> Model:
+def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
     """``data`` as a ``model``.
 
-    :param where: what the message calls the data, such as the name of its file.
+    :param where: what the message calls the data, such as the name of its file; or gives that for a key.
     :raises ConfigError: something does not fit; one line names each key, what is wrong, and the nearest valid key. Where all
         that is wrong is an error of a kind of its own, such as :class:`CannotHover`, that kind is raised.
     """
@@ -35,7 +35,8 @@ def validate(model: type[Model], data: Any, where: str) -> Model:
     except ValidationError as error:
         kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
         kind = next((each for each in kinds if len(kinds) == 1 and issubclass(each, ConfigError)), ConfigError)
-        raise kind(f"{where}: {explain(error, model)}") from None
+        place = where if isinstance(where, str) else where(str((error.errors()[0]["loc"] or ("",))[0]))
+        raise kind(f"{place}: {explain(error, model)}") from None
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
@@ -48,7 +49,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
             text = unknown("key", item["loc"][-1], [*_fields(inside), *getattr(inside, "other_keys", ())])
         else:
             text = _message(item) + (f" ({meaning})" if meaning else "")
-        found.setdefault(key, f"{key}: {text}" if key else text)  # of a union only the first alternative
+        found.setdefault(key, text if text.startswith(key) else f"{key}: {text}")  # of a union only the first alternative
     return "; ".join(found.values())
 
 

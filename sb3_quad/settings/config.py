@@ -3,7 +3,7 @@
 ====================  ============================================================================================
 key                   meaning
 ====================  ============================================================================================
-n_timesteps           transitions to train on, over all environments
+n_timesteps           timesteps to train on, over all environments
 n_envs                environments flown side by side (1)
 vec_env               batch (default for this package's environments), dummy (default for others) or subproc
 env_kwargs            keywords of the environment's constructor
@@ -22,57 +22,67 @@ anything else         a keyword of the algorithm's constructor; ``lin_1e-3`` fal
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, field
-from importlib import resources
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeAlias
 
 import gymnasium
-import yaml
+from pydantic import BeforeValidator, Field, StrictBool, ValidationInfo, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.settings.values import convert, positive_whole, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import is_vehicle_file
 
+SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("geometric", "thesis"))
+"""The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
-CONFIG_FOLDERS = ("geometric", "thesis")  # with further settings files, inside zoo_configs
-_JOB_KEYS = (
-    *("n_timesteps", "n_envs", "vec_env", "env_kwargs", "eval_env_kwargs", "eval_tasks", "eval_expert"),
-    *("policy", "policy_kwargs", "expert", "callback", "env_wrapper", "vec_env_wrapper", "normalize"),
-)
-_ENV_KEYS = ("env_kwargs", "eval_env_kwargs")
-# What env_kwargs may give to a quadcopter environment, batched or not.
-QUADCOPTER_KEYWORDS = (
-    *("task", "task_kwargs", "vehicle", "noise", "observation_mean", "observation_std", "max_episode_steps"),
-)
 
 
-@dataclass(frozen=True)
-class TrainingConfig:
+def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
+    if str(value) not in valid:
+        raise ConfigError(unknown(str(info.field_name), value, valid))
+    return str(value)
+
+
+def _as_list(value: Any) -> Any:
+    return [] if value is None else value if isinstance(value, (list, tuple)) else [value]
+
+
+Whole: TypeAlias = Annotated[int, BeforeValidator(lambda value, info: positive_whole(value, info.field_name))]
+Keywords: TypeAlias = Annotated[dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))]
+Classes: TypeAlias = Annotated[
+    list[tuple[str, dict[str, Any]]], BeforeValidator(lambda value, info: qualified_classes(value, info.field_name))
+]
+
+
+class TrainingConfig(Frozen):
     """One job's settings, checked. ``settings`` holds them as given: plain values that YAML can hold."""
 
     algo: str
     env_id: str
-    n_timesteps: int
-    n_envs: int
-    vec_env: str
-    env_kwargs: dict[str, Any]
-    eval_env_kwargs: dict[str, Any]
-    eval_tasks: tuple[str, ...]
-    eval_expert: bool
-    policy: str
-    policy_kwargs: dict[str, Any]
-    expert: Any
-    callback: list[tuple[str, dict[str, Any]]]
-    env_wrapper: list[tuple[str, dict[str, Any]]]
-    vec_env_wrapper: list[tuple[str, dict[str, Any]]]
+    n_timesteps: Whole
+    n_envs: Whole = 1
+    vec_env: Annotated[str, BeforeValidator(lambda value, info: _one_of(VEC_ENVS, value, info))]
+    env_kwargs: Keywords = Field(default_factory=dict)
+    eval_env_kwargs: Keywords = Field(default_factory=dict)
+    eval_tasks: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
+    eval_expert: StrictBool = False
+    policy: str = "MlpPolicy"
+    policy_kwargs: Keywords = Field(default_factory=dict)
+    expert: Any = None
+    callback: Classes = Field(default_factory=list)
+    env_wrapper: Classes = Field(default_factory=list)
+    vec_env_wrapper: Classes = Field(default_factory=list)
+    normalize: Any = None
     hyperparams: dict[str, Any]
-    settings: dict[str, Any] = field(repr=False)
+    settings: dict[str, Any] = Field(repr=False)
 
     @property
     def task(self) -> str | None:
@@ -80,9 +90,53 @@ class TrainingConfig:
         return ENVIRONMENTS.get(self.env_id)
 
     @property
-    def flight_kwargs(self) -> dict[str, Any]:
-        """What ``env_kwargs`` says of vehicle, noise and scaling: what an agent of this job must be flown with in any task."""
-        return {key: self.env_kwargs[key] for key in ("vehicle", "noise", "observation_std") if key in self.env_kwargs}
+    def flight_settings(self) -> FlightSettings:
+        """How an agent of this job flies, of an environment of this package."""
+        return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
+
+    def for_evaluation(self, changes: Mapping[str, Any] | None = None) -> TrainingConfig:
+        """The settings with the environments as evaluations have them, and ``changes`` to their keywords."""
+        return self.model_copy(update={"env_kwargs": {**self.env_kwargs, **self.eval_env_kwargs, **(changes or {})}})
+
+    @field_validator("policy", mode="before")
+    @classmethod
+    def _known_policy(cls, value: Any, info: ValidationInfo) -> str:
+        return _one_of(get_algorithm(info.data["algo"]).policy_aliases, value, info)
+
+    @field_validator("env_kwargs", "eval_env_kwargs")
+    @classmethod
+    def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        for key in value:
+            if info.data["env_id"] in ENVIRONMENTS and key not in FlightSettings.model_fields:
+                raise ConfigError(unknown(f"keyword of {info.data['env_id']}", key, FlightSettings.model_fields))
+        return value
+
+    @field_validator("eval_tasks")
+    @classmethod
+    def _known_tasks(cls, value: tuple[str, ...], info: ValidationInfo) -> tuple[str, ...]:
+        if value and info.data["env_id"] not in ENVIRONMENTS:
+            raise ConfigError(f"{info.data['env_id']} has no tasks; leave it out")
+        return tuple(_one_of(TASKS, name, info) for name in value)
+
+    @field_validator("normalize")
+    @classmethod
+    def _not_normalised(cls, value: Any) -> Any:
+        if value:
+            raise ConfigError("normalize is not supported: its statistics are not part of a model's zip; use false")
+        return value
+
+    @model_validator(mode="after")
+    def _consistent(self) -> TrainingConfig:
+        if self.vec_env == "batch" and self.task is None:
+            raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
+        if not takes_expert(get_algorithm(self.algo)):
+            for key in ("expert", "eval_expert"):
+                if getattr(self, key):
+                    raise ConfigError(f"{key}: {self.algo} learns from no expert; leave it out")
+        return self
+
+
+JOB_KEYS = tuple(name for name in TrainingConfig.model_fields if name not in ("algo", "env_id", "hyperparams", "settings"))
 
 
 def load_config(
@@ -96,9 +150,7 @@ def load_config(
     """
     get_algorithm(algo)
     check_environment(env_id)
-    content, where = read_settings(conf_file if conf_file is not None else f"{algo}.yml")
-    if not isinstance(content, dict):
-        raise ConfigError(f"{where}: must hold environment ids with their settings")
+    content, where = SETTINGS.read(conf_file if conf_file is not None else f"{algo}.yml")
     if env_id not in content:
         listed = [str(key) for key in content]
         raise ConfigError(f"{where}: {unknown('environment in this file', env_id, listed)}; give another with --conf-file")
@@ -121,48 +173,27 @@ def build_config(
     :param changes: keys that come from the command line instead.
     :raises ConfigError: see :func:`load_config`.
     """
-    algorithm = get_algorithm(algo)
+    parameters = constructor_parameters(get_algorithm(algo))
     check_environment(env_id)
-    settings = {key: with_vehicle_path(value) if key in _ENV_KEYS else value for key, value in settings.items()}
-    parameters = constructor_parameters(algorithm)
+    settings = {key: with_vehicle_path(value) if key.endswith("env_kwargs") else value for key, value in settings.items()}
 
-    def at(key: str) -> str:
-        return f"{'command line' if key in changes else where}: {key}"
+    def source(key: str) -> str:
+        return "command line" if key in changes else where
 
     for key in settings:
-        if key not in _JOB_KEYS and key not in parameters:
-            source = at(key).removesuffix(f": {key}")
-            raise ConfigError(f"{source}: {unknown(f'key of {algo}', key, [*_JOB_KEYS, *parameters])}")
-    if settings.get("normalize"):
-        raise ConfigError(f"{at('normalize')} is not supported: its statistics are not part of a model's zip; use false")
-    if "n_timesteps" not in settings:
+        if key not in JOB_KEYS and key not in parameters:
+            raise ConfigError(f"{source(key)}: {unknown(f'key of {algo}', key, [*JOB_KEYS, *parameters])}")
+    given = {key: value for key, value in settings.items() if key in JOB_KEYS and value is not None}
+    hyperparams = {
+        key: convert(value, parameters[key], f"{source(key)}: {key}") for key, value in settings.items() if key in parameters
+    }
+    defaults: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
+    if takes_expert(get_algorithm(algo)):
+        defaults["expert"] = "pid"
+    whole = {**defaults, **given, "algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": dict(settings)}
+    if "n_timesteps" not in whole:
         raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
-    learns = takes_expert(algorithm)
-    if settings.get("expert") is not None and not learns:
-        raise ConfigError(f"{at('expert')}: {algo} learns from no expert; leave it away")
-    if not isinstance(settings.get("eval_expert", False), bool):
-        raise ConfigError(f"{at('eval_expert')} is {settings['eval_expert']!r}, must be true or false")
-    if settings.get("eval_expert") and not learns:
-        raise ConfigError(f"{at('eval_expert')}: {algo} learns from no expert to compare with; leave it away")
-    return TrainingConfig(
-        algo=algo,
-        env_id=env_id,
-        n_timesteps=positive_whole(settings["n_timesteps"], at("n_timesteps")),
-        n_envs=positive_whole(settings.get("n_envs", 1), at("n_envs")),
-        vec_env=_vec_env(settings.get("vec_env"), env_id, at("vec_env")),
-        env_kwargs=_env_kwargs(settings.get("env_kwargs"), env_id, at("env_kwargs")),
-        eval_env_kwargs=_env_kwargs(settings.get("eval_env_kwargs"), env_id, at("eval_env_kwargs")),
-        eval_tasks=_eval_tasks(settings.get("eval_tasks"), env_id, at("eval_tasks")),
-        eval_expert=settings.get("eval_expert", False),
-        policy=_known(settings.get("policy", "MlpPolicy"), algorithm.policy_aliases, at("policy")),
-        policy_kwargs=parse_mapping(settings.get("policy_kwargs"), at("policy_kwargs")),
-        expert=settings.get("expert") or ("pid" if learns else None),
-        callback=qualified_classes(settings.get("callback"), at("callback")),
-        env_wrapper=qualified_classes(settings.get("env_wrapper"), at("env_wrapper")),
-        vec_env_wrapper=qualified_classes(settings.get("vec_env_wrapper"), at("vec_env_wrapper")),
-        hyperparams={key: convert(value, parameters[key], at(key)) for key, value in settings.items() if key in parameters},
-        settings=dict(settings),
-    )
+    return validate(TrainingConfig, whole, source)
 
 
 def with_vehicle_path(value: Any) -> Any:
@@ -179,69 +210,3 @@ def check_environment(env_id: str) -> None:
         return
     nearest = unknown("environment", env_id, gymnasium.registry).split(" (valid:")[0]
     raise ConfigError(f"{nearest} (of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)")
-
-
-def config_names() -> list[str]:
-    """The YAML files that come with the package, as ``--conf-file`` takes them."""
-    root = resources.files("sb3_quad.zoo_configs")
-    folders = {"": root, **{f"{name}/": root.joinpath(name) for name in CONFIG_FOLDERS}}
-    return [
-        f"{prefix}{name}"
-        for prefix, folder in folders.items()
-        for name in sorted(entry.name for entry in folder.iterdir())
-        if name.endswith(".yml")
-    ]
-
-
-def read_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """:raises ConfigError: text that is not YAML, in one line."""
-    try:
-        return yaml.load(text, Loader=loader)
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{where}: not valid YAML ({' '.join(str(error).split())})") from None
-
-
-def read_settings(conf_file: str | Path) -> tuple[Any, str]:
-    """The content of a settings file on disk or in the package, and what to call it.
-
-    :raises ConfigError: no such file, or one that cannot be read.
-    """
-    name = str(conf_file)
-    path = Path(conf_file)
-    if path.is_file():
-        try:
-            return read_yaml(path.read_text(encoding="utf-8"), name), name
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{name}: cannot be read ({error})") from None
-    if name not in config_names():
-        raise ConfigError(f"{unknown('settings file', name, config_names())}, or the path of one")
-    return read_yaml(resources.files("sb3_quad.zoo_configs").joinpath(name).read_text(encoding="utf-8"), name), name
-
-
-def _known(value: Any, valid: Collection[str], where: str) -> str:
-    if str(value) not in valid:
-        source, _, key = where.rpartition(": ")
-        raise ConfigError(f"{source}: {unknown(key, value, valid)}")
-    return str(value)
-
-
-def _vec_env(value: Any, env_id: str, where: str) -> str:
-    kind = _known(value or ("batch" if env_id in ENVIRONMENTS else "dummy"), VEC_ENVS, where)
-    if kind == "batch" and env_id not in ENVIRONMENTS:
-        raise ConfigError(f"{where} is batch, but {env_id} has no batched form; use dummy or subproc")
-    return kind
-
-
-def _eval_tasks(value: Any, env_id: str, where: str) -> tuple[str, ...]:
-    names = [] if value is None else value if isinstance(value, list) else [value]
-    if names and env_id not in ENVIRONMENTS:
-        raise ConfigError(f"{where}: {env_id} has no tasks; leave it away")
-    return tuple(_known(name, TASKS, where) for name in names)
-
-
-def _env_kwargs(value: Any, env_id: str, where: str) -> dict[str, Any]:
-    kwargs = parse_mapping(value, where)
-    for key in kwargs:
-        if env_id in ENVIRONMENTS and key not in QUADCOPTER_KEYWORDS:
-            raise ConfigError(f"{where}: {unknown(f'keyword of {env_id}', key, QUADCOPTER_KEYWORDS)}")
-    return kwargs

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import torch as th
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from sb3_quad.base.files import one_line
 
 
-def hand_over(path: str | Path, model: OnPolicyAlgorithm) -> None:
+def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
     """Give ``model`` the policy and critic of an SB3 zip, of any on-policy algorithm with the same spaces and networks.
 
     ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that holds. The optimiser
@@ -44,8 +43,6 @@ def read_policy(path: str | Path) -> dict[str, th.Tensor]:
 
     :raises ConfigError: a file that is missing or not a complete SB3 zip.
     """
-    from stable_baselines3.common.save_util import load_from_zip_file
-
     file = Path(path)
     if not file.is_file():
         raise ConfigError(f"{file}: no such file")
@@ -53,8 +50,10 @@ def read_policy(path: str | Path) -> dict[str, th.Tensor]:
         _, parameters, _ = load_from_zip_file(file, load_data=False, device="cpu")
         policy = parameters["policy"]
     except Exception as error:  # what a damaged archive raises depends on where the damage is
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{file}: not a complete SB3 zip ({reason[:160]})") from None
+        raise ConfigError(f"{file}: not a complete SB3 zip ({one_line(error)})") from None
     if not all(th.isfinite(tensor).all() for tensor in policy.values()):
         raise ConfigError(f"{file}: holds parameters that are not finite")
     return dict(policy)
+
+
+hand_over = transfer_policy  # its name in version 0.1

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.seeds import check_seed
 from sb3_quad.settings.config import TrainingConfig
 
 
@@ -19,11 +20,11 @@ class TrainingJob:
     :param seed: of the policy, the environments (number i gets ``seed + i``) and the exploration.
     :param device: cpu, cuda or auto; the small networks here are fastest on the cpu.
     :param trained_agent: zip whose policy and critic to start from.
-    :param eval_freq: transitions between evaluations; below 1 only one at the end.
+    :param eval_freq: timesteps between evaluations; below 1 only one at the end.
     :param eval_episodes: episodes of one evaluation; below 1 none at all.
     :param n_eval_envs: environments to evaluate in; None for as many as episodes if batched, else 1.
-    :param eval_env_kwargs: put over the settings' env_kwargs in the evaluation's environments.
-    :param save_freq: transitions between checkpoints; below 1 none.
+    :param eval_env_kwargs: put over the settings' ``env_kwargs`` in the evaluation's environments.
+    :param save_freq: timesteps between checkpoints; below 1 none.
     :param log_interval: rollouts between two lines of the log.
     :param tensorboard_log: folder for TensorBoard, None for none.
     :param progress: whether to show a progress bar.
@@ -48,8 +49,7 @@ class TrainingJob:
     unique: bool = False
 
     def __post_init__(self) -> None:
-        if not 0 <= self.seed < 2**32 - 2**20:  # evaluations count up from it
-            raise ConfigError(f"seed {self.seed}: must be at least 0 and below {2**32 - 2**20}")
+        check_seed(self.seed)
         if self.n_eval_envs is not None and self.n_eval_envs < 1:
             raise ConfigError(f"n_eval_envs {self.n_eval_envs}: must be at least 1")
         if self.log_interval < 1:
@@ -83,6 +83,6 @@ def describe(job: TrainingJob) -> str:
     start = f", from {job.trained_agent}" if job.trained_agent else ""
     expert = f", expert {config.expert}" if config.expert is not None else ""
     return (
-        f"{config.algo} on {config.env_id}: {config.n_timesteps:,} transitions, {config.n_envs} environments "
+        f"{config.algo} on {config.env_id}: {config.n_timesteps:,} timesteps, {config.n_envs} environments "
         f"({config.vec_env}){expert}, seed {job.seed}{start}"
     )

@@ -5,34 +5,39 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import save_model
+from sb3_quad.base.files import one_line, save_model
+from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
+from sb3_quad.callbacks.best_model import BestModel
+from sb3_quad.callbacks.checkpoint import Checkpoint
+from sb3_quad.callbacks.episode_log import EpisodeLog
+from sb3_quad.callbacks.last_good import LastGoodModel
+from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
 from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
-from sb3_quad.training.handover import hand_over
+from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.resume import forget_snapshot, load_snapshot, write_snapshot
 from sb3_quad.training.runs import RunFolder, claim_run, open_run
 
-if TYPE_CHECKING:
-    from stable_baselines3.common.callbacks import BaseCallback
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-    from stable_baselines3.common.vec_env import VecEnv
-
-    from sb3_quad.callbacks.best_model import BestModel
-    from sb3_quad.training.last_good import LastGoodModel
-
-EVALUATION_SEED = 2**18  # added to the seed for the evaluations along the way; beyond any training environment's
-FRESH_SEED = 2**19  # added to the seed for the figures at the end: episodes that nothing before has seen
-
 Report = Callable[[str], None]
-GoesOn = Callable[[float, float], bool]
+ShouldContinue = Callable[[float, float], bool]
+EvalEnvs = dict[str | None, VecEnv]
+
+
+def _always(success: float, reward: float) -> bool:
+    return True
 
 
 @dataclass(frozen=True)
@@ -55,25 +60,25 @@ class TrainingResult:
 def train(
     job: TrainingJob,
     report: Report = print,
-    started: Callable[[RunFolder], None] = lambda run: None,
-    goes_on: GoesOn = lambda success, reward: True,
+    on_start: Callable[[RunFolder], None] = lambda run: None,
+    should_continue: ShouldContinue = _always,
 ) -> TrainingResult:
     """Train as ``job`` says, in a run folder of its own.
 
     :param report: told of each event in one line.
-    :param started: told of the run folder before the training begins.
-    :param goes_on: asked after each evaluation, with its success rate and mean reward, whether the training goes on.
+    :param on_start: told of the run folder before the training begins.
+    :param should_continue: asked after each evaluation, with its success rate and mean reward.
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         if job.trained_agent is not None:
-            hand_over(job.trained_agent, model)
+            transfer_policy(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
         run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": for_evaluation(job).env_kwargs})
-        started(run)
-        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps, goes_on)
+        on_start(run)
+        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps, should_continue)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -91,28 +96,26 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = load_snapshot(run, config.algo, env, job.device, **attributes)
-        report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} transitions")
+        report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps - model.num_timesteps)
 
 
 @contextmanager
-def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str | None, VecEnv]]]:
+def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
     """The environments to train in and those to evaluate in; closed in the end.
 
     The latter by task, the run's own first, whose name is None; none if there are no evaluations.
     """
     config = job.config
     made: list[VecEnv] = []
-    evaluating: dict[str | None, VecEnv] = {}
+    evaluating: EvalEnvs = {}
     try:
         made.append(make_environments(config, config.n_envs, job.seed))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
             for task in (None, *config.eval_tasks):
-                settings = for_evaluation(job)
-                if task is not None:
-                    settings = replace(settings, env_kwargs={**settings.env_kwargs, "task": task})
-                made.append(make_environments(settings, min(n_envs, job.eval_episodes), job.seed + EVALUATION_SEED))
+                settings = config.for_evaluation({**(job.eval_env_kwargs or {}), **({} if task is None else {"task": task})})
+                made.append(make_environments(settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed)))
                 evaluating[task] = made[-1]
         yield made[0], evaluating
     finally:
@@ -122,15 +125,12 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, dict[str | None, V
 
 def for_evaluation(job: TrainingJob) -> TrainingConfig:
     """The settings with the environments as evaluations have them."""
-    config = job.config
-    return replace(config, env_kwargs={**config.env_kwargs, **config.eval_env_kwargs, **(job.eval_env_kwargs or {})})
+    return job.config.for_evaluation(job.eval_env_kwargs)
 
 
 def _expert(config: TrainingConfig) -> dict[str, Any]:
     if not takes_expert(get_algorithm(config.algo)):
         return {}
-    from sb3_quad.experts.resolve import resolve_expert
-
     return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
 
 
@@ -143,33 +143,31 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
     keywords = {**config.hyperparams, **_expert(config)}
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
+    keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
     try:
-        return get_algorithm(config.algo)(
-            config.policy,
-            env,
-            seed=job.seed,
-            device=job.device,
-            verbose=job.verbose,
-            tensorboard_log=job.tensorboard_log,
-            **keywords,
-        )
+        return get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
-        raise ConfigError(f"{config.algo} cannot be made with these settings ({' '.join(str(error).split())})") from error
+        raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
 
 
 def _learn(
     job: TrainingJob,
     run: RunFolder,
     model: OnPolicyAlgorithm,
-    eval_envs: dict[str | None, VecEnv],
+    eval_envs: EvalEnvs,
     signals: StopSignals,
     report: Report,
     timesteps: int,
-    goes_on: GoesOn = lambda success, reward: True,
+    should_continue: ShouldContinue = _always,
 ) -> TrainingResult:
-    callbacks, last_good, best = _callbacks(job, run, model, eval_envs, signals, report, goes_on)
+    last_good, best = LastGoodModel(), _best_model(job, run, model, eval_envs, report, should_continue)
+    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
+    callbacks += [] if best is None else [best]
+    callbacks += [] if job.save_freq < 1 else [Checkpoint(job.save_freq, run.checkpoint)]
+    callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
+    callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
     start = time.perf_counter()
     try:
         model.learn(
@@ -194,12 +192,36 @@ def _learn(
     if last_good.snapshot is not None:
         write_snapshot(run, last_good.snapshot, model, resumable=True)
         report(
-            f"interrupted by {signals.name} after {last_good.snapshot.timesteps:,} transitions: model saved to {run.model}; "
+            f"interrupted by {signals.name} after {last_good.snapshot.timesteps:,} timesteps: model saved to {run.model}; "
             f"to go on: --resume {run.path}"
         )
     else:
         report(f"interrupted by {signals.name} before the first rollout: nothing to save in {run.path}")
     return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
+
+
+def _best_model(
+    job: TrainingJob,
+    run: RunFolder,
+    model: OnPolicyAlgorithm,
+    eval_envs: EvalEnvs,
+    report: Report,
+    should_continue: ShouldContinue,
+) -> BestModel | None:
+    if not eval_envs:
+        return None
+    return BestModel(
+        eval_envs[None],
+        every=job.eval_freq if job.eval_freq > 0 else 2**62,
+        n_episodes=job.eval_episodes,
+        seed=seed_for("evaluation", job.seed),
+        best_model=run.best_model,
+        evaluations=run.evaluations,
+        report=report,
+        others={task: env for task, env in eval_envs.items() if task is not None},
+        expert=getattr(model, "expert", None) if job.config.eval_expert else None,
+        should_continue=should_continue,
+    )
 
 
 def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, model: OnPolicyAlgorithm) -> None:
@@ -208,49 +230,11 @@ def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, 
     if snapshot is None:
         return
     write_snapshot(run, snapshot, model, resumable=False)
-    where = f"the model after {snapshot.timesteps:,} transitions is in {run.model}"
+    where = f"the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
         raise type(error)(f"{error}; {where}") from error
-    if isinstance(error, ValueError) and not _finite(model):
+    finite = all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
+    if isinstance(error, ValueError) and not finite:
         raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate; {where}") from error
-    error.add_note(where) if hasattr(error, "add_note") else None
-
-
-def _finite(model: OnPolicyAlgorithm) -> bool:
-    import torch as th
-
-    return all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
-
-
-def _callbacks(
-    job: TrainingJob,
-    run: RunFolder,
-    model: OnPolicyAlgorithm,
-    eval_envs: dict[str | None, VecEnv],
-    signals: StopSignals,
-    report: Report,
-    goes_on: GoesOn,
-) -> tuple[list[BaseCallback], LastGoodModel, BestModel | None]:
-    from sb3_quad.callbacks.best_model import BestModel
-    from sb3_quad.callbacks.checkpoint import Checkpoint
-    from sb3_quad.callbacks.episode_log import EpisodeLog
-    from sb3_quad.callbacks.stop import StopWhen
-    from sb3_quad.training.last_good import LastGoodModel
-
-    last_good = LastGoodModel()
-    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
-    best = None
-    if eval_envs:
-        every = job.eval_freq if job.eval_freq > 0 else 2**62
-        seed = job.seed + EVALUATION_SEED
-        others = {task: env for task, env in eval_envs.items() if task is not None}
-        expert = getattr(model, "expert", None) if job.config.eval_expert else None
-        files = run.best_model, run.evaluations
-        best = BestModel(eval_envs[None], every, job.eval_episodes, seed, *files, report, others, expert, goes_on)
-        callbacks.append(best)
-    if job.save_freq > 0:
-        callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
-    for path, kwargs in job.config.callback:
-        callbacks.append(import_class(path, "callback")(**kwargs))
-    callbacks.append(StopWhen(lambda: signals.received is not None))
-    return callbacks, last_good, best
+    if hasattr(error, "add_note"):  # Python 3.11 and later
+        error.add_note(where)
