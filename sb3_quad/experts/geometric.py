@@ -9,10 +9,14 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.experts.protocol import Actions, Expert
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.authority import command_lag, greatest_moments
-from sb3_quad.vehicles.gains import GeometricGains
+from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
+
+G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
@@ -79,7 +83,8 @@ class GeometricExpert(Expert):
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
-        _geometric(state.array, self._gains, self._body, self.vehicle.mixer_inverse, self._thrust_range, actions)
+        moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
+        _geometric(*moving, self._gains, self._body, self.vehicle.mixer_inverse, self._thrust_range, actions)
         return actions
 
 
@@ -93,11 +98,22 @@ def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-d
 def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped-def]
     """Desired force per mass in the world frame, m/s²."""
     distance = math.sqrt(ex * ex + ey * ey)
-    speed = _braking_profile(distance, gains[0], gains[4]) / distance if distance > 0.0 else gains[0]
-    fx, fy = gains[1] * (speed * ex - vx), gains[1] * (speed * ey - vy)
-    rise = math.copysign(_braking_profile(abs(ez), gains[2], gains[5] if ez > 0.0 else gains[12]), ez)
-    fz = max(0.1 * g, g + max(-gains[6], gains[3] * (rise - vz)))  # upwards, so that a tilt can be told
-    horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[7] * fz
+    speed = (
+        _braking_profile(distance, gains[G.position], gains[G.deceleration]) / distance
+        if distance > 0.0
+        else gains[G.position]
+    )
+    fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
+    rise = math.copysign(
+        _braking_profile(
+            abs(ez), gains[G.height_position], gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
+        ),
+        ez,
+    )
+    fz = max(
+        0.1 * g, g + max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
+    )  # upwards, so that a tilt can be told
+    horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[G.tilt] * fz
     scale = limit / horizontal if horizontal > limit else 1.0
     return scale * fx, scale * fy, fz
 
@@ -121,7 +137,7 @@ def _rotated(b1, b2, b3, p, q, r, time):  # type: ignore[no-untyped-def]
 @numba.njit(cache=True, error_model="numpy")
 def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-def]
     """Roll and pitch moments that turn the thrust to the direction (b1, b2, b3), body frame, N m."""
-    k_a, a_w, k_w = gains[8], gains[9], gains[10]
+    k_a, a_w, k_w = gains[G.attitude], gains[G.angular_deceleration], gains[G.body_rates]
     sine = math.sqrt(b1 * b1 + b2 * b2)
     angle = math.atan2(sine, b3)
     nx, ny = (-b2 / sine, b1 / sine) if sine > 1e-9 else (1.0, 0.0)
@@ -132,8 +148,9 @@ def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-
         nx, ny, angle = -nx, -ny, 2.0 * math.pi - angle
     rate = _braking_profile(angle, k_a, a_w)
     # The wanted rates stay in the world while the body yaws; then Euler's gyroscopic moments.
-    mx = body[2] * (k_w * (rate * nx - p) + r * rate * ny) + (body[4] - body[3]) * q * r
-    my = body[3] * (k_w * (rate * ny - q) - r * rate * nx) + (body[2] - body[4]) * r * p
+    _, _, ixx, iyy, izz, _ = body
+    mx = ixx * (k_w * (rate * nx - p) + r * rate * ny) + (izz - iyy) * q * r
+    my = iyy * (k_w * (rate * ny - q) - r * rate * nx) + (ixx - izz) * r * p
     return mx, my
 
 
@@ -160,18 +177,20 @@ def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: i
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _geometric(x, gains, body, mixer_inverse, thrust_range, actions):  # type: ignore[no-untyped-def]
-    mass, g, izz, lag = body[0], body[1], body[4], body[5]
-    low, high = thrust_range
-    for i in range(x.shape[1]):
-        w, qx, qy, qz = x[3, i], x[4, i], x[5, i], x[6, i]
-        p, q, r = x[10, i], x[11, i], x[12, i]
-        ex, ey, ez = x[17, i] - x[0, i], x[18, i] - x[1, i], x[19, i] - x[2, i]
-        fx, fy, fz = _desired_force(ex, ey, ez, x[7, i], x[8, i], x[9, i], gains, g)
+def _geometric(position, quaternion, velocity, rates, target, gains, body, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
+    mass, g, _, _, izz, lag = body
+    low, high = limits
+    for i in range(actions.shape[0]):
+        p, q, r = rates[0, i], rates[1, i], rates[2, i]
+        ex, ey, ez = target[0, i] - position[0, i], target[1, i] - position[1, i], target[2, i] - position[2, i]
+        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], gains, g)
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
-        b1 = ((1 - 2 * (qy * qy + qz * qz)) * fx + 2 * (qx * qy + w * qz) * fy + 2 * (qx * qz - w * qy) * fz) / size
-        b2 = (2 * (qx * qy - w * qz) * fx + (1 - 2 * (qx * qx + qz * qz)) * fy + 2 * (qy * qz + w * qx) * fz) / size
-        b3 = (2 * (qx * qz + w * qy) * fx + 2 * (qy * qz - w * qx) * fy + (1 - 2 * (qx * qx + qy * qy)) * fz) / size
+        (r11, r12, r13), (r21, r22, r23), (r31, r32, r33) = rotation_rows(
+            quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
+        )
+        b1 = (r11 * fx + r21 * fy + r31 * fz) / size
+        b2 = (r12 * fx + r22 * fy + r32 * fz) / size
+        b3 = (r13 * fx + r23 * fy + r33 * fz) / size
         b1, b2, b3 = _rotated(b1, b2, b3, p, q, r, lag)
         mx, my = _turn_moments(b1, b2, b3, p, q, r, gains, body)
-        _allocate(mass * size * b3, mx, my, -gains[11] * izz * r, mixer_inverse, low, high, actions[i])
+        _allocate(mass * size * b3, mx, my, -gains[G.yaw_rate] * izz * r, mixer_inverse, low, high, actions[i])

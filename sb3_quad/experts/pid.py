@@ -10,7 +10,8 @@ import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 ANGLE_FACTOR = 0.25  # φ_des and θ_des are taken at a quarter, "to ensure smoother rotations" (3.2.1)
@@ -57,22 +58,26 @@ class PIDExpert(Expert):
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
-        _pid(state.array, self._gains, self._attitude, self.vehicle.mixer_inverse, self._thrust_range, actions)
+        moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
+        _pid(*moving, self._gains, self._attitude, self.vehicle.mixer_inverse, self._thrust_range, actions)
         return actions
 
 
 @numba.njit(cache=True, fastmath=False)
-def _pid(x, gains, attitude, mixer_inverse, thrust_range, actions):  # type: ignore[no-untyped-def]
+def _pid(position, quaternion, velocity, rates, target, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
     kp, kd, ki_dt, mass, g = gains
-    low, high = thrust_range
+    low, high = limits
     middle, half = (high + low) / 2, (high - low) / 2
-    for i in range(x.shape[1]):
-        ex, ey, ez = x[17, i] - x[0, i], x[18, i] - x[1, i], x[19, i] - x[2, i]
-        w, qx, qy, qz = x[3, i], x[4, i], x[5, i], x[6, i]
-        vx, vy, vz = x[7, i], x[8, i], x[9, i]
-        r11, r12, r13 = 1 - 2 * (qy * qy + qz * qz), 2 * (qx * qy - w * qz), 2 * (qx * qz + w * qy)
-        r21, r22, r23 = 2 * (qx * qy + w * qz), 1 - 2 * (qx * qx + qz * qz), 2 * (qy * qz - w * qx)
-        r31, r32, r33 = 2 * (qx * qz - w * qy), 2 * (qy * qz + w * qx), 1 - 2 * (qx * qx + qy * qy)
+    for i in range(actions.shape[0]):
+        ex, ey, ez = (
+            target[0, i] - position[0, i],
+            target[1, i] - position[1, i],
+            target[2, i] - position[2, i],
+        )
+        vx, vy, vz = velocity[0, i], velocity[1, i], velocity[2, i]
+        (r11, r12, r13), (r21, r22, r23), (r31, r32, r33) = rotation_rows(
+            quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
+        )
         roll, pitch, yaw = math.atan2(r32, r33), math.asin(min(1.0, max(-1.0, -r31))), math.atan2(r21, r11)
         ax = kp * ex - kd * (r11 * vx + r21 * vy + r31 * vz)  # body-frame velocity
         ay = kp * ey - kd * (r12 * vx + r22 * vy + r32 * vz)
@@ -81,9 +86,9 @@ def _pid(x, gains, attitude, mixer_inverse, thrust_range, actions):  # type: ign
         roll_des = ANGLE_FACTOR * (ax * sin_yaw - ay * cos_yaw) / g
         pitch_des = ANGLE_FACTOR * (ax * cos_yaw + ay * sin_yaw) / g
         u1 = mass * (g + az + ki_dt * ez)
-        u2 = attitude[0, 0] * (roll_des - roll) - attitude[1, 0] * x[10, i]
-        u3 = attitude[0, 1] * (pitch_des - pitch) - attitude[1, 1] * x[11, i]
-        u4 = -attitude[0, 2] * yaw - attitude[1, 2] * x[12, i]  # ψ_des = 0
+        u2 = attitude[0, 0] * (roll_des - roll) - attitude[1, 0] * rates[0, i]
+        u3 = attitude[0, 1] * (pitch_des - pitch) - attitude[1, 1] * rates[1, i]
+        u4 = -attitude[0, 2] * yaw - attitude[1, 2] * rates[2, i]  # ψ_des = 0
         largest = -math.inf
         for k in range(4):
             m = mixer_inverse[k]

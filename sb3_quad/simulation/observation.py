@@ -12,9 +12,9 @@ import numpy as np
 from numba import float32
 
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled
-from sb3_quad.simulation.engine.physics import rotation_rows
 from sb3_quad.simulation.engine.random import random_words, standard_normals
 from sb3_quad.simulation.layout import first_rows, row_slices
+from sb3_quad.simulation.rotation import rotation_rows
 
 
 class Feature(NamedTuple):

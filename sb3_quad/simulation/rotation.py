@@ -1,11 +1,21 @@
-"""Rotation matrices and quaternions (w, x, y, z; body to world) over batches, in numpy."""
+"""Rotation matrices and quaternions (w, x, y, z; body to world)."""
 
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.simulation.engine.lowlevel import compiled
+
+
+@compiled(inline="always")
+def rotation_rows(qw, qx, qy, qz):
+    """The rotation matrix of a unit quaternion, row by row; for compiled code."""
+    return (
+        (1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)),
+        (2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)),
+        (2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)),
+    )
 
 
 def nearest_rotation(matrices: FloatArray) -> FloatArray:

@@ -13,6 +13,7 @@ import math
 
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled
 from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.rotation import rotation_rows
 from sb3_quad.simulation.state import WRENCH
 
 W = first_rows(WRENCH)
@@ -20,16 +21,6 @@ W = first_rows(WRENCH)
 MAX_COORDINATE_VELOCITY = 100.0  # btMultiBody's m_maxCoordinateVelocity, m/s and rad/s
 MAX_HALF_ANGLE = math.pi / 8.0  # btMultiBody's ANGULAR_MOTION_THRESHOLD, halved
 SMALL_STEP = 0.0025  # s; up to here half of dt |ω| stays below 0.2166, whatever ω the cut at 100 lets through
-
-
-@compiled(inline="always")
-def rotation_rows(qw, qx, qy, qz):
-    """The rotation matrix of a unit quaternion, body to world, row by row."""
-    return (
-        (1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)),
-        (2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)),
-        (2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)),
-    )
 
 
 @compiled(fastmath=True)

@@ -6,7 +6,8 @@ import math
 
 from sb3_quad.simulation.engine.block import P, X
 from sb3_quad.simulation.engine.lowlevel import compiled
-from sb3_quad.simulation.engine.physics import W, rotation_rows
+from sb3_quad.simulation.engine.physics import W
+from sb3_quad.simulation.rotation import rotation_rows
 
 NOT_FINITE, BODY_FRAME_ONLY, WORLD_FRAME_TOO = range(3)
 
