@@ -7,8 +7,8 @@ import weakref
 
 import numpy as np
 import numpy.typing as npt
-import pybullet as p
 
+from sb3_quad.base.bullet import p
 from sb3_quad.drawing.client import has_display, load_urdf_text, open_window
 from sb3_quad.drawing.urdf import vehicle_urdf
 from sb3_quad.simulation.engine.rotors import write_body

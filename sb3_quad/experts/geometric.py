@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.rotation import rotation_rows
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
@@ -88,13 +88,13 @@ class GeometricExpert(Expert):
         return actions
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-def]
     """Speed towards a target from which it can be braked: gain · distance near it, √(2 deceleration distance) far away."""
     return deceleration / gain * (math.sqrt(1.0 + 2.0 * gain * gain * distance / deceleration) - 1.0)
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped-def]
     """Desired force per mass in the world frame, m/s²."""
     distance = math.sqrt(ex * ex + ey * ey)
@@ -118,7 +118,7 @@ def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped
     return scale * fx, scale * fy, fz
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _rotated(b1, b2, b3, p, q, r, time):  # type: ignore[no-untyped-def]
     """A direction fixed in the world as the body sees it after turning with its present rates for some time."""
     rate = math.sqrt(p * p + q * q + r * r)
@@ -134,7 +134,7 @@ def _rotated(b1, b2, b3, p, q, r, time):  # type: ignore[no-untyped-def]
     )
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-def]
     """Roll and pitch moments that turn the thrust to the direction (b1, b2, b3), body frame, N m."""
     k_a, a_w, k_w = gains[G.attitude], gains[G.angular_deceleration], gains[G.body_rates]
@@ -154,7 +154,7 @@ def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-
     return mx, my
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: ignore[no-untyped-def]
     """Actions of one vehicle: roll and pitch before thrust, thrust before yaw, all within every rotor's limits."""
     middle, half = (high + low) / 2, (high - low) / 2
@@ -176,7 +176,7 @@ def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: i
         actions[k] = min(1.0, max(-1.0, (each - middle) / half))
 
 
-@numba.njit(cache=True, error_model="numpy")
+@compiled
 def _geometric(position, quaternion, velocity, rates, target, gains, body, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
     mass, g, _, _, izz, lag = body
     low, high = limits

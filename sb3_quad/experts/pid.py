@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.rotation import rotation_rows
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -63,7 +63,7 @@ class PIDExpert(Expert):
         return actions
 
 
-@numba.njit(cache=True, fastmath=False)
+@compiled
 def _pid(position, quaternion, velocity, rates, target, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
     kp, kd, ki_dt, mass, g = gains
     low, high = limits

@@ -17,8 +17,6 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-import sb3_quad
-
 LANES = 64  # rows of a block; a multiple of every vector width, small enough for a block to stay in the first cache
 
 
@@ -36,8 +34,9 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 
 def _source_stamp() -> tuple[tuple[str, float, int], ...]:
-    names = ("base/*.py", "vehicles/*.py", "simulation/*.py", "simulation/engine/*.py")
-    files = sorted(path for root in sb3_quad.__path__ for name in names for path in Path(root).glob(name))
+    package = Path(__file__).resolve().parents[2]
+    folders = ("base", "vehicles", "simulation", "experts")
+    files = sorted(path for folder in folders for path in (package / folder).rglob("*.py"))
     return tuple((path.name, os.stat(path).st_mtime, os.stat(path).st_size) for path in files)
 
 
