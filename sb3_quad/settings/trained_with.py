@@ -8,8 +8,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.settings.config import read_yaml
-from sb3_quad.settings.literals import parse_mapping
-from sb3_quad.settings.zoo_yaml import ZooLoader
+from sb3_quad.settings.literals import ZooLoader, parse_mapping
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ import yaml
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.settings.config import read_yaml
-from sb3_quad.settings.zoo_yaml import ZooLoader
+from sb3_quad.settings.literals import ZooLoader
 
 
 @dataclass(frozen=True)
