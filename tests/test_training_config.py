@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
+from typing import Any, Literal
+
 import pytest
 import torch.nn as nn
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.settings.algorithms import ALGORITHMS
+from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
 from sb3_quad.settings.config import build_config, check_environment, config_names, load_config, read_settings
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
-from sb3_quad.settings.values import qualified_classes
+from sb3_quad.settings.values import convert, qualified_classes, takes_whole
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -94,6 +99,10 @@ def test_mappings_survive(mapping):
         ({"learning_rate": "fast"}, "must be a number or lin_<number>"),
         ({"learning_rate": "lin_fast"}, "must be lin_ and a number"),
         ({"learning_rate": float("nan")}, "must be finite"),
+        ({"n_steps": True}, "n_steps is True, must be a whole number"),
+        ({"gamma": False}, "gamma is False, must be a number"),
+        ({"n_steps": None}, "must be a whole number"),
+        ({"bc_loss": "mae"}, "'mse', 'nll'"),
         ({"policy": "MlpPolciy"}, "did you mean 'MlpPolicy'"),
         ({"vec_env": "bath"}, "did you mean 'batch'"),
         ({"env_kwargs": {"nosie": 0}}, "did you mean 'noise'"),
@@ -169,6 +178,65 @@ def test_settings_can_be_written_and_read_again():
     again = build_config("dagger", ENV, yaml.safe_load(yaml.safe_dump(config.settings)))
     assert again.policy_kwargs["activation_fn"] is nn.ReLU
     assert repr(sorted(again.hyperparams.items())) == repr(sorted(config.hyperparams.items()))
+
+
+@pytest.mark.parametrize("algorithm", [A2C, DDPG, DQN, PPO, SAC, TD3, *map(get_algorithm, ALGORITHMS)])
+def test_the_types_of_every_algorithm_are_resolved(algorithm):
+    parameters = constructor_parameters(algorithm)
+    assert not [name for name, parameter in parameters.items() if parameter.annotation is Any]
+    given = {name: parameter for name, parameter in parameters.items() if parameter.default is not parameter.empty}
+    assert {name: convert(each.default, each, name) for name, each in given.items()} == {
+        name: each.default for name, each in given.items()
+    }
+    assert not takes_whole(parameters["gamma"]) and not takes_whole(parameters["learning_rate"])
+    assert takes_whole(parameters["n_steps" if "n_steps" in parameters else "batch_size"])
+
+
+class Foreign:
+    """A constructor whose annotations are strings, one of them of a name that is not there."""
+
+    def __init__(self, steps: int, rate: float | Missing, plain=1):  # noqa: F821
+        pass
+
+
+def test_a_type_that_cannot_be_resolved_takes_any_value():
+    parameters = constructor_parameters(Foreign)
+    assert [parameter.annotation for parameter in parameters.values()] == [int, Any, Any]
+    assert convert("lin_2", parameters["rate"], "rate")(0.5) == 1.0
+    assert not takes_whole(parameters["rate"])
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "expected"),
+    [
+        (int | None, "4.0", 4),
+        (float | None, None, None),
+        (bool, "False", False),
+        (str | float, "auto", "auto"),
+        (int | tuple[int, str], [1, "episode"], (1, "episode")),
+        (dict[str, Any] | None, "dict(a=1)", {"a": 1}),
+        (type[RolloutBuffer] | None, DictRolloutBuffer, DictRolloutBuffer),
+        (type[RolloutBuffer] | None, "package.Buffer", "package.Buffer"),  # rl_zoo3 imports it
+    ],
+)
+def test_a_value_becomes_what_its_type_says(kind, value, expected):
+    found = convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
+    assert found == expected and type(found) is type(expected)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "message"),
+    [
+        (type[RolloutBuffer], ReplayBuffer, "must be a subclass of RolloutBuffer"),
+        (dict[str, Any], "abc", "must be a valid dictionary"),
+        (Literal["a", "b"], "c", "must be 'a' or 'b'"),
+        (float, "inf", "must be a finite number"),
+        (Any, float("nan"), "must be finite"),
+    ],
+)
+def test_a_value_of_another_type_is_refused(kind, value, message):
+    with pytest.raises(ConfigError, match=message):
+        convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
 
 
 @pytest.mark.parametrize("name", config_names())

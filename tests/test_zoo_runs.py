@@ -12,7 +12,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.settings.config import read_yaml
-from sb3_quad.settings.zoo_yaml import ZooLoader
+from sb3_quad.settings.literals import ZooLoader
 
 ENV = "QuadStateRecovery-v0"
 TAGGED = """!!python/object/apply:collections.OrderedDict

@@ -10,7 +10,7 @@ from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
 EXAMPLES = """The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
-world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It gives what to command of the four rotors.
+world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It gives the command of each rotor.
 Scaling and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
 
 examples:
@@ -19,7 +19,7 @@ examples:
   sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
 
-ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'
+ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header needs a C compiler, which checks it.
 """
 
 
@@ -42,23 +42,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Build, check, time, write. Returns the exit code."""
-    from sb3_quad.base.files import write_bytes
+    from sb3_quad.base.files import refuse_existing, write_bytes
     from sb3_quad.export.c_header import c_name
     from sb3_quad.export.policy import FORMATS, export_policy
 
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
-    model, ending = Path(options.model), FORMATS[options.format]
+    model = Path(options.model)
     if not model.is_file():
         raise ConfigError(f"model {model}: no such file")
-    file = Path(options.file) if options.file else model.with_suffix(ending)
-    if file.is_dir():
-        raise ConfigError(f"{file}: is a folder; give the path of a file, such as {file / ('policy' + ending)}")
-    if file.exists():
-        if file.samefile(model):
-            raise ConfigError(f"{file}: is the model itself; give another file with -o")
-        if not options.overwrite:
-            raise ConfigError(f"{file}: is there already; give --overwrite, or another file with -o")
+    file = Path(options.file) if options.file else model.with_suffix(FORMATS[options.format])
+    if file.exists() and file.samefile(model):
+        raise ConfigError(f"{file}: is the model itself; give another file with -o")
+    refuse_existing(file, options.overwrite)
     if options.name is not None and options.format != "c":
         raise ConfigError(f"--name {options.name}: only a C header has one (--format c)")
     name = c_name(file.stem) if options.name is None else options.name
@@ -67,7 +63,6 @@ def run(options: argparse.Namespace) -> int:
     print(f"settings: {exported.settings}")
     for key in ("vehicle", "scaling", "network", "observation", "result", "rotors", "check"):
         print(f"{key}: {exported.metadata[key]}")
-    if exported.microseconds is not None:
-        print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
+    print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
     print(f"saved {file} ({len(exported.content)} bytes)")
     return 0

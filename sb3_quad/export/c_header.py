@@ -5,15 +5,15 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.export.network import N_ROTORS, Layer, Network
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.base.arrays import Float32Array
+from sb3_quad.export.network import Network
 
 WIDTH = 110  # columns
+RESULTS = {"none": "sum", "tanh": "tanhf(sum)", "relu": "sum < 0.0f ? 0.0f : sum"}
 
 
 def c_name(text: str) -> str:
@@ -22,30 +22,19 @@ def c_name(text: str) -> str:
     return name if name and not name[0].isdigit() else f"quad_{name}".rstrip("_")
 
 
-def check_name(name: str) -> str:
-    """``name``, if C identifiers may begin so.
-
-    :raises ConfigError: it cannot.
-    """
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
-        raise ConfigError(f"--name {name!r}: must be a C identifier: letters, digits and underscores, a letter first")
-    return name
-
-
-def write(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
+def write_header(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
     """The header, with ``static inline void NAME_policy(const float observation[18], float thrust[4])``.
 
-    For speeds the second parameter is called ``rotor_speed``.
-
+    :param network: for speeds the second parameter is called ``rotor_speed``.
     :param metadata: becomes the comment at the top.
-    :param name: see :func:`check_name`.
+    :param name: beginning of the identifiers, as :func:`c_name` gives it.
     """
-    guard = f"{name.upper()}_POLICY_H"
-    prefix = f"{name}_policy"
-    tables = [_table(f"{prefix}_mean", network.mean), _table(f"{prefix}_inverse_std", network.inverse_std)]
-    for k, layer in enumerate(network.layers):
-        tables += [_table(f"{prefix}_weight_{k}", layer.weight), _table(f"{prefix}_bias_{k}", layer.bias)]
-    parts = [_comment(metadata), f"#ifndef {guard}\n#define {guard}\n\n#include <math.h>\n", *tables]
+    guard, prefix = f"{name.upper()}_POLICY_H", f"{name}_policy"
+    tables = {"mean": network.mean, "inverse_std": network.inverse_std}
+    for k, (layer, _) in enumerate(network.steps):
+        tables |= {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}
+    arrays = [_table(f"{prefix}_{key}", value.numpy()) for key, value in tables.items()]
+    parts = [_comment(metadata), f"#ifndef {guard}\n#define {guard}\n\n#include <math.h>\n", *arrays]
     return "\n".join([*parts, _function(network, prefix), f"#endif /* {guard} */\n"]).encode("ascii")
 
 
@@ -59,60 +48,50 @@ def _comment(metadata: Mapping[str, str]) -> str:
     return "\n".join(["/*", *(f" * {line}" for line in lines), " */"])
 
 
-def _number(value: np.float32) -> str:
-    text = f"{float(value):.9g}"  # nine digits tell any two float32 apart
-    return f"{text}f" if "." in text or "e" in text else f"{text}.0f"
+def _number(value: Any) -> str:
+    return f"{np.float32(value)!s}f"  # the fewest digits that tell it from any other float32
 
 
-def _table(name: str, values: npt.NDArray[np.float32]) -> str:
+def _table(name: str, values: Float32Array) -> str:
     size = "".join(f"[{length}]" for length in values.shape)
-    rows = values if values.ndim == 2 else values[None]
-    lines = []
-    for row in rows:
-        text = textwrap.fill(", ".join(map(_number, row)), WIDTH - 8, break_on_hyphens=False)
-        lines.append(textwrap.indent(f"{{{text}}}," if values.ndim == 2 else text, "    "))
-    return "\n".join([f"static const float {name}{size} = {{", *lines, "};\n"])
+    with np.printoptions(threshold=values.size, linewidth=WIDTH, formatter={"float_kind": _number}):
+        rows = np.array2string(values, separator=", ").translate(str.maketrans("[]", "{}"))
+    return f"static const float {name}{size} =\n{rows};\n"
 
 
 def _function(network: Network, prefix: str) -> str:
-    lines = [
-        f"static inline void {prefix}(const float observation[{OBSERVATION_SIZE}], float {network.result}[{N_ROTORS}])",
-        "{",
-        f"    float layer_0[{OBSERVATION_SIZE}];",
-        *(f"    float layer_{k + 1}[{len(layer.bias)}];" for k, layer in enumerate(network.layers)),
-        "    int i, j;",
-        "",
-        f"    for (i = 0; i < {OBSERVATION_SIZE}; ++i) {{",
-        f"        layer_0[i] = (observation[i] - {prefix}_mean[i]) * {prefix}_inverse_std[i];",
-        "    }",
-    ]
-    for k, layer in enumerate(network.layers):
-        lines += _layer(k, layer, prefix)
-    last = f"layer_{len(network.layers)}"
-    lines += [
-        f"    for (i = 0; i < {N_ROTORS}; ++i) {{",
-        f"        float a = {last}[i];",
-        "",
-        "        a = a < -1.0f ? -1.0f : (a > 1.0f ? 1.0f : a);",
-        f"        a = {_number(network.middle)} + {_number(network.half_range)} * a;",
-        f"        {network.result}[i] = {'a' if network.output == 'thrusts' else 'sqrtf(a < 0.0f ? 0.0f : a)'};",
-        "    }",
-        "}",
-        "",
-    ]
-    return "\n".join(lines)
+    layers = network.steps
+    inputs, outputs = layers[0][0].in_features, layers[-1][0].out_features
+    root = "a" if network.output == "thrusts" else "sqrtf(a < 0.0f ? 0.0f : a)"
+    declarations = [f"    float layer_{k + 1}[{layer.out_features}];\n" for k, (layer, _) in enumerate(layers)]
+    loops = [
+        f"""\
+    for (i = 0; i < {layer.out_features}; ++i) {{
+        float sum = {prefix}_bias_{k}[i];
 
-
-def _layer(k: int, layer: Layer, prefix: str) -> list[str]:
-    outputs, inputs = layer.weight.shape
-    result = {"none": "sum", "tanh": "tanhf(sum)", "relu": "sum < 0.0f ? 0.0f : sum"}[layer.activation]
-    return [
-        f"    for (i = 0; i < {outputs}; ++i) {{",
-        f"        float sum = {prefix}_bias_{k}[i];",
-        "",
-        f"        for (j = 0; j < {inputs}; ++j) {{",
-        f"            sum += {prefix}_weight_{k}[i][j] * layer_{k}[j];",
-        "        }",
-        f"        layer_{k + 1}[i] = {result};",
-        "    }",
+        for (j = 0; j < {layer.in_features}; ++j) {{
+            sum += {prefix}_weight_{k}[i][j] * layer_{k}[j];
+        }}
+        layer_{k + 1}[i] = {RESULTS[activation]};
+    }}
+"""
+        for k, (layer, activation) in enumerate(layers)
     ]
+    return f"""\
+static inline void {prefix}(const float observation[{inputs}], float {network.result}[{outputs}])
+{{
+    float layer_0[{inputs}];
+{"".join(declarations)}    int i, j;
+
+    for (i = 0; i < {inputs}; ++i) {{
+        layer_0[i] = (observation[i] - {prefix}_mean[i]) * {prefix}_inverse_std[i];
+    }}
+{"".join(loops)}    for (i = 0; i < {outputs}; ++i) {{
+        float a = layer_{len(layers)}[i];
+
+        a = a < -1.0f ? -1.0f : (a > 1.0f ? 1.0f : a);
+        a = {_number(network.middle)} + {_number(network.half_range)} * a;
+        {network.result}[i] = {root};
+    }}
+}}
+"""

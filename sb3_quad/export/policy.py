@@ -3,47 +3,39 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass
+import re
+import warnings
+from collections.abc import Callable, Iterable
+from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import numpy.typing as npt
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.experts.models import load_model, saved_algorithm
-from sb3_quad.export import c_header, c_trial, onnx, torchscript
-from sb3_quad.export.check import N_OBSERVATIONS, Trial, draw_samples, largest_error
-from sb3_quad.export.network import Float32Array, Network, build_network, result_range
-from sb3_quad.settings.trained_with import trained_with
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.export import check
+from sb3_quad.export.c_header import c_name, write_header
+from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.vehicles.vehicle import Vehicle
 
-FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}
-"""Each format and the ending of its files."""
-_SIGN = {1: "+", -1: "-"}
+FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
 
 
-@dataclass(frozen=True)
-class Export:
-    """An exported policy, not yet on disk.
+class Export(NamedTuple):
+    """An exported policy, not yet on disk."""
 
-    :param content: the file.
-    :param metadata: what it says about itself.
-    :param max_error: the largest difference to the policy, in ``unit``.
-    :param unit: ``N`` or ``rad/s``.
-    :param microseconds: per call with one observation, on one thread; None where it could not be run.
-    :param checked_by: what ran it.
-    :param settings: the file that vehicle and scaling came from, where they were not given.
-    """
-
-    content: bytes
-    metadata: dict[str, str]
-    max_error: float
-    unit: str
-    microseconds: float | None
-    checked_by: str
-    settings: str
+    content: bytes  # the file
+    metadata: dict[str, str]  # what it says about itself
+    max_error: float  # the largest difference to the policy, in `unit`
+    unit: str  # N or rad/s
+    microseconds: float  # per call with one observation, on one thread
+    checked_by: str  # what ran it
+    settings: str  # the file that vehicle and scaling came from, where they were not given
 
 
 def export_policy(
@@ -54,65 +46,62 @@ def export_policy(
     observation_mean: npt.ArrayLike | None = None,
     observation_std: npt.ArrayLike | None = None,
     name: str | None = None,
-    n_observations: int = N_OBSERVATIONS,
+    n_observations: int = check.N_OBSERVATIONS,
 ) -> Export:
     """The policy of an on-policy SB3 zip (PPO, A2C, DAgger, PPOBC; ``MlpPolicy``) as a file that flies by itself.
 
-    What it is given are the 18 features of an observation in physical units, see ``metadata["observation"]``; what it gives
-    are the four rotors' thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Vehicle and scaling that are
-    not given are those of the settings in the zip's run folder, or else ``itm`` and Table A.2.
+    It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Vehicle and scaling that are not given are those of
+    the settings in the zip's run folder, or else ``itm`` and Table A.2.
 
-    :param file_format: ``onnx``, ``torchscript`` or ``c``.
-    :param output: ``thrusts`` or ``speeds``.
+    :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
     :param observation_mean: μ of Eq. 3.16, (18,); ``observation_std`` σ, likewise.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
     :param n_observations: of the check; even.
-    :raises ConfigError: an unknown format or output, a zip that cannot be read, whose spaces are not the quadcopter's or
-        whose policy is no ``MlpPolicy``, or a package that the format needs and that is not installed.
+    :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are not the quadcopter's or
+        whose policy is no ``MlpPolicy``; a package or a C compiler that is not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
     """
-    if file_format not in FORMATS:
-        raise ConfigError(unknown("format", file_format, FORMATS))
-    prefix = c_header.c_name(Path(path).stem) if name is None else c_header.check_name(name)
-    algorithm, model = saved_algorithm(path), load_model(path)
-    given = trained_with(path)
-    flown = load_vehicle(vehicle if vehicle is not None else given.vehicle or "itm")
-    mean = given.observation_mean if observation_mean is None else observation_mean
-    std = given.observation_std if observation_std is None else observation_std
-    network = build_network(model, flown, output, mean, std, f"model {path}")
-    samples = draw_samples(model, flown, mean, std, n_observations)
-    metadata = _describe(Path(path), algorithm, network, flown)
-    trial = _run(file_format, _write(file_format, network, metadata, prefix), samples.physical, prefix, network)
-    error = largest_error(model, samples, trial, flown, network.output)
-    count = len(samples.physical)
-    metadata["check"] = f"largest error {error:.2g} {network.unit} in {count} observations ({trial.by})"
-    content = _write(file_format, network, metadata, prefix)
-    return Export(content, metadata, error, network.unit, trial.microseconds, trial.by, given.source)
+    prefix = c_name(Path(path).stem) if name is None else name
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix):
+        raise ConfigError(f"--name {name!r}: must be a C identifier: letters, digits and underscores, a letter first")
+    formats: dict[str, tuple[Callable[..., bytes], Callable[..., tuple[check.Call, str]]]] = {
+        "onnx": (write_onnx, check.load_onnx),
+        "torchscript": (write_torchscript, check.load_torchscript),
+        "c": (partial(write_header, name=prefix), partial(check.load_header, name=prefix)),
+    }
+    if file_format not in formats:
+        raise ConfigError(unknown("format", file_format, formats))
+    write, load = formats[file_format]
+    algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), FlightSettings.beside(path)
+    changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
+    settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
+    row = QuadcopterBatch(1, **settings.keywords(), n_threads=1)  # it checks them
+    reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output)
+    network = build_network(reference, f"model {path}")
+    metadata = _describe(Path(path), algorithm, network, reference)
+    with warnings.catch_warnings():
+        # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        call, by = load(write(network, metadata))
+        observations = reference.sample_observations(n_observations)
+        error = reference.largest_error(observations, call(observations), by)
+        metadata["check"] = f"largest error {error:.2g} {network.unit} in {len(observations)} observations ({by})"
+        content = write(network, metadata)
+    time = check.time_calls(call, observations, at_once=file_format == "c")
+    return Export(content, metadata, error, network.unit, time, by, source)
 
 
-def _write(file_format: str, network: Network, metadata: dict[str, str], prefix: str) -> bytes:
-    if file_format == "c":
-        return c_header.write(network, metadata, prefix)
-    return onnx.write(network, metadata) if file_format == "onnx" else torchscript.write(network, metadata)
-
-
-def _run(file_format: str, content: bytes, observations: Float32Array, prefix: str, network: Network) -> Trial:
-    if file_format == "c":
-        return c_trial.run(content, observations, prefix, network)
-    return onnx.run(content, observations) if file_format == "onnx" else torchscript.run(content, observations)
-
-
-def _describe(path: Path, algorithm: str, network: Network, vehicle: Vehicle) -> dict[str, str]:
+def _describe(path: Path, algorithm: str, network: Network, reference: check.Reference) -> dict[str, str]:
     """What users of the file must know; ASCII but for names."""
-    low, high = result_range(vehicle, network.output)
-    what = "thrust" if network.output == "thrusts" else "speed"
+    vehicle = reference.vehicle
+    low, high = reference.results([-1.0, 1.0])
     rotors = enumerate(zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True))
-    sizes = [len(network.mean), *(len(layer.bias) for layer in network.layers)]
-    hidden = ", ".join(layer.activation for layer in network.layers[:-1]) or "none"
-    std = _compact([f"{1.0 / value:.6g}" for value in network.inverse_std])
-    mean = _compact([f"{value:.6g}" for value in network.mean])
-    facts: dict[str, Any] = {
+    sizes = [len(network.mean), *(layer.out_features for layer, _ in network.steps)]
+    hidden = ", ".join(activation for _, activation in network.steps[:-1]) or "none"
+    n_parameters = sum(parameter.numel() for parameter in network.parameters())
+    return {
         "policy": f"{path.name} ({algorithm}), sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}",
         "made_by": f"sb3_quad {__version__}",
         "vehicle": f"{vehicle.name}: hover thrust {vehicle.hover_thrust:.6g} N, kF {vehicle.thrust_coefficient:.6g} N s^2",
@@ -120,16 +109,16 @@ def _describe(path: Path, algorithm: str, network: Network, vehicle: Vehicle) ->
         "observation": "18 numbers, not scaled: 0-2 position minus target position, world frame, m; "
         "3-11 rotation matrix world to body (v_body = R v_world), row by row; "
         "12-14 linear velocity, body frame, m/s; 15-17 body rates, body frame, rad/s",
-        "result": f"4 numbers: the {what} to command of each rotor, {network.unit}, within {low:.6g} to {high:.6g}",
-        "rotors": "; ".join(f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {_SIGN[sign]}" for k, ((x, y), sign) in rotors),
+        "result": f"4 numbers: the {network.output.removesuffix('s')} to command of each rotor, {network.unit}, "
+        f"within {low:.6g} to {high:.6g}",
+        "rotors": "; ".join(f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {sign:+d}"[:-1] for k, ((x, y), sign) in rotors),
         "period": f"{vehicle.control_step:g} s between calls, as in training",
-        "scaling": f"done inside, (x - mean) / std with mean {mean} and std {std}",
-        "network": f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, {network.n_parameters} float32 parameters",
+        "scaling": f"done inside, (x - mean) / std with mean {_compact(reference.mean)} and std {_compact(reference.std)}",
+        "network": f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, {n_parameters} float32 parameters",
         "check": "pending",
     }
-    return facts
 
 
-def _compact(words: list[str]) -> str:
-    """Equal words in a row once, with how many they are: ``5.7735 (3 times), 1.73205 (9 times)``."""
-    return ", ".join(f"{word} ({len(list(group))} times)" for word, group in groupby(words))
+def _compact(values: Iterable[float]) -> str:
+    """Equal numbers in a row once, with how many they are: ``5.7735 (3 times), 1.73205 (9 times)``."""
+    return ", ".join(f"{word} ({len(list(group))} times)" for word, group in groupby(f"{value:.6g}" for value in values))

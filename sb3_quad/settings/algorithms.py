@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from typing import TYPE_CHECKING
+import typing
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 
@@ -32,13 +34,26 @@ def get_algorithm(name: str) -> type[OnPolicyAlgorithm]:
 
 
 def constructor_parameters(algorithm: type[OnPolicyAlgorithm]) -> dict[str, inspect.Parameter]:
-    """What an algorithm's settings may give: its constructor's keywords, less those that a training job sets."""
-    parameters = inspect.signature(algorithm.__init__).parameters
+    """What an algorithm's settings may give: its constructor's keywords, less those that a training job sets.
+
+    The annotation of each is a type; Any where there is none, or where its names cannot be resolved.
+    """
+    constructor = inspect.unwrap(algorithm.__init__)
     return {
-        name: parameter
-        for name, parameter in parameters.items()
+        name: parameter.replace(annotation=_resolve(parameter.annotation, constructor.__globals__))
+        for name, parameter in inspect.signature(constructor).parameters.items()
         if name not in _SET_BY_JOB and not name.startswith("_") and parameter.kind is not parameter.VAR_KEYWORD
     }
+
+
+def _resolve(annotation: Any, names: dict[str, Any]) -> Any:
+    if annotation is inspect.Parameter.empty:
+        return Any
+    alone = SimpleNamespace(__annotations__={"value": annotation})  # a name that is missing spoils all others otherwise
+    try:
+        return typing.get_type_hints(alone, names)["value"]
+    except Exception:  # an annotation is any expression, and fails as it likes
+        return Any
 
 
 def takes_expert(algorithm: type[OnPolicyAlgorithm]) -> bool:

@@ -11,8 +11,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import parse_mapping_file
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
-from sb3_quad.settings.literals import parse_mapping
-from sb3_quad.settings.zoo_yaml import ZooLoader
+from sb3_quad.settings.literals import ZooLoader, parse_mapping
 
 
 class FlightSettings(Frozen):

@@ -3,25 +3,21 @@
 from __future__ import annotations
 
 import ast
-import importlib
+import pkgutil
 import re
+from contextlib import suppress
 from typing import Any
 
+import yaml
+
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.files import one_line
 
 _NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _ACTIVATIONS = ("ELU", "GELU", "Hardtanh", "LeakyReLU", "Mish", "ReLU", "ReLU6", "SELU", "Sigmoid", "SiLU", "Softplus", "Tanh")
 _OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
-CLASSES = {
-    **{f"nn.{name}": ("torch.nn", name) for name in _ACTIVATIONS},
-    **{f"optim.{name}": ("torch.optim", name) for name in _OPTIMIZERS},
-}
-_PREFIXES = ("torch.", "th.")
-_CLASS_NAME = re.compile(r"((torch|th)\.)?(nn|optim)\.")
-
-
-class _NotLiteral(ValueError):
-    """An expression that is more than literals and known classes."""
+CLASSES = (*(f"nn.{name}" for name in _ACTIVATIONS), *(f"optim.{name}" for name in _OPTIMIZERS))
+_CLASS_NAME = re.compile(r"(?:torch\.|th\.)?((?:nn|optim)\..*)")
 
 
 def parse_number(value: Any) -> Any:
@@ -32,54 +28,34 @@ def parse_number(value: Any) -> Any:
     """
     if not isinstance(value, str) or not _NUMBER.fullmatch(value.strip()):
         return value
-    text = value.strip()
-    return int(text) if re.fullmatch(r"[+-]?\d[\d_]*", text) else float(text)
+    return float(value) if re.search(r"[.eE]", value) else int(value)
 
 
-def parse_value(text: str) -> Any:
+def parse_value(text: str, key: str = "") -> Any:
     """The value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the string itself.
 
     >>> parse_value("[64, 64]"), parse_value("dict(a=1)"), parse_value("mse"), parse_value("lin_1e-3")
     ([64, 64], {'a': 1}, 'mse', 'lin_1e-3')
+
+    :raises ConfigError: there is a ``key``, which the message names, and the text is no literal.
     """
-    number = parse_number(text)
-    if not isinstance(number, str):
-        return number
     try:
         return _evaluate(ast.parse(text.strip(), mode="eval").body)
-    except (SyntaxError, ValueError, RecursionError, MemoryError):
-        return text
+    except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError) as error:
+        if key:
+            raise ConfigError(f"{key}: {text!r} cannot be read ({one_line(error)}); write dict(name=literal, …)") from None
+        return parse_number(text)
 
 
 def parse_mapping(value: Any, key: str) -> dict[str, Any]:
     """A mapping given as one, as None, or as rl-zoo's string ``"dict(net_arch=[64, 64], activation_fn=nn.Tanh)"``.
 
-    Strings that name a known class, such as ``nn.Tanh``, become the class.
-
-    :raises ConfigError: anything else; the message names ``key``.
+    :raises ConfigError: anything else; the message names ``key``. Names such as ``nn.Tanh`` become classes.
     """
-    if value is None:
-        return {}
-    if isinstance(value, str):
-        try:
-            value = _evaluate(ast.parse(value.strip(), mode="eval").body)
-        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-            reason = str(error) if isinstance(error, _NotLiteral) else "not an expression"
-            raise ConfigError(f"{key}: {value!r} cannot be read ({reason}); write dict(name=literal, …)") from None
-    if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
+    given = parse_value(value, key) if isinstance(value, str) else {} if value is None else value
+    if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
         raise ConfigError(f"{key}: must be a mapping of names to values, not {value!r}")
-    return {name: _named(entry, f"{key}.{name}") for name, entry in value.items()}
-
-
-def find_class(name: str) -> type | None:
-    """The class of a name such as ``nn.Tanh``, ``torch.nn.Tanh`` or ``th.optim.Adam``; None for other strings."""
-    for prefix in _PREFIXES:
-        name = name.removeprefix(prefix)
-    if name not in CLASSES:
-        return None
-    module, attribute = CLASSES[name]
-    found = getattr(importlib.import_module(module), attribute)
-    return found if isinstance(found, type) else None
+    return {name: _named(entry, f"{key}.{name}") for name, entry in given.items()}
 
 
 def _named(value: Any, key: str) -> Any:
@@ -89,10 +65,11 @@ def _named(value: Any, key: str) -> Any:
         return type(value)(_named(entry, key) for entry in value)
     if not isinstance(value, str):
         return value
-    found = find_class(value)
-    if found is None and _CLASS_NAME.match(value):
+    if (match := _CLASS_NAME.fullmatch(value)) is None:
+        return parse_number(value)
+    if match[1] not in CLASSES:
         raise ConfigError(f"{key}: {unknown('class', value, CLASSES)}")
-    return found if found is not None else parse_number(value)
+    return pkgutil.resolve_name(f"torch.{match[1]}")
 
 
 def _evaluate(node: ast.expr) -> Any:
@@ -112,4 +89,24 @@ def _evaluate(node: ast.expr) -> Any:
             return {str(entry.arg): _evaluate(entry.value) for entry in keywords}
         case ast.Attribute() if _CLASS_NAME.match(ast.unparse(node)):
             return ast.unparse(node)
-    raise _NotLiteral(f"{ast.unparse(node)!r} is not a literal")
+    raise ValueError(f"{ast.unparse(node)!r} is not a literal")
+
+
+class ZooLoader(yaml.SafeLoader):
+    """Of rl_zoo3's YAML, which may call any function there: ordered mappings, tuples and the names of ``CLASSES`` alone."""
+
+    def construct_python(self, tag: str, node: Any) -> Any:  # torch.nn.modules.activation.Tanh becomes nn.Tanh
+        kind, _, name = tag.partition(":")
+        with suppress(TypeError, ValueError):
+            match kind, name.split("."):
+                case "tuple", _:
+                    return self.construct_sequence(node, deep=True)
+                case "object/apply", ["collections", "OrderedDict"]:
+                    (pairs,) = self.construct_sequence(node, deep=True)
+                    return dict(pairs)
+                case "name", ["torch", module, *_, attribute] if f"{module}.{attribute}" in CLASSES:
+                    return f"{module}.{attribute}"
+        raise yaml.YAMLError(f"{tag} is nothing that settings may hold")
+
+
+ZooLoader.add_multi_constructor("tag:yaml.org,2002:python/", ZooLoader.construct_python)

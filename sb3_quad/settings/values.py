@@ -1,17 +1,18 @@
-"""One value of the settings at a time: checked against what it is for, and converted."""
+"""One value of the settings at a time: checked against the type it is for, and converted."""
 
 from __future__ import annotations
 
-import importlib
 import inspect
 import math
-import re
+import pkgutil
+from contextlib import suppress
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.settings.literals import parse_mapping, parse_number
+from pydantic import ConfigDict, PositiveInt, PydanticUserError, TypeAdapter, ValidationError
+from stable_baselines3.common.utils import LinearSchedule
 
-_LINEAR = re.compile(r"lin_(.+)")
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 
 
 def positive_whole(value: Any, where: str) -> int:
@@ -19,43 +20,30 @@ def positive_whole(value: Any, where: str) -> int:
 
     :raises ConfigError: anything else.
     """
-    number = parse_number(value)
-    if isinstance(number, bool) or not isinstance(number, (int, float)) or not math.isfinite(number) or number != int(number):
-        raise ConfigError(f"{where} is {value!r}, must be a whole number")
-    if number < 1:
-        raise ConfigError(f"{where} is {value!r}, must be at least 1")
-    return int(number)
+    return int(_validate(PositiveInt, parse_number(value), where))
 
 
 def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
-    """``value`` as the constructor's ``parameter`` takes it.
+    """``value`` as the constructor's ``parameter`` takes it, whose annotation is a type.
 
-    Strings become numbers or, as ``lin_x``, SB3's ``LinearSchedule(x, 0, 1)``, which every SB3 can unpickle.
+    Strings become literals or, as ``lin_x``, SB3's ``LinearSchedule(x, 0, 1)``, which every SB3 can unpickle.
 
-    :raises ConfigError: text where a number belongs, a fraction where a whole number does, NaN or infinity.
+    :raises ConfigError: text where a number belongs, a fraction where a whole number does, another type; NaN or infinity.
     """
-    kinds = _kinds(parameter)
-    value = parse_number(value)
-    if isinstance(value, str) and (match := _LINEAR.fullmatch(value)):
-        return _linear(match.group(1), kinds, where)
-    numeric = kinds & {"int", "float"}
-    if isinstance(value, str) and numeric and not kinds & {"str", "Any", "dict", "type"}:
-        raise ConfigError(f"{where} is {value!r}, must be a number{' or lin_<number>' if 'Schedule' in kinds else ''}")
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return value
-    if not math.isfinite(value):
-        raise ConfigError(f"{where} is {value}, must be finite")
-    if takes_whole(parameter):
-        if value != int(value):
-            raise ConfigError(f"{where} is {value}, must be a whole number")
-        return int(value)
-    return value
+    if not isinstance(value, str) or not value.startswith("lin_"):
+        return _validate(parameter.annotation, parse_value(value) if isinstance(value, str) else value, where)
+    start = parse_number(value.removeprefix("lin_"))
+    if isinstance(start, str) or not math.isfinite(start):
+        raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
+    schedule = LinearSchedule(float(start), 0.0, 1.0)
+    if not _takes(parameter.annotation, schedule):
+        raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
+    return schedule
 
 
 def takes_whole(parameter: inspect.Parameter) -> bool:
     """Whether a constructor's parameter takes whole numbers and no other."""
-    kinds = _kinds(parameter)
-    return kinds & {"int", "float"} == {"int"} and not kinds & {"Schedule", "Any"}
+    return _takes(parameter.annotation, 2) and not _takes(parameter.annotation, 0.5)
 
 
 def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
@@ -63,17 +51,12 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]
 
     :raises ConfigError: another form.
     """
-    if value is None or value == []:
-        return []
-    found: list[tuple[str, dict[str, Any]]] = []
-    for entry in value if isinstance(value, list) else [value]:
-        if isinstance(entry, str):
-            found.append((entry, {}))
-        elif isinstance(entry, dict) and len(entry) == 1:
-            (name, kwargs) = next(iter(entry.items()))
-            found.append((str(name), parse_mapping(kwargs, f"{where}.{name}")))
-        else:
+    found = []
+    for entry in value if isinstance(value, list) else [] if value is None else [value]:
+        form = {entry: None} if isinstance(entry, str) else entry
+        if not isinstance(form, dict) or len(form) != 1:
             raise ConfigError(f"{where}: {entry!r} must be package.module.Class, or {{package.module.Class: {{…}}}}")
+        found += [(str(name), parse_mapping(kwargs, f"{where}.{name}")) for name, kwargs in form.items()]
     return found
 
 
@@ -82,29 +65,34 @@ def import_class(path: str, where: str) -> Any:
 
     :raises ConfigError: a module or a name that is not there.
     """
-    module, _, attribute = path.rpartition(".")
     try:
-        return getattr(importlib.import_module(module), attribute)
+        return pkgutil.resolve_name(path)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{where}: {path} cannot be imported ({error})") from None
 
 
-def _linear(text: str, kinds: set[str], where: str) -> Any:
-    from stable_baselines3.common.utils import LinearSchedule
-
-    start = parse_number(text)
-    if isinstance(start, str) or not math.isfinite(start):
-        raise ConfigError(f"{where} is 'lin_{text}', must be lin_ and a number, such as lin_1e-3")
-    if "Schedule" not in kinds:
-        raise ConfigError(f"{where} is 'lin_{text}', but it takes no schedule")
-    return LinearSchedule(float(start), 0.0, 1.0)
+def _takes(kind: Any, value: Any) -> bool:
+    with suppress(ConfigError):
+        _validate(kind, value, "")
+        return True
+    return False
 
 
-def _kinds(parameter: inspect.Parameter) -> set[str]:
-    """The type names in a parameter's annotation, however it is spelled; schedules as ``Schedule``."""
-    annotation = parameter.annotation
-    if annotation is inspect.Parameter.empty:
-        return {"Any"}
-    text = annotation.__name__ if isinstance(annotation, type) else str(annotation)
-    kinds = set(re.findall(r"\w+", text))
-    return kinds | {"Schedule"} if kinds & {"Callable", "FloatSchedule"} else kinds
+def _validate(kind: Any, value: Any, where: str) -> Any:
+    """``value`` as the type ``kind``, by pydantic; :raises ConfigError: it is none, and what it must be."""
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} is {value}, must be finite")
+    try:
+        adapter = TypeAdapter(kind, config=ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False))
+        return adapter.validate_python(value, strict=isinstance(value, bool))  # True is not 1
+    except PydanticUserError:  # a type that pydantic does not know how to check
+        return value
+    except ValidationError as error:
+        found = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}  # one for each type of a union
+    if isinstance(value, str) and "is" in found:
+        return value  # the name of a class, which rl_zoo3 imports
+    number = "a number or lin_<number>" if "callable" in found else "a number"
+    expected = {"greater": "at least 1", "float": number, "int": "a whole number"}
+    others = [message.removeprefix("Input should be ") for message in found.values()]
+    must_be = next((text for kind, text in expected.items() if kind in found), others[0])
+    raise ConfigError(f"{where} is {value!r}, must be {must_be}")

@@ -28,7 +28,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.base.yaml_files import parse_mapping_file
 from sb3_quad.settings.flight import FlightSettings, flight_settings
-from sb3_quad.settings.zoo_yaml import ZooLoader
+from sb3_quad.settings.literals import ZooLoader
 
 
 class RunFolder:
