@@ -34,12 +34,13 @@ def test_the_example_runs(name, tmp_path, monkeypatch):
 
 
 def test_the_page_lists_every_callback_and_its_settings_are_read():
-    from sb3_quad.settings.config import build_config, read_yaml
+    from sb3_quad.base.yaml_files import parse_yaml
+    from sb3_quad.settings.config import build_config
     from sb3_quad.settings.values import import_class
 
     page = (ROOT / "docs" / "callbacks.md").read_text(encoding="utf-8")
     assert set(callbacks.__all__) <= set(re.findall(r"^\| `(\w+)`", page, flags=re.MULTILINE))
-    blocks = [read_yaml(text, "page") for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)]
+    blocks = [parse_yaml(text, "page") for text in re.findall(r"```yaml\n(.*?)```", page, flags=re.DOTALL)]
     settings = {"n_timesteps": 100, **blocks[0]}
     config = build_config("ppo_bc", "QuadStateRecovery-v0", settings)
     assert config.callback

@@ -11,7 +11,7 @@ import pytest
 from sb3_quad.cli.app import COMMANDS, EPILOG, make_parser
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.settings.algorithms import ALGORITHMS
-from sb3_quad.settings.config import config_names
+from sb3_quad.settings.config import SETTINGS
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 
@@ -39,7 +39,7 @@ def test_examples_are_taken(name):
         if getattr(options, "env", None) is not None:
             assert options.env in (*ENVIRONMENTS, "Pendulum-v1")
         if getattr(options, "conf_file", None) is not None:
-            assert options.conf_file in (*config_names(), "my.yml") or options.conf_file.endswith("/best.yml")
+            assert options.conf_file in (*SETTINGS.names(), "my.yml") or options.conf_file.endswith("/best.yml")
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))

@@ -15,7 +15,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, Ro
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
-from sb3_quad.settings.config import build_config, check_environment, config_names, load_config, read_settings
+from sb3_quad.settings.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.settings.values import convert, qualified_classes, takes_whole
 
@@ -239,9 +239,9 @@ def test_a_value_of_another_type_is_refused(kind, value, message):
         convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
 
 
-@pytest.mark.parametrize("name", config_names())
+@pytest.mark.parametrize("name", SETTINGS.names())
 def test_packaged_files_hold_good_settings(name):
-    content, _ = read_settings(name)
+    content, _ = SETTINGS.read(name)
     if "stages" in content:
         pytest.skip("a pipeline")
     algo = name.rpartition("/")[2].removesuffix(".yml")

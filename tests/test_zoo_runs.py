@@ -9,9 +9,9 @@ import yaml
 from stable_baselines3 import SAC
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.yaml_files import parse_yaml
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.settings.config import read_yaml
 from sb3_quad.settings.literals import ZooLoader
 
 ENV = "QuadStateRecovery-v0"
@@ -25,12 +25,12 @@ TAGGED = """!!python/object/apply:collections.OrderedDict
 
 
 def test_yaml_of_rl_zoo3_is_read_without_running_it():
-    assert read_yaml(TAGGED, "config.yml", ZooLoader) == {
+    assert parse_yaml(TAGGED, "config.yml", ZooLoader) == {
         "env_kwargs": {"task": "state_recovery"},
         "policy_kwargs": {"activation_fn": "nn.Tanh", "net_arch": [64, 64]},
     }
     with pytest.raises(ConfigError):
-        read_yaml(TAGGED, "my.yml")  # settings files of users stay plain
+        parse_yaml(TAGGED, "my.yml")  # settings files of users stay plain
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ def test_yaml_of_rl_zoo3_is_read_without_running_it():
 )
 def test_other_tags_are_refused(text):
     with pytest.raises(ConfigError, match=r"config\.yml: not valid YAML"):
-        read_yaml(text, "config.yml", ZooLoader)
+        parse_yaml(text, "config.yml", ZooLoader)
 
 
 @pytest.fixture

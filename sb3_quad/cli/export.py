@@ -60,7 +60,7 @@ def run(options: argparse.Namespace) -> int:
     name = c_name(file.stem) if options.name is None else options.name
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
     write_bytes(file, exported.content)
-    print(f"settings: {exported.settings}")
+    print(f"settings: {exported.settings or 'none beside the zip'}")
     for key in ("vehicle", "scaling", "network", "observation", "result", "rotors", "check"):
         print(f"{key}: {exported.metadata[key]}")
     print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")

@@ -35,7 +35,7 @@ class Export(NamedTuple):
     unit: str  # N or rad/s
     microseconds: float  # per call with one observation, on one thread
     checked_by: str  # what ran it
-    settings: str  # the file that vehicle and scaling came from, where they were not given
+    settings: Path | None  # the file that vehicle and scaling came from, where they were not given
 
 
 def export_policy(
