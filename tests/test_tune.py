@@ -222,7 +222,7 @@ def test_a_database_and_another_environment(command, capsys):
         (["--storage", "broken.log"], "storage broken.log: cannot be used"),
         (["--storage", "mysql+nothing://x/y"], "storage mysql+nothing://x/y: cannot be used"),
         (["--search-space", "nowhere.yml"], "nowhere.yml"),
-        (["--search-space", "broken.log"], "must hold settings with their ranges"),
+        (["--search-space", "broken.log"], "broken.log: must hold keys and values"),
         (["-i", "nowhere.zip"], "nowhere.zip"),
         (["--num-threads", "0"], "at least 1"),
         (["--n-trails", "3"], "did you mean '--n-trials'"),
@@ -257,7 +257,7 @@ def test_spaces_that_are_none_are_refused(tmp_path, space, message):
     path = tmp_path / "space.yml"
     path.write_text(yaml.safe_dump(space))
     with pytest.raises(ConfigError, match=message) as caught:
-        load_space(build_config("dagger", ENV, SMALL), path)
+        load_space("dagger", SMALL, path)
     assert "space.yml" in str(caught.value)
 
 
@@ -277,7 +277,7 @@ def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
 )
 def test_the_shipped_spaces_fit_the_shipped_settings(algo, file):
     config = load_config(algo, "QuadStateRecovery-v0" if algo != "dagger" else ENV, file)
-    space = load_space(config)
+    space = load_space(algo, config.settings)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(20):
         settings = space.suggest(study.ask())

@@ -4,26 +4,64 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Mapping
+from typing import Any
 
-from sb3_quad.settings.algorithms import get_algorithm
-from sb3_quad.zoo.search import CONVERTERS, SAMPLERS
+from rl_zoo3 import ALGOS
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
+from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
+from sb3_quad.settings.config import read_settings
+from sb3_quad.settings.literals import parse_mapping
+from sb3_quad.settings.values import convert
+from sb3_quad.tuning.space import SearchSpace, load_space
+
+Settings = dict[str, Any]
 OWN_ALGORITHMS = ("dagger", "ppo_bc")
 
 
 def register() -> None:
     """Make them known; calling it again changes nothing."""
-    from rl_zoo3 import ALGOS
-    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-
-    ALGOS.update({name: get_algorithm(name) for name in OWN_ALGORITHMS})
-    HYPERPARAMS_SAMPLER.update(SAMPLERS)
-    HYPERPARAMS_CONVERTER.update(CONVERTERS)
+    for name in OWN_ALGORITHMS:
+        ALGOS[name] = get_algorithm(name)
+        register_space(name, next(iter(read_settings(f"{name}.yml")[0].values())))
     module = importlib.import_module("rl_zoo3.exp_manager")
     # rl_zoo3's record_video imports exp_manager, which imports custom_envs, which may import this: too early for a
     # subclass of what it is about to define, and none is needed there.
     if hasattr(module, "ExperimentManager"):
         _replace_manager()
+
+
+def register_space(algo: str, settings: Mapping[str, Any]) -> None:
+    """Have ``-optimize`` and ``--trial-id`` search as ``tune`` does, around some settings of an algorithm.
+
+    rl_zoo3 wants a sampler, which asks a trial for values and gives keywords of the algorithm; and a converter, which gives
+    the settings that the values kept by a study stand for, as plain as YAML holds them.
+    """
+
+    def space() -> SearchSpace:
+        parse_mapping(settings.get("policy_kwargs"), "policy_kwargs")  # an expression would be lost, so it is refused
+        return load_space(algo, settings)
+
+    def sample(trial: Any, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+        return to_keywords(algo, changes(space().suggest(trial)), "search space")
+
+    def changes(found: Settings) -> Settings:
+        return {name: value for name, value in found.items() if name not in settings or settings[name] != value}
+
+    HYPERPARAMS_SAMPLER[algo] = sample
+    HYPERPARAMS_CONVERTER[algo] = lambda parameters: changes(space().settings(parameters))
+
+
+def to_keywords(algo: str, settings: Settings, where: str) -> Settings:
+    """Settings with those that the algorithm's constructor takes converted to what it takes."""
+    parameters = constructor_parameters(ALGOS[algo])
+    found = {
+        name: convert(each, parameters[name], f"{where}: {name}") for name, each in settings.items() if name in parameters
+    }
+    if isinstance(settings.get("policy_kwargs"), dict):
+        found["policy_kwargs"] = parse_mapping(settings["policy_kwargs"], f"{where}: policy_kwargs")
+    return {**settings, **found}
 
 
 def _replace_manager() -> None:
