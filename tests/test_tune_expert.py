@@ -144,7 +144,7 @@ def test_an_interrupt_keeps_the_best(tmp_path, monkeypatch, capsys):
         (["--vehicle", "imt"], "did you mean 'itm'"),
         (["-n", "0"], "at least 1"),
         (["-o", "tuned.txt"], ".yaml"),
-        (["-o", "there.yaml"], "there.yaml exists"),
+        (["-o", "there.yaml"], "there.yaml: exists already"),
         (["--journal", "broken.journal"], "broken.journal"),
         (["--trails", "3"], "'--trials'"),
     ],

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from contextlib import suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,8 +17,8 @@ from sb3_quad.cli.settings import add_settings, make_config, make_seed, prepare,
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
+    from rich.table import Table
 
-    from sb3_quad.base.signals import StopSignals
     from sb3_quad.tuning.search import Search
 
 HELP = "Search for hyperparameters: trains with one choice after the other; writes the best as a settings file."
@@ -71,10 +72,19 @@ def run(options: argparse.Namespace) -> int:
     with StopSignals() as signals:
         search, folder = _make_search(options)
         say(f"study {search.name} in {search.storage}: {_count(search)}; results go to {folder}")
-        try:
-            _train(search, folder, options, signals)
-        finally:
-            write_results(search, folder)
+        with progress_bar(options.progress) as show:
+            done = count()
+            show(next(done), options.n_trials, "trials")
+
+            def after_each(trial: FrozenTrial) -> None:
+                write_results(search, folder)
+                say(_line(search, trial))
+                show(next(done), options.n_trials, "trials")
+
+            try:
+                search.run(options.n_trials, options.max_total_trials, signals, after_each)
+            finally:
+                write_results(search, folder)
     _print_results(search, folder)
     return signals.exit_code
 
@@ -111,27 +121,9 @@ def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
         raise
 
 
-def _train(search: Search, folder: Path, options: argparse.Namespace, signals: StopSignals) -> None:
-    """Train, a line for each trial; the results are renewed after each."""
-    from sb3_quad.tuning.results import write_results
-
-    with progress_bar(options.progress) as show:
-        done = 0
-        show(done, options.n_trials, "trials")
-
-        def after_each(trial: FrozenTrial) -> None:
-            nonlocal done
-            write_results(search, folder)
-            say(_line(search, trial))
-            done += 1
-            show(done, options.n_trials, "trials")
-
-        search.run(options.n_trials, options.max_total_trials, signals, after_each)
-
-
 def _line(search: Search, trial: FrozenTrial) -> str:
     from sb3_quad.tuning.results import in_words, varied
-    from sb3_quad.tuning.search import ERROR, SUCCESS
+    from sb3_quad.tuning.search import ERROR
 
     seconds = trial.duration.total_seconds() if trial.duration is not None else 0.0
     values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
@@ -139,8 +131,7 @@ def _line(search: Search, trial: FrozenTrial) -> str:
         return f"trial {trial.number} failed: {trial.user_attrs[ERROR]} ({values})"
     pruned = f"pruned after {len(trial.intermediate_values)} evaluations, " if trial.state.name == "PRUNED" else ""
     mark = " (best so far)" if search.best is not None and search.best.number == trial.number else ""
-    how = in_words(search, trial) if SUCCESS in trial.user_attrs else ""
-    return f"trial {trial.number}: {pruned}{how}, {seconds:.1f} s{mark} ({values})"
+    return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
 
 
 def _print_results(search: Search, folder: Path) -> None:
@@ -150,7 +141,7 @@ def _print_results(search: Search, folder: Path) -> None:
     best = search.best
     if best is not None:
         write_plot(search, folder / PLOT)
-        _print_best_trials(search)
+        console().print(_best_trials(search))
         _fly(search, best)
     written = [TRIALS] if best is None else [TRIALS, BEST, PLOT]
     say(f"{_count(search)}; saved in {folder}: {', '.join(written)}")
@@ -176,7 +167,7 @@ def _fly(search: Search, best: FrozenTrial) -> None:
     say(f"agent: {run.model}")
 
 
-def _print_best_trials(search: Search) -> None:
+def _best_trials(search: Search) -> Table:
     from sb3_quad.tuning.results import varied
     from sb3_quad.tuning.search import REWARD, SUCCESS
 
@@ -187,7 +178,7 @@ def _print_best_trials(search: Search) -> None:
     table.add_row("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in best), end_section=True)
     for name in search.space.dimensions:
         table.add_row(name, *(str(varied(search, trial)[name]) for trial in best))
-    console().print(table)
+    return table
 
 
 def _count(search: Search) -> str:

@@ -9,7 +9,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console, make_table, progress_bar
 
-HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the figures they reach."
+HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the metrics they reach."
 EXAMPLES = """examples:
   sb3-quad tune-expert                                   for ITM, into itm_tuned.yaml
   sb3-quad tune-expert --vehicle my.yaml -o tuned.yaml   for a vehicle of your own
@@ -41,7 +41,7 @@ def run(options: argparse.Namespace) -> int:
     """Search, measure on fresh episodes, write. Returns the exit code."""
     if min(options.trials, options.starts, options.targets) < 1 or options.seed < 0:
         raise ConfigError("--trials, --starts and --targets must be at least 1, --seed at least 0")
-    from sb3_quad.base.files import write_text
+    from sb3_quad.base.files import refuse_existing, write_text
     from sb3_quad.base.seeds import seed_for
     from sb3_quad.base.signals import StopSignals
     from sb3_quad.evaluation.expert_figures import measure_expert
@@ -55,10 +55,10 @@ def run(options: argparse.Namespace) -> int:
     if output.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--output {output}: must end in .yaml or .yml")
     journal = Path(options.journal) if options.journal else output.with_suffix(".journal")
-    _check_output(output, options.overwrite or journal.exists())
+    refuse_existing(output, options.overwrite or journal.exists())
     first = vehicle.geometric_gains or derived_gains(vehicle)
     search = ExpertSearch(vehicle, first, journal, options.seed, options.starts, options.targets)
-    _check_output(output, options.overwrite or (output.exists() and search.may_overwrite(output)))
+    refuse_existing(output, options.overwrite or search.may_overwrite(output))
 
     with StopSignals() as signals, progress_bar(options.progress) as show:
         show(search.trials_done, options.trials, "choosing the hardest starts")
@@ -91,8 +91,3 @@ def run(options: argparse.Namespace) -> int:
     print(f"{search.trials_done} gains tried, least cost {search.best_cost:.3f}; journal: {journal}")
     print(f"saved {output}")
     return signals.exit_code
-
-
-def _check_output(output: Path, allowed: bool) -> None:
-    if output.exists() and not allowed:
-        raise ConfigError(f"{output} exists: give another --output, or --overwrite")

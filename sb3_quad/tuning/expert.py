@@ -200,8 +200,8 @@ class ExpertSearch:
         self.study.optimize(fly, n_trials=remaining, callbacks=[report])
 
     def may_overwrite(self, output: Path) -> bool:
-        """Whether a file that exists holds what this search itself wrote there earlier."""
-        return self.study.user_attrs.get(WRITTEN) == hashlib.sha256(output.read_bytes()).hexdigest()
+        """Whether a file holds what this search itself wrote there earlier."""
+        return output.is_file() and self.study.user_attrs.get(WRITTEN) == hashlib.sha256(output.read_bytes()).hexdigest()
 
     def note_output(self, content: bytes) -> None:
         """Remember what is going to be written, for :meth:`may_overwrite`."""

@@ -102,8 +102,8 @@ def write_plot(search: Search, path: Path) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    groups = {"finished": search.trials("COMPLETE"), "best": [search.best] if search.best is not None else []}
-    groups["pruned"] = [trial for trial in search.trials("PRUNED") if REWARD in trial.user_attrs]
+    groups = {"finished": search.trials("COMPLETE"), "pruned": search.trials("PRUNED")}
+    groups["best"] = [] if search.best is None else [search.best]
     successes = [trial.user_attrs[SUCCESS] for trial in groups["finished"]]
     equals = successes.count(max(successes, default=0.0))
     by_reward = search.job.config.task is None or 2 * equals > len(successes)
@@ -123,7 +123,10 @@ def write_plot(search: Search, path: Path) -> None:
             places = [str(value) for value in values] if isinstance(dimension, Choice) else values
             panel.scatter(places, heights[group], label=group, **STYLES[group])
         if isinstance(dimension, Interval) and dimension.log:
+            ticks = dimension.low, math.sqrt(dimension.low * dimension.high), dimension.high
             panel.set_xscale("log")
+            panel.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
+            panel.minorticks_off()
         panel.set_xlabel(name)
         panel.grid(alpha=0.25)
     first = panels[0, 0]

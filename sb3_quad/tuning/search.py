@@ -156,8 +156,8 @@ class Search:
             )
         if result.exit_code != 0:
             return "FAIL", None
-        for name, measured in zip((SUCCESS, REWARD), evaluations[-1], strict=True):
-            trial.set_user_attr(name, measured)
+        trial.set_user_attr(SUCCESS, evaluations[-1][0])
+        trial.set_user_attr(REWARD, evaluations[-1][1])
         if result.model.num_timesteps < total:
             return "PRUNED", None
         if not math.isfinite(value()):

@@ -9,7 +9,8 @@ value                                   meaning
 ======================================  ==================================================================================
 
 Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapping, and ``n_minibatches`` stands for the
-``batch_size`` that divides a rollout into so many. Where the settings have ``lin_x``, the x is varied.
+``batch_size`` that divides a rollout into so many. Where the settings have ``lin_x``, the x is varied. Settings of which only
+whole numbers are known to fit get whole numbers; ``whole: true`` beside ``low`` asks for them elsewhere.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     def _choose_vec_env(self, setting: str | None) -> None:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--vec-env")
-        flag = parser.parse_known_args()[0].vec_env  # whether it was given is not to be told from rl_zoo3's default
+        flag = parser.parse_known_args()[0].vec_env  # rl_zoo3's own default hides whether it was given
         kind = flag or setting or ("batch" if self._env_id in ENVIRONMENTS else "dummy")
         if kind not in VEC_ENVS:
             raise ConfigError(f"{self.config}: {unknown('vec_env', kind, VEC_ENVS)}")

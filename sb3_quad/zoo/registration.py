@@ -14,7 +14,7 @@ from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
 from sb3_quad.settings.config import read_settings
 from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.settings.values import convert
-from sb3_quad.tuning.space import SearchSpace, load_space
+from sb3_quad.tuning.space import load_space
 
 Settings = dict[str, Any]
 OWN_ALGORITHMS = ("dagger", "ppo_bc")
@@ -25,11 +25,14 @@ def register() -> None:
     for name in OWN_ALGORITHMS:
         ALGOS[name] = get_algorithm(name)
         register_space(name, next(iter(read_settings(f"{name}.yml")[0].values())))
-    module = importlib.import_module("rl_zoo3.exp_manager")
     # rl_zoo3's record_video imports exp_manager, which imports custom_envs, which may import this: too early for a
     # subclass of what it is about to define, and none is needed there.
-    if hasattr(module, "ExperimentManager"):
-        _replace_manager()
+    if hasattr(importlib.import_module("rl_zoo3.exp_manager"), "ExperimentManager"):
+        from sb3_quad.zoo.manager import QuadExperimentManager
+
+        for name, module in list(sys.modules.items()):
+            if name.startswith("rl_zoo3.") and hasattr(module, "ExperimentManager"):
+                module.ExperimentManager = QuadExperimentManager  # type: ignore[attr-defined]
 
 
 def register_space(algo: str, settings: Mapping[str, Any]) -> None:
@@ -39,18 +42,17 @@ def register_space(algo: str, settings: Mapping[str, Any]) -> None:
     the settings that the values kept by a study stand for, as plain as YAML holds them.
     """
 
-    def space() -> SearchSpace:
+    def convert_parameters(parameters: Mapping[str, Any]) -> Settings:
         parse_mapping(settings.get("policy_kwargs"), "policy_kwargs")  # an expression would be lost, so it is refused
-        return load_space(algo, settings)
-
-    def sample(trial: Any, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
-        return to_keywords(algo, changes(space().suggest(trial)), "search space")
-
-    def changes(found: Settings) -> Settings:
+        found = load_space(algo, settings).settings(parameters)
         return {name: value for name, value in found.items() if name not in settings or settings[name] != value}
 
+    def sample(trial: Any, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+        load_space(algo, settings).suggest(trial)
+        return to_keywords(algo, convert_parameters(trial.params), "search space")
+
     HYPERPARAMS_SAMPLER[algo] = sample
-    HYPERPARAMS_CONVERTER[algo] = lambda parameters: changes(space().settings(parameters))
+    HYPERPARAMS_CONVERTER[algo] = convert_parameters
 
 
 def to_keywords(algo: str, settings: Settings, where: str) -> Settings:
@@ -62,11 +64,3 @@ def to_keywords(algo: str, settings: Settings, where: str) -> Settings:
     if isinstance(settings.get("policy_kwargs"), dict):
         found["policy_kwargs"] = parse_mapping(settings["policy_kwargs"], f"{where}: policy_kwargs")
     return {**settings, **found}
-
-
-def _replace_manager() -> None:
-    from sb3_quad.zoo.manager import QuadExperimentManager
-
-    for name, module in list(sys.modules.items()):
-        if name.startswith("rl_zoo3.") and hasattr(module, "ExperimentManager"):
-            module.ExperimentManager = QuadExperimentManager  # type: ignore[attr-defined]
