@@ -125,7 +125,7 @@ def write_plot(search: Search, path: Path) -> None:
         if isinstance(dimension, Interval) and dimension.log:
             ticks = dimension.low, math.sqrt(dimension.low * dimension.high), dimension.high
             panel.set_xscale("log")
-            panel.set_xticks(ticks, [f"{tick:.2g}" for tick in ticks])
+            panel.set_xticks(ticks, [f"{float(f'{tick:.2g}'):g}" for tick in ticks])
             panel.minorticks_off()
         panel.set_xlabel(name)
         panel.grid(alpha=0.25)
