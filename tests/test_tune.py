@@ -22,6 +22,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.settings.config import build_config, load_config
 from sb3_quad.tuning import search as search_module
+from sb3_quad.tuning import study as study_module
 from sb3_quad.tuning.search import score
 from sb3_quad.tuning.space import load_space
 
@@ -42,7 +43,7 @@ FEW = ["--eval-episodes", "4", "--n-evaluations", "2", "--no-progress", "--sampl
 
 @pytest.fixture
 def command(tmp_path, monkeypatch):
-    """A search in an empty folder, of a few hundred transitions a trial; the settings and the space are files there."""
+    """A search in an empty folder, of a few hundred timesteps a trial; the settings and the space are files there."""
     monkeypatch.chdir(tmp_path)
     Path("small.yml").write_text(yaml.safe_dump({ENV: SMALL}))
     Path("space.yml").write_text(yaml.safe_dump(SPACE))
@@ -207,6 +208,19 @@ def test_a_database_and_another_environment(command, capsys):
     assert sizes == [-(-64 // int(row["n_minibatches"])) for row in rows]
 
 
+def test_studies_of_others_are_refused_and_one_that_was_left_at_its_birth_is_begun(command, monkeypatch, capsys):
+    monkeypatch.setattr(study_module, "PATIENCE", 0.0)
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend("studies.log"))
+    others = optuna.create_study(study_name="others", storage=storage, direction="maximize")
+    others.add_trial(optuna.trial.create_trial(value=1.0))
+    optuna.create_study(study_name="left", storage=storage, direction="maximize")
+    known = [*command, "--n-trials", "1", "--storage", "studies.log", "--study-name"]
+    assert main([*known, "others"]) == 2
+    assert "not of tune" in one_line_of_error(capsys)
+    assert main([*known, "left"]) == 0
+    assert [row["state"] for row in trials()] == ["COMPLETE"]
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -222,7 +236,7 @@ def test_a_database_and_another_environment(command, capsys):
         (["--storage", "broken.log"], "storage broken.log: cannot be used"),
         (["--storage", "mysql+nothing://x/y"], "storage mysql+nothing://x/y: cannot be used"),
         (["--search-space", "nowhere.yml"], "nowhere.yml"),
-        (["--search-space", "broken.log"], "must hold settings with their ranges"),
+        (["--search-space", "broken.log"], "broken.log: must hold keys and values"),
         (["-i", "nowhere.zip"], "nowhere.zip"),
         (["--num-threads", "0"], "at least 1"),
         (["--n-trails", "3"], "did you mean '--n-trials'"),
@@ -257,7 +271,7 @@ def test_spaces_that_are_none_are_refused(tmp_path, space, message):
     path = tmp_path / "space.yml"
     path.write_text(yaml.safe_dump(space))
     with pytest.raises(ConfigError, match=message) as caught:
-        load_space(build_config("dagger", ENV, SMALL), path)
+        load_space("dagger", SMALL, path)
     assert "space.yml" in str(caught.value)
 
 
@@ -277,14 +291,14 @@ def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
 )
 def test_the_shipped_spaces_fit_the_shipped_settings(algo, file):
     config = load_config(algo, "QuadStateRecovery-v0" if algo != "dagger" else ENV, file)
-    space = load_space(config)
+    space = load_space(algo, config.settings)
     study = optuna.create_study(sampler=optuna.samplers.RandomSampler(seed=0))
     for _ in range(20):
         settings = space.suggest(study.ask())
         assert yaml.safe_load(yaml.safe_dump(settings)) == settings
-        drawn = build_config(algo, config.env_id, settings)
-        assert drawn.policy_kwargs["net_arch"] == config.policy_kwargs["net_arch"]
-        assert 0 < drawn.hyperparams["gamma"] < 1
+        suggested = build_config(algo, config.env_id, settings)
+        assert suggested.policy_kwargs["net_arch"] == config.policy_kwargs["net_arch"]
+        assert 0 < suggested.hyperparams["gamma"] < 1
     if "thesis" not in file:
         assert space.start() is not None
 

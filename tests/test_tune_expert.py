@@ -13,17 +13,17 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main, tune_expert
 from sb3_quad.evaluation.expert_figures import by_start, start_states
-from sb3_quad.tuning import expert_objective
-from sb3_quad.tuning.expert_objective import ExpertObjective
-from sb3_quad.tuning.expert_search import ExpertSearch
-from sb3_quad.tuning.vehicle_files import vehicle_text, with_gains
+from sb3_quad.tuning import expert
+from sb3_quad.tuning.expert import ExpertObjective, ExpertSearch, with_gains
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 ITM = load_vehicle("itm")
 GAINS = ITM.geometric_gains
+ITM_YAML, _ = VEHICLES.text("itm")
 SMALL = ["--starts", "120", "--targets", "8"]
 positive = st.floats(0.01, 1e3).map(lambda value: float(f"{value:.4g}"))
 
@@ -33,7 +33,7 @@ def little_to_fly(monkeypatch):
     monkeypatch.setattr(tune_expert, "FRESH_EPISODES", 16)
     monkeypatch.setattr(tune_expert, "FRESH_SETS", 2)
     for name, steps in (("DESCENT", 250), ("WAY", 450), ("RECOVERY", 150)):
-        monkeypatch.setattr(expert_objective, name, steps)
+        monkeypatch.setattr(expert, name, steps)
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def slow_itm(tmp_path):
     """ITM's file, commented as it is, with gains that can be improved on."""
     poor = GAINS.model_copy(update={"position": 0.9 * GAINS.position, "measured": None})
     path = tmp_path / "slow.yaml"
-    path.write_text(with_gains(vehicle_text("itm"), poor))
+    path.write_text(with_gains(ITM_YAML, poor))
     return path
 
 
@@ -61,10 +61,9 @@ figures = st.builds(
 @given(st.fixed_dictionaries(dict.fromkeys(GAIN_NAMES, positive)), st.none() | figures, st.integers(0, 2))
 def test_gains_survive_the_file_and_leave_the_rest_of_it(values, measured, where):
     gains = GeometricGains(**values, measured=measured)
-    original = vehicle_text("itm")
-    block = original[original.index("geometric_gains:") :]
-    head = original.removesuffix(block)
-    other_places = (original, head, block + head)  # at the end, nowhere, at the beginning
+    block = ITM_YAML[ITM_YAML.index("geometric_gains:") :]
+    head = ITM_YAML.removesuffix(block)
+    other_places = (ITM_YAML, head, block + head)  # at the end, nowhere, at the beginning
     text = with_gains(other_places[where], gains)
     loaded = yaml.safe_load(text)
     assert GeometricGains.model_validate(loaded.pop("geometric_gains")) == gains
@@ -74,8 +73,6 @@ def test_gains_survive_the_file_and_leave_the_rest_of_it(values, measured, where
 
 
 def test_gains_in_another_form_are_not_cut_in_half():
-    from sb3_quad.base.errors import ConfigError
-
     with pytest.raises(ConfigError, match="remove it"):
         with_gains('{"name": "x", "geometric_gains": {"position": 1}}', GAINS)
 
@@ -151,7 +148,7 @@ def test_an_interrupt_keeps_the_best(tmp_path, monkeypatch, capsys):
         (["--vehicle", "imt"], "did you mean 'itm'"),
         (["-n", "0"], "at least 1"),
         (["-o", "tuned.txt"], ".yaml"),
-        (["-o", "there.yaml"], "there.yaml exists"),
+        (["-o", "there.yaml"], "there.yaml: exists already"),
         (["--journal", "broken.journal"], "broken.journal"),
         (["--trails", "3"], "'--trials'"),
     ],

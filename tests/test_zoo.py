@@ -15,12 +15,14 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import optuna
 import pytest
 import yaml
 
 from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.training.runs import open_run
+from sb3_quad.tuning.space import load_space
 
 ROOT = Path(__file__).resolve().parent.parent
 ENV = "QuadStateRecovery-v0"
@@ -142,13 +144,17 @@ def session(tmp_path_factory):
     dagger = ["train", "--algo", "dagger", *common, *evaluation, "--save-freq", "400", "-params", "dataset_capacity:1000"]
     agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
     study = ["--storage", "study.log", "--study-name", "s"]
+    ppo_bc = ["train", "--algo", "ppo_bc", *common]
+    optimize = ["-n", "400", "-optimize", "--no-optim-plots", "-f", "search", "--n-trials"]
     commands = [
         [*dagger, "--env-kwargs", "noise:0.1"],
-        ["train", "--algo", "ppo_bc", *common, "--eval-freq", "-1", "-i", agent, "-params", "vec_env:'dummy'", "n_envs:2"],
-        [*dagger, "-optimize", "--n-trials", "1", *study, "--no-optim-plots", "-f", "search"],
+        [*ppo_bc, "--eval-freq", "-1", "-i", agent, "-params", "vec_env:'dummy'", "n_envs:2"],
+        [*dagger, *optimize, "2", *study],
         ["enjoy", "--algo", "dagger", "--env", ENV, "-f", "logs", "--no-render", "-n", "40", "--load-best"],
         ["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", "ours", "--no-render", "-n", "40"],
         ["plot_train", "-a", "dagger", "-e", ENV, "-f", "logs", "-y", "success", "-w", "2"],
+        ["train", "--algo", "dagger", *common, *study, "--trial-id", "1", "--eval-freq", "-1", "-f", "trial"],
+        [*ppo_bc, *evaluation, *optimize, "1"],
     ]
     (folder / "commands.json").write_text(json.dumps(commands))
     parts = run("-c", SESSION, cwd=folder).split("COMMAND")[1:]
@@ -198,10 +204,18 @@ def test_a_second_stage_starts_from_the_first(session):
 
 
 @with_zoo
-def test_its_search_goes_through_our_spaces(session):
-    folder, (_, _, said, *_) = session
-    assert "Number of finished trials:  1" in said and "gradient_steps:" in said
+def test_its_search_varies_what_ours_does_and_a_trial_can_be_trained_again(session):
+    folder, (_, _, said, *_, said_of_ppo_bc) = session
+    assert "Number of finished trials:  2" in said and "Number of finished trials:  1" in said_of_ppo_bc
+    assert "n_minibatches:" in said_of_ppo_bc and "policy_kwargs.log_std_init:" in said_of_ppo_bc
     assert (folder / "study.log").is_file() and list((folder / "search" / "dagger").glob("report_*.csv"))
+    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(folder / "study.log")))
+    parameters = optuna.load_study(study_name="s", storage=storage).trials[1].params
+    space = load_space("dagger", SETTINGS)
+    assert parameters.keys() == space.dimensions.keys()
+    settings, _ = open_run(folder / "trial" / "dagger" / f"{ENV}_1").read_yaml()
+    assert settings == space.settings(parameters)
+    assert settings["learning_rate"].startswith("lin_") and settings["n_envs"] == SETTINGS["n_envs"]
 
 
 @with_zoo

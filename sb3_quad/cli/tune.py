@@ -3,23 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import io
 from contextlib import suppress
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.cli.arguments import pairs, whole
 from sb3_quad.cli.compare import agent_and_expert
-from sb3_quad.cli.output import console
-from sb3_quad.cli.settings import add_settings, make_config, make_seed, prepare, say, shows_progress
+from sb3_quad.cli.output import console, make_table, progress_bar
+from sb3_quad.cli.settings import add_settings, make_config, make_seed, prepare, say
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
     from rich.table import Table
 
-    from sb3_quad.base.signals import StopSignals
     from sb3_quad.tuning.search import Search
 
 HELP = "Search for hyperparameters: trains with one choice after the other; writes the best as a settings file."
@@ -34,7 +33,7 @@ EXAMPLES = """examples:
 
 The first trial has the settings as they are. Ctrl-C keeps what is finished. Needs pip install 'sb3_quad[tune]'.
 """
-JOURNAL, PICTURE = "study.log", "trials.png"
+JOURNAL = "study.log"
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
 SHOWN = 5  # trials in the table
@@ -63,23 +62,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Search, tell, write. Returns the exit code."""
+    """Search, report, write. Returns the exit code."""
     if options.n_trials < 0 or (options.max_total_trials is not None and options.max_total_trials < 1):
         raise ConfigError("--n-trials must be at least 0, --max-total-trials at least 1")
     from sb3_quad.base.signals import StopSignals
     from sb3_quad.tuning.results import write_results
-    from sb3_quad.tuning.study import require_optuna
 
-    require_optuna("tune")
     prepare(options)
     with StopSignals() as signals:
         search, folder = _make_search(options)
-        say(f"study {search.options.name} in {search.options.storage}: {_count(search)}; results go to {folder}")
-        try:
-            _go_on(search, folder, options, signals)
-        finally:
-            write_results(search, folder)
-    _tell(search, folder)
+        say(f"study {search.name} in {search.storage}: {_count(search)}; results go to {folder}")
+        with progress_bar(options.progress) as show:
+            done = count()
+            show(next(done), options.n_trials, "trials")
+
+            def after_each(trial: FrozenTrial) -> None:
+                write_results(search, folder)
+                say(_line(search, trial))
+                show(next(done), options.n_trials, "trials")
+
+            try:
+                search.run(options.n_trials, options.max_total_trials, signals, after_each)
+            finally:
+                write_results(search, folder)
+    _print_results(search, folder)
     return signals.exit_code
 
 
@@ -88,16 +94,14 @@ def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
     from sb3_quad.settings.config import build_config
     from sb3_quad.training.job import TrainingJob
     from sb3_quad.training.runs import claim_folder, file_name
-    from sb3_quad.tuning.search import Search, StudyOptions
+    from sb3_quad.tuning.search import Search
     from sb3_quad.tuning.space import load_space
-    from sb3_quad.tuning.study import check_names
 
-    check_names(options.sampler, options.pruner)
     config = make_config(options)
     if options.eval_env_kwargs is not None:  # into the settings, so that the best ones have it too
         given = {**config.eval_env_kwargs, **pairs(options.eval_env_kwargs, "--eval-env-kwargs")}
         config = build_config(config.algo, config.env_id, {**config.settings, "eval_env_kwargs": given})
-    space = load_space(config, options.search_space)
+    space = load_space(config.algo, config.settings, options.search_space)
     job = TrainingJob(
         config,
         seed=make_seed(options),
@@ -107,70 +111,41 @@ def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
         n_eval_envs=options.n_eval_envs,
     )
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
-    storage = folder / JOURNAL if options.storage is None else options.storage
     name = options.study_name or f"{config.algo}_{config.env_id}"
-    names = options.sampler, options.pruner
+    study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
     try:
-        study = StudyOptions(name, storage, *names, options.n_startup_trials, options.n_evaluations)
-        return Search(replace(job, log_folder=str(folder)), space, study), folder
+        return Search(replace(job, log_folder=str(folder)), space, name, options.storage or folder / JOURNAL, *study), folder
     except SB3QuadError:
         with suppress(OSError):
             folder.rmdir()
         raise
 
 
-def _go_on(search: Search, folder: Path, options: argparse.Namespace, signals: StopSignals) -> None:
-    """Train, a line for each trial; the results are renewed after each."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from sb3_quad.tuning.results import write_results
-
-    screen = console()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=screen, disable=not shows_progress(options)) as bar:
-        task = bar.add_task("trials", total=options.n_trials)
-
-        def after_each(trial: FrozenTrial) -> None:
-            write_results(search, folder)
-            say(_line(search, trial))
-            bar.advance(task)
-
-        search.run(options.n_trials, options.max_total_trials, signals, after_each)
-
-
 def _line(search: Search, trial: FrozenTrial) -> str:
     from sb3_quad.tuning.results import in_words, varied
-    from sb3_quad.tuning.search import ERROR, SUCCESS
+    from sb3_quad.tuning.search import ERROR
 
     seconds = trial.duration.total_seconds() if trial.duration is not None else 0.0
     values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
     if trial.state.name == "FAIL":
         return f"trial {trial.number} failed: {trial.user_attrs[ERROR]} ({values})"
     pruned = f"pruned after {len(trial.intermediate_values)} evaluations, " if trial.state.name == "PRUNED" else ""
-    best = search.best
-    mark = " (best so far)" if best is not None and best.number == trial.number else ""
-    how = in_words(search, trial) if SUCCESS in trial.user_attrs else ""
-    return f"trial {trial.number}: {pruned}{how}, {seconds:.1f} s{mark} ({values})"
+    mark = " (best so far)" if search.best is not None and search.best.number == trial.number else ""
+    return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
 
 
-def _tell(search: Search, folder: Path) -> None:
+def _print_results(search: Search, folder: Path) -> None:
     """The best trials, the best agent on fresh episodes, and where everything is."""
-    from sb3_quad.base.files import write_bytes
-    from sb3_quad.tuning.picture import draw_search
-    from sb3_quad.tuning.results import BEST, TRIALS, train_command
+    from sb3_quad.tuning.results import BEST, PLOT, TRIALS, train_command, write_plot
 
     best = search.best
-    written = [TRIALS]
     if best is not None:
-        buffer = io.BytesIO()
-        draw_search(search).savefig(buffer, format="png", dpi=110)
-        write_bytes(folder / PICTURE, buffer.getvalue())
-        written += [BEST, PICTURE]
-        console().print(_table(search))
+        write_plot(search, folder / PLOT)
+        console().print(_best_trials(search))
         _fly(search, best)
+    written = [TRIALS] if best is None else [TRIALS, BEST, PLOT]
     say(f"{_count(search)}; saved in {folder}: {', '.join(written)}")
-    where = f"--storage {search.options.storage} --study-name {search.options.name}"
-    say(f"to go on, the same command with {where}")
+    say(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
     if best is not None:
         say(f"to train: {train_command(search, folder / BEST)}")
 
@@ -183,27 +158,21 @@ def _fly(search: Search, best: FrozenTrial) -> None:
     from sb3_quad.tuning.results import settings_of
     from sb3_quad.tuning.search import RUN
 
-    path = Path(best.user_attrs[RUN])
-    if search.job.config.task is None or not path.is_dir():
+    path, known = Path(best.user_attrs[RUN]), search.job.config
+    if known.task is None or not path.is_dir():
         return
     run = open_run(path)
-    config = build_config(search.job.config.algo, search.job.config.env_id, settings_of(best))
+    config = build_config(known.algo, known.env_id, settings_of(best))
     console().print(agent_and_expert(replace(search.job, config=config), load_model(run.model)))
     say(f"agent: {run.model}")
 
 
-def _table(search: Search) -> Table:
-    """The best trials."""
-    from rich.table import Table
-
+def _best_trials(search: Search) -> Table:
     from sb3_quad.tuning.results import varied
     from sb3_quad.tuning.search import REWARD, SUCCESS
 
     best = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
-    table = Table(title=f"the best of {_count(search)}", title_justify="left")
-    table.add_column("trial")
-    for trial in best:
-        table.add_column(str(trial.number), justify="right")
+    table = make_table(f"the best of {_count(search)}", "trial", *(str(trial.number) for trial in best))
     if search.job.config.task is not None:
         table.add_row("success", *(f"{100 * trial.user_attrs[SUCCESS]:.2f} %" for trial in best))
     table.add_row("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in best), end_section=True)

@@ -3,22 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.arguments import whole
-from sb3_quad.cli.output import console
+from sb3_quad.cli.output import console, make_table, progress_bar
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from sb3_quad.evaluation.expert_figures import Recoveries
-    from sb3_quad.tuning.expert_search import ExpertSearch
-    from sb3_quad.vehicles.gains import GeometricMetrics
-
-HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the figures they reach."
+HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the metrics they reach."
 EXAMPLES = """examples:
   sb3-quad tune-expert                                   for ITM, into itm_tuned.yaml
   sb3-quad tune-expert --vehicle my.yaml -o tuned.yaml   for a vehicle of your own
@@ -27,7 +18,7 @@ EXAMPLES = """examples:
 
 Ctrl-C writes the best gains so far; the same command goes on. Needs pip install 'sb3_quad[tune]'.
 """
-FRESH_SEED, FRESH_EPISODES, FRESH_SETS = 1_000_000, 960, 4
+FRESH_EPISODES, FRESH_SETS = 960, 4
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,84 +41,53 @@ def run(options: argparse.Namespace) -> int:
     """Search, measure on fresh episodes, write. Returns the exit code."""
     if min(options.trials, options.starts, options.targets) < 1 or options.seed < 0:
         raise ConfigError("--trials, --starts and --targets must be at least 1, --seed at least 0")
-    from sb3_quad.base.files import write_text
+    from sb3_quad.base.files import refuse_existing, write_text
+    from sb3_quad.base.seeds import seed_for
     from sb3_quad.base.signals import StopSignals
     from sb3_quad.evaluation.expert_figures import measure_expert
     from sb3_quad.experts.geometric import GeometricExpert, derived_gains
-    from sb3_quad.tuning.expert_search import ExpertSearch
-    from sb3_quad.tuning.vehicle_files import vehicle_text, with_gains
-    from sb3_quad.vehicles.vehicle import load_vehicle
+    from sb3_quad.tuning.expert import ExpertSearch, with_gains
+    from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
-    text = vehicle_text(options.vehicle)
     vehicle = load_vehicle(options.vehicle)
+    text, _ = VEHICLES.text(options.vehicle)
     output = Path(options.output or f"{vehicle.name}_tuned.yaml")
     if output.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--output {output}: must end in .yaml or .yml")
     journal = Path(options.journal) if options.journal else output.with_suffix(".journal")
-    _check_output(output, options.overwrite or journal.exists())
+    refuse_existing(output, options.overwrite or journal.exists())
     first = vehicle.geometric_gains or derived_gains(vehicle)
     search = ExpertSearch(vehicle, first, journal, options.seed, options.starts, options.targets)
-    _check_output(output, options.overwrite or (output.exists() and search.may_overwrite(output)))
+    refuse_existing(output, options.overwrite or search.may_overwrite(output))
 
-    with StopSignals() as signals:
-        _search(search, options.trials, options.progress, lambda: signals.received is None)
+    with StopSignals() as signals, progress_bar(options.progress) as show:
+        show(search.trials_done, options.trials, "choosing the hardest starts")
+
+        def should_continue(done: int, least: float) -> bool:
+            show(done, options.trials, f"least cost {least:.3f}")
+            return signals.received is None
+
+        search.run(options.trials, should_continue)
     if signals.received is not None:
         print(f"{signals.name}: writing the best of {search.trials_done} so far")
     gains = search.best
-    seeds = [FRESH_SEED + options.seed + k * FRESH_EPISODES for k in range(FRESH_SETS)]
-    figures, recoveries = measure_expert(GeometricExpert(vehicle, gains), vehicle, seeds, FRESH_EPISODES)
-    content = with_gains(text, gains.model_copy(update={"measured": figures}))
+    seeds = [seed_for("expert", options.seed) + k * FRESH_EPISODES for k in range(FRESH_SETS)]
+    measured, recoveries = measure_expert(GeometricExpert(vehicle, gains), vehicle, seeds, FRESH_EPISODES)
+    content = with_gains(text, gains.model_copy(update={"measured": measured}))
     search.note_output(content.encode("utf-8"))
     write_text(output, content)
-    console().print(_figures_table(figures))
-    console().print(_starts_table(recoveries))
-    print(f"{search.trials_done} gains tried, least cost {search.best_cost:.3f}; journal: {journal}")
-    print(f"saved {output}")
-    return signals.exit_code
 
-
-def _check_output(output: Path, allowed: bool) -> None:
-    if output.exists() and not allowed:
-        raise ConfigError(f"{output} exists: give another --output, or --overwrite")
-
-
-def _search(search: ExpertSearch, trials: int, progress: bool | None, goes_on: Callable[[], bool]) -> None:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    screen = console()
-    shown = screen.is_terminal if progress is None else progress
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=screen, disable=not shown) as bar:
-        task = bar.add_task("choosing the hardest starts", total=trials, completed=search.trials_done)
-
-        def after_each(done: int, least: float) -> bool:
-            bar.update(task, completed=done, description=f"least cost {least:.3f}")
-            return goes_on()
-
-        search.run(trials, after_each)
-
-
-def _figures_table(figures: GeometricMetrics) -> Table:
-    from rich.table import Table
-
-    table = Table(title="on fresh episodes, true state", title_justify="left")
-    for name in ("", "episodes", "success", "mean time to 0.1 m", "mean reward"):
-        table.add_column(name, justify="left" if not name else "right")
-    table.add_row("state recovery", f"{figures.recovery_episodes}", f"{100 * figures.recovery_success:.2f} %", "", "")
-    tracking = (f"{figures.tracking_episodes}", f"{100 * figures.tracking_success:.2f} %")
-    table.add_row("target tracking", *tracking, f"{figures.time_to_0_1_m:.2f} s", f"{figures.tracking_reward:.2f}")
-    return table
-
-
-def _starts_table(recoveries: Recoveries) -> Table:
-    from rich.table import Table
-
-    table = Table(title="state recovery, by how it starts", title_justify="left")
-    for name in ("", "", "flown", "lost", "success"):
-        table.add_column(name, justify="left" if not name else "right")
+    table = make_table("on fresh episodes, true state", "", "episodes", "success", "mean time to 0.1 m", "mean reward")
+    table.add_row("state recovery", f"{measured.recovery_episodes}", f"{100 * measured.recovery_success:.2f} %", "", "")
+    tracking = (f"{measured.tracking_episodes}", f"{100 * measured.tracking_success:.2f} %")
+    table.add_row("target tracking", *tracking, f"{measured.time_to_0_1_m:.2f} s", f"{measured.tracking_reward:.2f}")
+    console().print(table)
+    table = make_table("state recovery, by how it starts", "", "", "flown", "lost", "success", left=2)
     for quantity, groups in recoveries.flown.items():
         for group, flown in groups.items():
             lost = recoveries.lost[quantity][group]
-            share = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
-            table.add_row(quantity, group, str(flown), str(lost), share)
-    return table
+            table.add_row(quantity, group, str(flown), str(lost), f"{100 * (1 - lost / flown):.2f} %" if flown else "")
+    console().print(table)
+    print(f"{search.trials_done} gains tried, least cost {search.best_cost:.3f}; journal: {journal}")
+    print(f"saved {output}")
+    return signals.exit_code

@@ -130,7 +130,7 @@ def fly(
         ``observation_std`` and ``observation_mean``.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
-    :param hooks: see :func:`fly_fleet`.
+    :param hooks: are called along the way.
     :raises ConfigError: an unknown backend, fewer than one episode, or a controller that is none of the three.
     :raises ControllerError: a controller that fails in flight.
     """
@@ -143,54 +143,36 @@ def fly(
         observation_std=observation_std,
         max_episode_steps=max_steps,
     )
-    return fly_settings(controller, settings, n_episodes, seed, backend, tolerances, hooks)
+    if n_episodes < 1:
+        raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
+    return fly_settings(controller, settings, range(seed, seed + n_episodes), backend, tolerances, hooks)
 
 
 def fly_settings(
     controller: Any,
     settings: FlightSettings,
-    n_episodes: int,
-    seed: int = 0,
+    seeds: Sequence[int],
     backend: str = "batch",
     tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
     plan: Plan | None = None,
 ) -> Flights:
-    """As :func:`fly`, by one record of how the episodes are flown, and a plan."""
-    if n_episodes < 1:
-        raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
-    fleet = make_fleet(backend, range(seed, seed + n_episodes), settings)
+    """As :func:`fly`, by one record of how the episodes are flown: the first episode of each seed, from its start to its end.
+
+    :param hooks: are called along the way.
+    """
+    if backend not in FLEETS:
+        raise ConfigError(unknown("backend", backend, FLEETS))
+    fleet = FLEETS[backend](seeds, settings)
     try:
-        return fly_fleet(fleet, controller, plan or Plan(), settings.max_episode_steps, tolerances, hooks)
+        return _fly_fleet(fleet, controller, plan or Plan(), settings.max_episode_steps, tolerances, hooks)
     finally:
         fleet.close()
 
 
-def make_fleet(backend: str, seeds: Sequence[int], settings: FlightSettings) -> Fleet:
-    """The episodes of some seeds, in the environment of that name.
-
-    :raises ConfigError: an unknown backend, or settings that the environment refuses.
-    """
-    if backend not in FLEETS:
-        raise ConfigError(unknown("backend", backend, FLEETS))
-    return FLEETS[backend](seeds, settings)
-
-
-def fly_fleet(
-    fleet: Fleet,
-    controller: Any,
-    plan: Plan,
-    max_steps: int,
-    tolerances: Sequence[float] = TOLERANCES,
-    hooks: Sequence[Hook] = (),
+def _fly_fleet(
+    fleet: Fleet, controller: Any, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
 ) -> Flights:
-    """Fly the episodes of a fleet from their start to their ends.
-
-    :param controller: see :func:`fly`.
-    :param hooks: are called along the way.
-    :raises ConfigError: a controller that cannot be asked.
-    :raises ControllerError: a controller that fails in flight.
-    """
     asked = Controller(controller, ACTIONS, true_state=fleet.true_state)
     n, control_step, count = fleet.n, fleet.vehicle.control_step, len(plan.waypoints)
     observation = fleet.reset(plan.start)

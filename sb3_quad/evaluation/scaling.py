@@ -73,7 +73,7 @@ def hover_offset(
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
     own = {"task": "target_tracking", "task_kwargs": None, "max_episode_steps": STEPS, **changes}
-    flights = fly_settings(controller, (settings or FlightSettings()).with_changes(**own), n_flights, seed)
+    flights = fly_settings(controller, (settings or FlightSettings()).with_changes(**own), range(seed, seed + n_flights))
     lost = 1.0 - float(flights.success.mean())
     if lost > 0.5:
         raise ConfigError(

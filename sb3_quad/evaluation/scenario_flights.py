@@ -7,7 +7,7 @@ from typing import Any
 
 from sb3_quad.base.arrays import Arrays, FloatArray
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import Flights, Plan, fly_fleet, make_fleet
+from sb3_quad.evaluation.flights import Flights, Plan, fly_settings
 from sb3_quad.scenarios.sample import Episodes, sample_episodes
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
@@ -44,12 +44,8 @@ def fly_scenario(
         episodes = sample_episodes(scenario, chosen[part], None if factors is None else factors[part])
         recorder = Recorder(min(recorded, len(episodes.seeds)), episodes.steps) if recorded and first == 0 else None
         settings, plan = flown_as(episodes)
-        fleet = make_fleet(backend, episodes.seeds, settings)
         hooks = () if recorder is None else (recorder,)
-        try:
-            parts.append(fly_fleet(fleet, controller, plan, episodes.steps, scenario.tolerances, hooks))
-        finally:
-            fleet.close()
+        parts.append(fly_settings(controller, settings, episodes.seeds, backend, scenario.tolerances, hooks, plan))
         trajectories = recorder.arrays() if recorder is not None else trajectories
     return Flights.concatenate(parts), trajectories or {}
 

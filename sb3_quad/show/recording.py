@@ -109,7 +109,7 @@ def record(
         observation_std=observation_std,
         max_episode_steps=n_steps,
     )
-    flights = fly_settings(pilot, settings, 1, seed, "pybullet", (), [recorder], plan)
+    flights = fly_settings(pilot, settings, [seed], "pybullet", (), [recorder], plan)
     lost = "" if flights.success[0] else "collision" if flights.collision[0] else "out of range"
     states, wrenches = np.stack(recorder.states, axis=1), np.stack(recorder.wrenches, axis=1)
     times = np.arange(states.shape[1], dtype=np.float64) * recorder.control_step

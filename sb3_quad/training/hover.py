@@ -63,7 +63,7 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings
     at_target = at_target.reshape(N_HEADINGS, N_SAMPLES, -1).mean(dim=1)
     seen = _Observations()
     changes = {"task": TASKS, "task_kwargs": None, "max_episode_steps": STEPS}
-    fly_settings(model, own.with_changes(**changes), N_FLIGHTS, seed, hooks=[seen])
+    fly_settings(model, own.with_changes(**changes), range(seed, seed + N_FLIGHTS), hooks=[seen])
     flown = _features(model, np.concatenate(seen.kept))
     hover = load_vehicle(own.vehicle).hover_action
     with th.no_grad():

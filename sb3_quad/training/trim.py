@@ -100,8 +100,8 @@ def scale_position(model: OnPolicyAlgorithm, scale: float) -> None:
 def _judge(model: OnPolicyAlgorithm, seed: int, settings: FlightSettings) -> tuple[float, float, float]:
     """Mean reward and success of target tracking, success of state recovery."""
     episodes = {"task_kwargs": None, "max_episode_steps": MAX_EPISODE_STEPS}
-    tracking = fly_settings(model, settings.with_changes(task="target_tracking", **episodes), N_TARGETS, seed)
-    recovery = fly_settings(model, settings.with_changes(task="state_recovery", **episodes), N_RECOVERIES, seed)
+    tracking = fly_settings(model, settings.with_changes(task="target_tracking", **episodes), range(seed, seed + N_TARGETS))
+    recovery = fly_settings(model, settings.with_changes(task="state_recovery", **episodes), range(seed, seed + N_RECOVERIES))
     return float(tracking.reward.mean()), float(tracking.success.mean()), float(recovery.success.mean())
 
 

@@ -1,27 +1,36 @@
-"""What a search leaves: the best settings as YAML, all trials as CSV."""
+"""What a search leaves: the best settings as YAML, all trials as CSV and as a plot."""
 
 from __future__ import annotations
 
 import csv
 import io
 import json
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import yaml
+from matplotlib.figure import Figure
 
-from sb3_quad.base.files import write_text
+from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.tuning.search import ERROR, REWARD, RUN, SETTINGS, SUCCESS, Search
-from sb3_quad.tuning.space import current
+from sb3_quad.tuning.space import Choice, Interval, current
 
 if TYPE_CHECKING:
     from optuna.trial import FrozenTrial
 
-BEST, TRIALS = "best.yml", "trials.csv"
+BEST, TRIALS, PLOT = "best.yml", "trials.csv", "trials.png"
+COLUMNS = 4  # panels of the plot side by side
+STYLES: dict[str, dict[str, Any]] = {
+    "finished": {"s": 16, "color": "C0"},
+    "pruned": {"s": 16, "color": "0.6", "marker": "x", "linewidth": 1.0},
+    "best": {"s": 90, "facecolors": "none", "edgecolors": "C3", "linewidths": 1.5},
+}
 
 
 def write_results(search: Search, folder: Path) -> None:
-    """Write, or renew, the files of a search in its folder.
+    """Write, or renew, the files of a search in its folder, less the plot.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
@@ -52,7 +61,7 @@ def best_yaml(search: Search, best: FrozenTrial, path: Path) -> str:
     """A trial's settings as ``train --conf-file`` takes them."""
     how, episodes = in_words(search, best), search.job.eval_episodes
     lines = [
-        f"# Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.options.name}.",
+        f"# Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.name}.",
         f"# {how} over {episodes} episodes, by which it was chosen; seed {search.job.seed}.",
         f"# {train_command(search, path)}",
     ]
@@ -68,17 +77,64 @@ def train_command(search: Search, path: Path) -> str:
 
 def trials_csv(search: Search) -> str:
     """All trials that ended, a line each."""
-    names = list(search.space.dimensions)
-    head = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds", *names, RUN, ERROR]
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
+    head = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds", *search.space.dimensions, RUN, ERROR]
+    writer = csv.DictWriter(text, head, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for trial in search.trials():
-        attrs, values = trial.user_attrs, varied(search, trial)
-        seconds = round(trial.duration.total_seconds(), 2) if trial.duration is not None else None
-        figures = [trial.value if trial.state.name == "COMPLETE" else None, attrs.get(SUCCESS), attrs.get(REWARD)]
-        counts = [len(trial.intermediate_values), seconds]
-        writer.writerow(
-            [trial.number, trial.state.name, *figures, *counts, *values.values(), attrs.get(RUN), attrs.get(ERROR)]
-        )
+        state, duration = trial.state.name, trial.duration
+        own = {
+            "number": trial.number,
+            "state": state,
+            "value": trial.value if state == "COMPLETE" else None,
+            "evaluations": len(trial.intermediate_values),
+            "seconds": None if duration is None else round(duration.total_seconds(), 2),
+        }
+        writer.writerow({**trial.user_attrs, **varied(search, trial), **own})
     return text.getvalue()
+
+
+def write_plot(search: Search, path: Path) -> None:
+    """Plot the history of the trials, and each setting against what came of it, as PNG.
+
+    Pruned trials are grey crosses, the best one is ringed. The vertical axis is the success, or the mean reward once half of
+    the finished trials succeed equally often and best.
+
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    groups = {"finished": search.trials("COMPLETE"), "pruned": search.trials("PRUNED")}
+    groups["best"] = [] if search.best is None else [search.best]
+    successes = [trial.user_attrs[SUCCESS] for trial in groups["finished"]]
+    equals = successes.count(max(successes, default=0.0))
+    by_reward = search.job.config.task is None or 2 * equals > len(successes)
+    key, label, factor = (REWARD, "mean reward", 1) if by_reward else (SUCCESS, "success in %", 100)
+    heights = {group: [factor * trial.user_attrs[key] for trial in trials] for group, trials in groups.items()}
+
+    names = ["trial", *search.space.dimensions]
+    rows = math.ceil(len(names) / COLUMNS)
+    figure = Figure(figsize=(3.1 * COLUMNS, 2.6 * rows), layout="constrained")
+    panels = figure.subplots(rows, COLUMNS, squeeze=False, sharey=True)
+    for panel in panels.ravel()[len(names) :]:
+        panel.set_visible(False)
+    for panel, name in zip(panels.ravel(), names, strict=False):
+        dimension = search.space.dimensions.get(name)
+        for group, trials in groups.items():
+            values = [trial.params.get(name, trial.number) for trial in trials]
+            places = [str(value) for value in values] if isinstance(dimension, Choice) else values
+            panel.scatter(places, heights[group], label=group, **STYLES[group])
+        if isinstance(dimension, Interval) and dimension.log:
+            ticks = dimension.low, math.sqrt(dimension.low * dimension.high), dimension.high
+            panel.set_xscale("log")
+            panel.set_xticks(ticks, [f"{float(f'{tick:.2g}'):g}" for tick in ticks])
+            panel.minorticks_off()
+        panel.set_xlabel(name)
+        panel.grid(alpha=0.25)
+    first = panels[0, 0]
+    numbers = [trial.number for trial in groups["finished"]]
+    first.step(numbers, np.maximum.accumulate(heights["finished"]), where="post", color="C0", alpha=0.5)
+    first.legend(frameon=False, fontsize="small")
+    for panel in panels[:, 0]:
+        panel.set_ylabel(label)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    write_bytes(path, buffer.getvalue())

@@ -5,51 +5,28 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import time
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.base.files import one_line
 from sb3_quad.base.signals import StopSignals
-from sb3_quad.settings.config import TrainingConfig, build_config
+from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace, current
-from sb3_quad.tuning.study import check_names, make_pruner, make_sampler, open_study
+from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, load_optuna, make_pruner, open_study
 
 if TYPE_CHECKING:
-    from optuna import Study, Trial
+    from optuna import Trial
     from optuna.trial import FrozenTrial
 
 BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
+INTERRUPTED = "interrupted"  # the error of trials that are tried again
 HOPELESS = 5  # so many trials failing at first, and none not: the settings are at fault, not what is varied
-PATIENCE = 10.0  # s to wait for the process that begins a study to say what it began with
-
-
-@dataclass(frozen=True)
-class StudyOptions:
-    """How a study proposes its trials and cuts them short.
-
-    :param name: of the study, within its storage.
-    :param storage: see :func:`sb3_quad.tuning.study.open_study`.
-    :param sampler: one of :data:`sb3_quad.tuning.study.SAMPLERS`; ``pruner`` one of its PRUNERS.
-    :param n_startup_trials: drawn at random before the sampler begins, and finished before the median pruner does.
-    :param n_evaluations: of each trial, the last at its end.
-    """
-
-    name: str
-    storage: str | Path | None = None
-    sampler: str = "tpe"
-    pruner: str = "median"
-    n_startup_trials: int = 10
-    n_evaluations: int = 10
-
-    def __post_init__(self) -> None:
-        check_names(self.sampler, self.pruner)
-        if self.n_evaluations < 1 or self.n_startup_trials < 0:
-            raise ConfigError("n_evaluations must be at least 1, n_startup_trials at least 0")
 
 
 class Search:
@@ -60,25 +37,43 @@ class Search:
     The first trial has the settings as they are.
 
     :param job: what every trial does, but for the settings that are varied; its run folders go to its ``log_folder``.
-    :raises ConfigError: a storage that cannot be used, or that holds a study of this name of another kind.
+    :param name: of the study, within its storage.
+    :param storage: see :func:`sb3_quad.tuning.study.open_study`.
+    :param sampler: one of :data:`sb3_quad.tuning.study.SAMPLERS`; ``pruner`` one of its PRUNERS.
+    :param n_startup_trials: sampled at random before the sampler begins, and finished before the median pruner does.
+    :param n_evaluations: of each trial, the last at its end.
+    :raises ConfigError: an option that there is not; a storage that cannot be used, or that holds a study of this name of
+        another kind.
     """
 
-    def __init__(self, job: TrainingJob, space: SearchSpace, options: StudyOptions) -> None:
-        if job.eval_episodes < 1:
-            raise ConfigError(f"eval_episodes {job.eval_episodes}: must be at least 1, trials are judged by them")
-        self.space, self.options = space, options
-        self.job = job
-        begun_with = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
-        sampler = make_sampler(options.sampler, job.seed, options.n_startup_trials)
-        pruner = make_pruner(options.pruner, options.n_startup_trials, options.n_evaluations)
-        self.study, new = open_study(options.name, options.storage, sampler, "maximize", pruner)
-        if new:
-            self.study.set_user_attr(BEGUN_WITH, begun_with)
-            start = space.start()
-            if start is not None:
-                self.study.enqueue_trial(start)
-        else:
-            self._check(begun_with)
+    def __init__(
+        self,
+        job: TrainingJob,
+        space: SearchSpace,
+        name: str,
+        storage: str | Path | None = None,
+        sampler: str = "tpe",
+        pruner: str = "median",
+        n_startup_trials: int = 10,
+        n_evaluations: int = 10,
+    ) -> None:
+        for kind, given, valid in (("sampler", sampler, SAMPLERS), ("pruner", pruner, PRUNERS)):
+            if given not in valid:
+                raise ConfigError(unknown(kind, given, valid))
+        if min(n_evaluations, job.eval_episodes) < 1 or n_startup_trials < 0:
+            raise ConfigError("n_evaluations and eval_episodes must be at least 1, n_startup_trials at least 0")
+        self.job, self.space, self.name, self.storage = job, space, name, storage
+        self.sampler, self.n_startup_trials, self.n_evaluations = sampler, n_startup_trials, n_evaluations
+        wanted = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
+        self.study, known = open_study(name, storage, "maximize", (BEGUN_WITH, wanted), space.start())
+        self.study.pruner = make_pruner(pruner, n_startup_trials, n_evaluations)
+        where = f"study {name} in {storage}"
+        if not isinstance(known, dict):
+            raise ConfigError(f"{where}: is not of tune; give another --study-name")
+        differing = sorted(key for key in {**known, **wanted} if known.get(key) != wanted.get(key))
+        if differing:
+            other = f"was begun with other settings ({', '.join(differing)})"
+            raise ConfigError(f"{where}: {other}; give the same again, or another --study-name")
 
     def run(
         self, n_trials: int, max_total_trials: int | None, signals: StopSignals, after_each: Callable[[FrozenTrial], None]
@@ -90,31 +85,25 @@ class Search:
         :raises TrainingError: the first trials of all have failed.
         :raises ConfigError: a storage that fails meanwhile.
         """
-        import optuna
-
-        try:
-            self._run(n_trials, max_total_trials, signals, after_each)
-        except (OSError, optuna.exceptions.OptunaError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise ConfigError(f"storage {self.options.storage}: fails ({type(error).__name__}: {reason})") from error
-
-    def _run(
-        self, n_trials: int, max_total_trials: int | None, signals: StopSignals, after_each: Callable[[FrozenTrial], None]
-    ) -> None:
+        most = math.inf if max_total_trials is None else max_total_trials
         failures = 0
-        for number in range(n_trials):
-            if signals.received is not None or (max_total_trials is not None and self._counted() >= max_total_trials):
-                break
-            trial = self.study.ask()
-            self._train(trial, signals)
-            ended = self.study.get_trials(deepcopy=False)[trial.number]
-            after_each(ended)
-            failures += ended.state.name == "FAIL" and signals.received is None
-            if failures == number + 1 == HOPELESS:
-                raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {ended.user_attrs[ERROR]}")
+        try:
+            for number in range(n_trials):
+                if signals.received is not None or len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
+                    break
+                trial = ask(self.study, self.sampler, self.job.seed, self.n_startup_trials)
+                self._train(trial)
+                ended = self.study.get_trials(deepcopy=False)[trial.number]
+                after_each(ended)
+                failures += ended.state.name == "FAIL" and signals.received is None
+                if failures == number + 1 == HOPELESS:
+                    raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {ended.user_attrs[ERROR]}")
+        except (OSError, load_optuna().exceptions.OptunaError) as error:
+            reason = f"{type(error).__name__}: {one_line(error)}"
+            raise ConfigError(f"storage {self.storage}: fails ({reason})") from error
 
     def trials(self, *states: str) -> list[FrozenTrial]:
-        """The trials that ended so, such as ``COMPLETE``; all that ended by default."""
+        """The trials in these states, such as ``COMPLETE``; all that ended by default."""
         wanted = states or ("COMPLETE", "PRUNED", "FAIL")
         return [trial for trial in self.study.get_trials(deepcopy=False) if trial.state.name in wanted]
 
@@ -123,84 +112,61 @@ class Search:
         """The best trial that was finished, of any process; None if there is none."""
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
-    def score(self, success: float, reward: float) -> float:
-        """An evaluation as one number, the greater the better."""
-        if self.job.config.task is None:
-            return reward
-        return score(success, reward, self.job.eval_episodes)
-
-    def _counted(self) -> int:
-        return sum(trial.state.name in ("COMPLETE", "PRUNED", "RUNNING") for trial in self.study.get_trials(deepcopy=False))
-
-    def _train(self, trial: Trial, signals: StopSignals) -> None:
-        """Train as a trial says, and tell the study how it ended."""
-        from optuna.trial import TrialState
-
+    def _train(self, trial: Trial) -> None:
+        """Train as a trial says, and tell the study how it ended. One that is interrupted will be tried again."""
+        state, value, error = "FAIL", None, INTERRUPTED
         try:
             state, value = self._outcome(trial)
-        except Exception as error:  # whatever a choice of settings leads to, the next one may fare better
-            trial.set_user_attr(ERROR, f"{type(error).__name__}: {' '.join(str(error).split())}")
-            state, value = TrialState.FAIL, None
-        except BaseException:
-            self._leave(trial, "interrupted")
-            raise
-        if state is None:
-            self._leave(trial, "interrupted")
-            return
-        self.study.tell(trial, value, state=state)
+        except Exception as failure:  # whatever a choice of settings leads to, the next one may fare better
+            error = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
+        finally:
+            if state == "FAIL":
+                trial.set_user_attr(ERROR, error)
+            self.study.tell(trial, value, state=load_optuna().trial.TrialState[state])
+            if state == "FAIL" and error == INTERRUPTED and trial.params:
+                self.study.enqueue_trial(trial.params)
 
-    def _outcome(self, trial: Trial) -> tuple[Any, float | None]:
-        """The state and the value of a trial; a state of None if it was interrupted."""
-        from optuna.trial import TrialState
-
-        from sb3_quad.training.trainer import train
-
+    def _outcome(self, trial: Trial) -> tuple[str, float | None]:
+        """Train as a trial says: its state, which is FAIL if it was interrupted, and its value if it is COMPLETE."""
+        known, count = self.job.config, self.n_evaluations
         settings = self.space.suggest(trial)
         trial.set_user_attr(SETTINGS, json.dumps(settings))
-        known = self.job.config
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
-        total, count = _transitions(config), self.options.n_evaluations
-        scores: list[tuple[float, float]] = []
+        rollout = int(current(config.algo, config.hyperparams, "n_steps")) * config.n_envs
+        total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
+        evaluations: list[tuple[float, float]] = []
 
-        def goes_on(success: float, reward: float) -> bool:
-            scores.append((success, reward))
-            trial.report(self.score(success, reward), len(scores))
-            return len(scores) >= count or not trial.should_prune()
+        def value() -> float:
+            success, reward = evaluations[-1]
+            return reward if known.task is None else score(success, reward, self.job.eval_episodes)
+
+        def should_continue(success: float, reward: float) -> bool:
+            evaluations.append((success, reward))
+            trial.report(value(), len(evaluations))
+            return len(evaluations) >= count or not trial.should_prune()
 
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
-                # Never due with the last transition: that evaluation follows the last update.
+                # Never due with the last timestep: that evaluation follows the last update.
                 replace(self.job, config=config, eval_freq=total // count + 1 if count > 1 else -1),
                 report=lambda line: None,
-                started=lambda run: trial.set_user_attr(RUN, str(run.path)),
-                goes_on=goes_on,
+                on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
+                should_continue=should_continue,
             )
         if result.exit_code != 0:
-            return None, None
-        success, reward = scores[-1]
-        trial.set_user_attr(SUCCESS, success)
-        trial.set_user_attr(REWARD, reward)
+            return "FAIL", None
+        trial.set_user_attr(SUCCESS, evaluations[-1][0])
+        trial.set_user_attr(REWARD, evaluations[-1][1])
         if result.model.num_timesteps < total:
-            return TrialState.PRUNED, None
-        value = self.score(success, reward)
-        if not math.isfinite(value):
-            raise TrainingError(f"the mean reward is {reward}")
-        return TrialState.COMPLETE, value
-
-    def _leave(self, trial: Trial, reason: str) -> None:
-        """Give a trial up, and have its settings tried again by whoever goes on."""
-        from optuna.trial import TrialState
-
-        trial.set_user_attr(ERROR, reason)
-        self.study.tell(trial, state=TrialState.FAIL)
-        if trial.params:
-            self.study.enqueue_trial(trial.params)
+            return "PRUNED", None
+        if not math.isfinite(value()):
+            raise TrainingError(f"the mean reward is {evaluations[-1][1]}")
+        return "COMPLETE", value()
 
     def _kind(self) -> dict[str, Any]:
         """What all trials of a study must share to be compared."""
-        job, config = self.job, self.job.config
-        agent = None
+        job, config, agent = self.job, self.job.config, None
         if job.trained_agent is not None:
             try:
                 agent = hashlib.sha256(Path(job.trained_agent).read_bytes()).hexdigest()
@@ -210,22 +176,12 @@ class Search:
             "algo": config.algo,
             "env": config.env_id,
             **config.settings,
-            "search_space": self.space.describe(),
+            "search_space": {name: repr(each) for name, each in self.space.dimensions.items()},
             "seed": job.seed,
             "trained_agent": agent,
-            "n_evaluations": self.options.n_evaluations,
+            "n_evaluations": self.n_evaluations,
             "eval_episodes": job.eval_episodes,
         }
-
-    def _check(self, wanted: dict[str, str]) -> None:
-        study = f"study {self.options.name} in {self.options.storage}"
-        known = _begun_with(self.study)
-        if known is None:
-            raise ConfigError(f"{study}: is not of tune; give another --study-name")
-        differing = sorted(key for key in {**known, **wanted} if known.get(key) != wanted.get(key))
-        if differing:
-            other = f"was begun with other settings ({', '.join(differing)})"
-            raise ConfigError(f"{study}: {other}; give the same again, or another --study-name")
 
 
 def score(success: float, reward: float, n_episodes: int) -> float:
@@ -237,18 +193,3 @@ def score(success: float, reward: float, n_episodes: int) -> float:
     :param reward: mean per episode.
     """
     return success + (1.0 + reward / (1.0 + abs(reward))) / (2 * n_episodes)
-
-
-def _transitions(config: TrainingConfig) -> int:
-    """How many a training makes: its last rollout is a whole one."""
-    rollout = int(current(config.algo, config.hyperparams, "n_steps")) * config.n_envs
-    return math.ceil(config.n_timesteps / rollout) * rollout
-
-
-def _begun_with(study: Study) -> dict[str, str] | None:
-    """What a study was begun with. The process that has just begun it may take a moment to say so."""
-    end = time.monotonic() + PATIENCE
-    while BEGUN_WITH not in study.user_attrs and not study.trials and time.monotonic() < end:
-        time.sleep(0.1)
-    known = study.user_attrs.get(BEGUN_WITH)
-    return known if isinstance(known, dict) else None

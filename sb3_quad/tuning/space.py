@@ -9,71 +9,102 @@ value                                   meaning
 ======================================  ==================================================================================
 
 Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapping, and ``n_minibatches`` stands for the
-``batch_size`` that divides a rollout into so many. Where the settings have ``lin_x``, the x is varied.
+``batch_size`` that divides a rollout into so many. Where the settings have ``lin_x``, the x is varied. Settings of which only
+whole numbers are known to fit get whole numbers; ``whole: true`` beside ``low`` asks for them elsewhere.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
-from sb3_quad.settings.config import TrainingConfig, read_yaml
-from sb3_quad.settings.literals import parse_value
+from sb3_quad.settings.literals import parse_number, parse_value
 from sb3_quad.settings.values import takes_whole
-from sb3_quad.tuning.dimensions import LINEAR, Choice, Interval, Parameter, number_of
 
 if TYPE_CHECKING:
     from optuna import Trial
 
-PACKAGE = "sb3_quad.zoo_configs.search_spaces"
+SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
 MINIBATCHES = "n_minibatches"
 MAPPINGS = ("policy_kwargs", "env_kwargs")
 JOB_SETTINGS = ("n_envs", "expert")
+LINEAR = "lin_"
+Parameter = float | int | str | bool | None  # as Optuna holds it
 
 
-class Bounds(BaseModel):
-    """A number between two others."""
+class Factor(Frozen):
+    """A number around what the settings have, on a logarithmic scale."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    around: float = Field(gt=1)
+
+
+class Interval(Frozen):
+    """A number between two others.
+
+    :param log: on a logarithmic scale.
+    :param whole: whole numbers only; others have four significant digits.
+    :param schedule: written ``lin_x``: falls linearly from x to 0 over the training.
+    """
 
     low: float
     high: float
     log: bool = False
+    whole: bool = False
+    schedule: bool = False
+
+    @model_validator(mode="after")
+    def _check(self) -> Interval:
+        if self.low >= self.high:
+            raise ValueError(f"low {self.low:g} must be below high {self.high:g}")
+        if self.log and self.low <= 0:
+            raise ValueError(f"low {self.low:g} must be above 0 on a logarithmic scale")
+        if self.whole and not (self.low.is_integer() and self.high.is_integer()):
+            raise ValueError(f"low {self.low:g} and high {self.high:g} must be whole numbers")
+        return self
 
 
-class Factor(BaseModel):
-    """A number around what the settings have."""
+class Choice(Frozen):
+    """One of several values, which may be lists and mappings too."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    values: tuple[Any, ...]
 
-    around: float = Field(gt=1)
+    @property
+    def labels(self) -> list[Parameter]:
+        """The values as Optuna holds them: plain ones as they are, others as JSON."""
+        plain = (bool, int, float, str, type(None))
+        return [value if isinstance(value, plain) else json.dumps(value, default=str) for value in self.values]
 
 
 @dataclass(frozen=True)
 class SearchSpace:
     """The settings that are varied, by name, beside those that stay.
 
-    :param config: the settings it starts from.
+    :param algo: the algorithm whose settings these are.
+    :param base: all settings, as a search starts from them.
     """
 
-    config: TrainingConfig
+    algo: str
+    base: Mapping[str, Any]
     dimensions: Mapping[str, Interval | Choice]
 
     def suggest(self, trial: Trial) -> dict[str, Any]:
         """All settings of a trial: plain values, as YAML holds them."""
-        return self.settings({name: each.suggest(trial, name) for name, each in self.dimensions.items()})
+        return self.settings({name: _suggest(each, trial, name) for name, each in self.dimensions.items()})
 
-    def settings(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """The settings with some values in them."""
-        changed = dict(self.config.settings)
+    def settings(self, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
+        """All settings of a trial with these parameters."""
+        changed = dict(self.base)
+        values = {name: _setting(self.dimensions[name], parameter) for name, parameter in parameters.items()}
         for name, value in values.items():
             outer, dot, inner = name.partition(".")
             if dot:
@@ -81,45 +112,38 @@ class SearchSpace:
             elif name != MINIBATCHES:
                 changed[name] = value
         if MINIBATCHES in values:
-            rollout = _number(self._current(changed, "n_steps")) * _number(changed.get("n_envs", 1))
+            rollout = math.prod(_number_of(current(self.algo, changed, key)) or 1 for key in ("n_steps", "n_envs"))
             changed["batch_size"] = math.ceil(rollout / values[MINIBATCHES])  # of all but the last, which may be smaller
         return changed
 
     def start(self) -> dict[str, Parameter] | None:
         """The parameters that stand for the settings as they are; None if one of these lies outside the space."""
         try:
-            return {name: each.parameter(self._current(self.config.settings, name)) for name, each in self.dimensions.items()}
+            return {name: _parameter(each, current(self.algo, self.base, name)) for name, each in self.dimensions.items()}
         except ValueError:
             return None
 
-    def _current(self, settings: Mapping[str, Any], name: str) -> Any:
-        return current(self.config.algo, settings, name)
 
-    def describe(self) -> dict[str, str]:
-        """The space in words, by name."""
-        return {name: repr(each) for name, each in self.dimensions.items()}
-
-
-def load_space(config: TrainingConfig, file: str | Path | None = None) -> SearchSpace:
+def load_space(algo: str, settings: Mapping[str, Any], source: str | Path | None = None) -> SearchSpace:
     """What a search varies around some settings.
 
-    :param file: a YAML file; None: the package's own for the algorithm.
+    :param source: a YAML file; None: the package's own for the algorithm.
     :raises ConfigError: an unreadable file, a setting that is none, bounds that are none.
     """
-    if file is None:
-        where = f"search_spaces/{config.algo}.yml"
-        text = resources.files(PACKAGE).joinpath(f"{config.algo}.yml").read_text(encoding="utf-8")
-    else:
-        where = str(file)
-        try:
-            text = Path(file).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"search space {where}: cannot be read ({error})") from None
-    content = read_yaml(text, where)
-    if not isinstance(content, dict) or not content:
+    content, where = SPACES.read(source or algo)
+    if not content:
         raise ConfigError(f"{where}: must hold settings with their ranges, such as 'learning_rate: {{around: 5}}'")
-    _check_names(config, content, where)
-    return SearchSpace(config, {name: _dimension(config, name, given, f"{where}: {name}") for name, given in content.items()})
+    parameters = constructor_parameters(get_algorithm(algo))
+    divides = [MINIBATCHES] if {"n_steps", "batch_size"} <= parameters.keys() else []
+    valid = [*parameters, *JOB_SETTINGS, *divides]
+    for name in content:
+        outer, dot, inner = str(name).partition(".")
+        if not (name in valid or (dot and inner and outer in MAPPINGS)):
+            raise ConfigError(f"{where}: {unknown(f'setting of {algo}', name, valid)}")
+    if MINIBATCHES in content and "batch_size" in content:
+        raise ConfigError(f"{where}: {MINIBATCHES} says what batch_size is; leave one of them away")
+    dimensions = {name: _dimension(algo, settings, name, given, f"{where}: {name}") for name, given in content.items()}
+    return SearchSpace(algo, settings, dimensions)
 
 
 def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
@@ -127,63 +151,65 @@ def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
     outer, dot, inner = name.partition(".")
     if dot:
         return _plain(settings.get(outer)).get(inner)
-    parameters = constructor_parameters(get_algorithm(algo))
     if name == MINIBATCHES:
-        sizes = [_number(current(algo, settings, key)) for key in ("n_steps", "n_envs", "batch_size")]
-        return round(sizes[0] * sizes[1] / sizes[2])
+        steps, envs, size = (_number_of(current(algo, settings, key)) or 1 for key in ("n_steps", "n_envs", "batch_size"))
+        return round(steps * envs / size)
+    parameters = constructor_parameters(get_algorithm(algo))
     default = {"n_envs": 1, **{key: each.default for key, each in parameters.items()}}
     return settings.get(name, default.get(name))
 
 
-def _check_names(config: TrainingConfig, content: Mapping[Any, Any], where: str) -> None:
-    algorithm = get_algorithm(config.algo)
-    divides = [MINIBATCHES] if {"n_steps", "batch_size"} <= (given := constructor_parameters(algorithm)).keys() else []
-    valid = [*given, *JOB_SETTINGS, *divides]
-    for name in content:
-        outer, dot, inner = str(name).partition(".")
-        if not (name in valid or (dot and inner and outer in MAPPINGS)):
-            raise ConfigError(f"{where}: {unknown(f'setting of {config.algo}', name, valid)}")
-    if MINIBATCHES in content and "batch_size" in content:
-        raise ConfigError(f"{where}: {MINIBATCHES} says what batch_size is; leave one of them away")
-
-
-def _dimension(config: TrainingConfig, name: str, given: Any, where: str) -> Interval | Choice:
+def _dimension(algo: str, settings: Mapping[str, Any], name: str, given: Any, where: str) -> Interval | Choice:
     if isinstance(given, list):
         if not given:
             raise ConfigError(f"{where}: the list is empty")
-        return Choice(tuple(given))
+        return Choice(values=tuple(given))
     if not isinstance(given, dict):
         raise ConfigError(f"{where}: {given!r} must be {{low: …, high: …}}, {{around: …}} or a list of values")
-    value = current(config.algo, config.settings, name)
-    schedule = isinstance(value, str) and value.startswith(LINEAR)
-    parameter = constructor_parameters(get_algorithm(config.algo)).get(name)
+    value = current(algo, settings, name)
+    parameter = constructor_parameters(get_algorithm(algo)).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
-    try:
-        if "around" in given:
-            factor = Factor.model_validate(given).around
-            middle = number_of(value)
-            if middle is None or middle <= 0:
-                raise ConfigError(f"{where}: around needs a number above 0 in the settings, not {value!r}; give low and high")
-            low, high, log = middle / factor, middle * factor, True
-            if whole:
-                low, high = max(1, math.floor(low)), math.ceil(high)
-        else:
-            bounds = Bounds.model_validate(given)
-            low, high, log = bounds.low, bounds.high, bounds.log
-    except ValidationError as error:
-        raise ConfigError(f"{where}: {_explain(error)}") from None
-    if low >= high:
-        raise ConfigError(f"{where}: low {low:g} must be below high {high:g}")
-    if log and low <= 0:
-        raise ConfigError(f"{where}: low {low:g} must be above 0 on a logarithmic scale")
-    if whole and (low != int(low) or high != int(high)):
-        raise ConfigError(f"{where}: low {low:g} and high {high:g} must be whole numbers")
-    return Interval(low, high, log, whole, schedule)
+    schedule = isinstance(value, str) and value.startswith(LINEAR)
+    if "around" not in given:
+        return validate(Interval, {"whole": whole, "schedule": schedule, **given}, where)
+    factor, middle = validate(Factor, given, where).around, _number_of(value)
+    if middle is None or middle <= 0:
+        raise ConfigError(f"{where}: around needs a number above 0 in the settings, not {value!r}; give low and high")
+    low, high = middle / factor, middle * factor
+    if whole:
+        low, high = max(1, math.floor(low)), math.ceil(high)
+    return Interval.model_construct(low=low, high=high, log=True, whole=whole, schedule=schedule)
 
 
-def _explain(error: ValidationError) -> str:
-    item = error.errors()[0]
-    return f"{'.'.join(str(part) for part in item['loc'])}: {item['msg']}"
+def _suggest(dimension: Interval | Choice, trial: Trial, name: str) -> Parameter:
+    if isinstance(dimension, Choice):
+        return trial.suggest_categorical(name, dimension.labels)
+    if dimension.whole:
+        return trial.suggest_int(name, int(dimension.low), int(dimension.high), log=dimension.log)
+    return trial.suggest_float(name, dimension.low, dimension.high, log=dimension.log)
+
+
+def _setting(dimension: Interval | Choice, parameter: Any) -> Any:
+    """The value that a parameter stands for, as the settings hold it."""
+    if isinstance(dimension, Choice):
+        return dimension.values[dimension.labels.index(parameter)]
+    if dimension.whole:
+        return parameter
+    written = f"{min(max(float(f'{parameter:.4g}'), dimension.low), dimension.high):.4g}"
+    return f"{LINEAR}{written}" if dimension.schedule else float(written)
+
+
+def _parameter(dimension: Interval | Choice, setting: Any) -> Parameter:
+    """The parameter that stands for a value of the settings.
+
+    :raises ValueError: the value is not among those that the dimension has.
+    """
+    if isinstance(dimension, Choice):
+        return dimension.labels[dimension.labels.index(Choice(values=(setting,)).labels[0])]
+    number = _number_of(setting)
+    if number is None or not dimension.low <= number <= dimension.high:
+        raise ValueError(f"{setting!r} is not between {dimension.low:g} and {dimension.high:g}")
+    return int(number) if dimension.whole else float(number)
 
 
 def _plain(value: Any) -> dict[str, Any]:
@@ -192,6 +218,7 @@ def _plain(value: Any) -> dict[str, Any]:
     return dict(found) if isinstance(found, dict) else {}
 
 
-def _number(value: Any) -> float:
-    number = number_of(value)
-    return 1.0 if number is None else number
+def _number_of(value: Any) -> float | None:
+    """A number, also that of ``lin_x``; None if there is none."""
+    number = parse_number(value.removeprefix(LINEAR) if isinstance(value, str) else value)
+    return None if isinstance(number, bool) or not isinstance(number, (int, float)) else number

@@ -2,127 +2,109 @@
 
 from __future__ import annotations
 
+import time
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.extras import require
+from sb3_quad.base.files import one_line
 
 if TYPE_CHECKING:
-    from optuna import Study
+    from optuna import Study, Trial
     from optuna.pruners import BasePruner
-    from optuna.samplers import BaseSampler
-    from optuna.storages import BaseStorage
 
 SAMPLERS = ("tpe", "random", "cmaes")
 PRUNERS = ("median", "halving", "none")
+PATIENCE = 10.0  # s to wait for the process that begins a study to say what it began with
 
 
-def require_optuna(command: str) -> None:
-    """See that Optuna and what its samplers need are there.
+def load_optuna() -> Any:
+    """Optuna, without its log.
 
-    :param command: what needs them, for the message.
-    :raises ConfigError: one is missing; the message names the extra that brings it.
+    :raises ConfigError: Optuna or cmaes is missing; the message says what to install.
     """
-    try:
-        import cmaes  # noqa: F401  (Optuna imports it only when it first samples)
-        import optuna
-    except ImportError as error:
-        raise ConfigError(f"{command} needs Optuna and cmaes ({error}): pip install 'sb3_quad[tune]'") from None
+    require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
+    optuna = require("optuna", "tune", "a search")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    return optuna
 
 
 def open_study(
     name: str,
     storage: str | Path | None,
-    sampler: BaseSampler,
     direction: Literal["minimize", "maximize"],
-    pruner: BasePruner | None = None,
-) -> tuple[Study, bool]:
-    """A study, and whether it is new; one that the storage remembers is gone on with.
+    begun_with: tuple[str, Any],
+    first: Mapping[str, Any] | None,
+) -> tuple[Study, Any]:
+    """A study, and the settings that it was begun with; one that the storage remembers is continued.
 
     :param storage: a database's URL (with ``://``), or else the path of a journal file; None: nothing is remembered.
-    :raises ConfigError: a storage that cannot be used, such as a file that is no journal.
+    :param begun_with: the settings of a new study, after the name of the user attribute that holds them.
+    :param first: parameters of a new study's first trial.
+    :raises ConfigError: Optuna is missing; a storage that cannot be used, such as a file that is no journal.
     """
-    import optuna
-
+    optuna = load_optuna()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            opened = _open_storage(storage)
-            keywords: dict[str, Any] = {"study_name": name, "storage": opened, "sampler": sampler, "pruner": pruner}
+            keywords = {"study_name": name, "storage": _open_storage(optuna, storage)}
             try:
-                return optuna.create_study(direction=direction, **keywords), True
+                study, new = optuna.create_study(direction=direction, **keywords), True
             except optuna.exceptions.DuplicatedStudyError:
-                return optuna.load_study(**keywords), False
+                study, new = optuna.load_study(**keywords), False
     except Exception as error:  # databases and damaged journals raise what they like
-        reason = " ".join(str(error).split())
-        raise ConfigError(f"storage {storage}: cannot be used ({type(error).__name__}: {reason[:200]})") from None
+        reason = f"{type(error).__name__}: {one_line(error)}"
+        raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
+    attribute, settings = begun_with
+    end = time.monotonic() + PATIENCE
+    while not new and attribute not in study.user_attrs and not study.trials and time.monotonic() < end:
+        time.sleep(0.1)  # the process that has just begun it may take a moment to say so
+    if attribute not in study.user_attrs and not study.trials:
+        study.set_user_attr(attribute, settings)
+        if first is not None:
+            study.enqueue_trial(dict(first))
+    return study, study.user_attrs.get(attribute)
 
 
-def _open_storage(storage: str | Path | None) -> BaseStorage:
-    from optuna.storages import InMemoryStorage, JournalStorage, RDBStorage
-    from optuna.storages.journal import JournalFileBackend
-
+def _open_storage(optuna: Any, storage: str | Path | None) -> Any:
     if storage is None:
-        return InMemoryStorage()
+        return optuna.storages.InMemoryStorage()
     if "://" in str(storage):
-        return RDBStorage(str(storage))
+        return optuna.storages.RDBStorage(str(storage))
     Path(storage).parent.mkdir(parents=True, exist_ok=True)
-    return JournalStorage(JournalFileBackend(str(storage)))
+    return optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(storage)))
 
 
-def check_names(sampler: str, pruner: str) -> None:
-    """:raises ConfigError: a sampler or a pruner that there is not."""
-    if sampler not in SAMPLERS:
-        raise ConfigError(unknown("sampler", sampler, SAMPLERS))
-    if pruner not in PRUNERS:
-        raise ConfigError(unknown("pruner", pruner, PRUNERS))
-
-
-def make_sampler(name: str, seed: int, n_startup_trials: int) -> BaseSampler:
-    """One of :data:`SAMPLERS`. What it proposes for a trial depends on ``seed``, the trial's number and the trials known.
+def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
+    """The next trial of a study. What is proposed depends on ``seed``, the trial's number and the trials known.
 
     So processes that share a study propose different trials, and a study that is resumed goes on as if never left.
 
-    :param n_startup_trials: trials drawn at random first.
+    :param sampler: one of :data:`SAMPLERS`.
+    :param n_startup_trials: sampled at random first.
     """
-    from optuna import samplers
+    optuna = load_optuna()
+    study.sampler = optuna.samplers.RandomSampler()  # proposes nothing yet: the trial's number is to be known first
+    trial = study.ask()
+    own = int(np.random.SeedSequence([seed, trial.number]).generate_state(1)[0])
+    study.sampler = _make_sampler(optuna.samplers, sampler, own, n_startup_trials)
+    sampled: Trial = optuna.trial.Trial(study, trial._trial_id)
+    return sampled
 
-    def fresh(number: int) -> samplers.BaseSampler:
-        own = int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
-        if name == "random":
-            return samplers.RandomSampler(seed=own)
-        if name == "cmaes":
-            return samplers.CmaEsSampler(seed=own, n_startup_trials=n_startup_trials, warn_independent_sampling=False)
-        return samplers.TPESampler(seed=own, n_startup_trials=n_startup_trials, multivariate=True, constant_liar=True)
 
-    class PerTrial(samplers.BaseSampler):
-        """Asks a new sampler for each trial, seeded by the trial's number."""
-
-        _current = fresh(0)
-
-        def before_trial(self, study: Study, trial: Any) -> None:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # what is experimental about TPE's arguments is Optuna's affair
-                self._current = fresh(trial.number)
-            self._current.before_trial(study, trial)
-
-        def infer_relative_search_space(self, study: Study, trial: Any) -> Any:
-            return self._current.infer_relative_search_space(study, trial)
-
-        def sample_relative(self, study: Study, trial: Any, search_space: Any) -> dict[str, Any]:
-            return self._current.sample_relative(study, trial, search_space)
-
-        def sample_independent(self, study: Study, trial: Any, param_name: str, param_distribution: Any) -> Any:
-            return self._current.sample_independent(study, trial, param_name, param_distribution)
-
-        def after_trial(self, study: Study, trial: Any, state: Any, values: Any) -> None:
-            self._current.after_trial(study, trial, state, values)
-
-    return PerTrial()
+def _make_sampler(samplers: Any, name: str, seed: int, n_startup_trials: int) -> Any:
+    if name == "random":
+        return samplers.RandomSampler(seed=seed)
+    if name == "cmaes":
+        return samplers.CmaEsSampler(seed=seed, n_startup_trials=n_startup_trials, warn_independent_sampling=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what is experimental about TPE's arguments is Optuna's affair
+        return samplers.TPESampler(seed=seed, n_startup_trials=n_startup_trials, multivariate=True, constant_liar=True)
 
 
 def make_pruner(name: str, n_startup_trials: int, n_evaluations: int) -> BasePruner:
@@ -131,10 +113,10 @@ def make_pruner(name: str, n_startup_trials: int, n_evaluations: int) -> BasePru
     :param n_startup_trials: trials that ``median`` lets finish first.
     :param n_evaluations: of a trial; ``median`` prunes none before a third of them.
     """
-    from optuna import pruners
-
+    pruners = load_optuna().pruners
+    pruner: BasePruner = pruners.NopPruner()
     if name == "halving":
-        return pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
-    if name == "median":
-        return pruners.MedianPruner(n_startup_trials=n_startup_trials, n_warmup_steps=n_evaluations // 3)
-    return pruners.NopPruner()
+        pruner = pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
+    elif name == "median":
+        pruner = pruners.MedianPruner(n_startup_trials=n_startup_trials, n_warmup_steps=n_evaluations // 3)
+    return pruner

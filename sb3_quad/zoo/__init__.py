@@ -1,17 +1,13 @@
 """Bridge to rl_zoo3: importing this makes our algorithms, settings files and batched environment known to it.
 
-Extra ``[zoo]``. In the same process, rl_zoo3's ``train`` and ``enjoy`` then take ``--algo dagger`` and ``--algo ppo_bc``::
-
-    import sb3_quad.zoo
-    from rl_zoo3.train import train
-
-On the command line, ``python -m sb3_quad.zoo train …`` is ``rl_zoo3 train …`` with this import before it. For the plain
-command, rl_zoo3 itself imports a module ``custom_envs`` if there is one: a file ``custom_envs.py`` that holds
-``import sb3_quad.zoo``, in a folder on ``PYTHONPATH``, is enough.
+``python -m sb3_quad.zoo train …`` is ``rl_zoo3 train …`` with this import before it, and takes ``--algo dagger`` and
+``--algo ppo_bc``; in a program, ``import sb3_quad.zoo`` comes before what it imports of rl_zoo3. The plain command imports a
+module ``custom_envs`` if there is one: a file ``custom_envs.py`` that holds ``import sb3_quad.zoo``, in a folder on
+``PYTHONPATH``, is enough.
 
 Never imported by the rest of this package: rl_zoo3 replaces Gymnasium's ``TimeLimit`` when it is imported.
 
-:raises ImportError: rl_zoo3 is not installed.
+:raises ImportError: rl_zoo3 is not installed (the extra ``zoo``).
 """
 
 from __future__ import annotations

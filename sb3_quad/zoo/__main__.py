@@ -8,11 +8,8 @@ import sys
 
 from sb3_quad.base.errors import SB3QuadError, unknown
 
-SCRIPTS = {  # the function to call, or the module to run
-    **{name: f"rl_zoo3.{name}:{name}" for name in ("train", "enjoy")},
-    **{name: f"rl_zoo3.plots.{name}:{name}" for name in ("plot_train", "plot_from_file", "all_plots")},
-    **{name: f"rl_zoo3.{name}" for name in ("record_video", "push_to_hub", "load_from_hub")},
-}
+FUNCTIONS = ("train", "enjoy", "plot_train", "plot_from_file", "all_plots")  # of rl_zoo3's modules of the same names
+SCRIPTS = (*FUNCTIONS, "record_video", "push_to_hub", "load_from_hub")
 
 
 def main() -> int:
@@ -28,9 +25,9 @@ def main() -> int:
         import sb3_quad.zoo  # noqa: F401
 
         sys.argv = [f"rl_zoo3 {script}", *sys.argv[2:]]
-        module, _, function = SCRIPTS[script].partition(":")
-        if function:
-            getattr(importlib.import_module(module), function)()
+        module = f"rl_zoo3.plots.{script}" if "plot" in script else f"rl_zoo3.{script}"
+        if script in FUNCTIONS:
+            getattr(importlib.import_module(module), script)()
         else:
             runpy.run_module(module, run_name="__main__")
     except (SB3QuadError, ImportError) as error:

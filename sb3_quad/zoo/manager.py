@@ -5,33 +5,28 @@ What differs holds for our algorithms and for any algorithm on our environments;
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Callable
-from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import rl_zoo3.exp_manager
 from rl_zoo3 import ALGOS
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.resolve import resolve_expert
-from sb3_quad.settings.algorithms import constructor_parameters, takes_expert
-from sb3_quad.settings.config import VEC_ENVS, config_names
-from sb3_quad.settings.literals import parse_mapping, parse_number
-from sb3_quad.settings.values import convert
+from sb3_quad.settings.algorithms import takes_expert
+from sb3_quad.settings.config import SETTINGS, VEC_ENVS
+from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.handover import hand_over
+from sb3_quad.zoo.registration import OWN_ALGORITHMS, Settings, register_space, to_keywords
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
-
-SCHEDULES = ("learning_rate", "clip_range", "clip_range_vf", "delta_std")  # those that rl_zoo3 makes of lin_x
-Settings = dict[str, Any]
 
 
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
@@ -55,14 +50,14 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     config: str
     env_kwargs: Settings
+    trial_id: int | None
     vec_env_class: Callable[..., VecEnv]
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         self._env_id: str = self.env_name.gym_id
-        self._ours = self.algo in ("dagger", "ppo_bc") or self._env_id in ENVIRONMENTS
+        self._ours = self.algo in OWN_ALGORITHMS or self._env_id in ENVIRONMENTS
         self._batched = False
-        self._evaluation: Settings = {}
         if self._ours:
             self.config = _find_config(self.config, self.algo)
         if self._env_id in ENVIRONMENTS:
@@ -73,10 +68,19 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if not self._ours:
             return super().read_hyperparameters()  # type: ignore[no-any-return]
         given, self.env_kwargs = self.env_kwargs, {}
+        trial_id = self.trial_id
+        if self.algo in OWN_ALGORITHMS:
+            self.trial_id = None  # a trial's values are read below, once the settings that they change are known
         settings, saved = super().read_hyperparameters()
-        merged = {**parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"), **given}
+        changes: Settings = {}
+        if self.algo in OWN_ALGORITHMS:
+            register_space(self.algo, dict(settings))
+            if self.storage and self.study_name and trial_id:
+                of_trial = self.load_trial(self.storage, self.study_name, trial_id)
+                changes = {**of_trial, **(self.custom_hyperparams or {})}
+        changes["env_kwargs"] = {**parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"), **given}
         for each in (settings, saved):
-            each["env_kwargs"] = merged
+            each.update(changes)
         return settings, saved
 
     def _preprocess_hyperparams(self, hyperparams: Settings) -> Any:
@@ -86,16 +90,10 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         evaluation = parse_mapping(hyperparams.pop("eval_env_kwargs", None), f"{self.config}: eval_env_kwargs")
         if hyperparams.pop("eval_tasks", None):
             print("eval_tasks: left out, rl_zoo3 evaluates on the environment's own task")
-        algorithm = ALGOS[self.algo]
         expert = hyperparams.pop("expert", None)
-        if takes_expert(algorithm):
-            vehicle = hyperparams["env_kwargs"].get("vehicle", "itm")
-            hyperparams["expert"] = resolve_expert(expert or "pid", vehicle)
-        parameters = constructor_parameters(algorithm)
-        for name in parameters.keys() & hyperparams.keys() - set(SCHEDULES):
-            hyperparams[name] = convert(hyperparams[name], parameters[name], f"{self.config}: {name}")
-        if isinstance(hyperparams.get("policy_kwargs"), dict):
-            hyperparams["policy_kwargs"] = parse_mapping(hyperparams["policy_kwargs"], f"{self.config}: policy_kwargs")
+        if takes_expert(ALGOS[self.algo]):
+            hyperparams["expert"] = resolve_expert(expert or "pid", hyperparams["env_kwargs"].get("vehicle", "itm"))
+        hyperparams = to_keywords(self.algo, hyperparams, self.config)
         processed = super()._preprocess_hyperparams(hyperparams)
         self.eval_env_kwargs = {**self.env_kwargs, **evaluation, **(self._eval_env_kwargs_args or {})}
         if self._batched and processed[1] is not None:
@@ -103,18 +101,12 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         return processed
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:
-        if not self._ours:
-            return super()._preprocess_schedules(hyperparams)  # type: ignore[no-any-return]
-        for name in set(SCHEDULES) & hyperparams.keys():
-            value = hyperparams[name]
-            if isinstance(value, str) and value.startswith("lin_"):
-                hyperparams[name] = LinearSchedule(float(value.removeprefix("lin_")), 0.0, 1.0)
-            else:
-                hyperparams[name] = parse_number(value)
-        return hyperparams
+        return hyperparams if self._ours else super()._preprocess_schedules(hyperparams)  # to_keywords has made ours
 
     def _choose_vec_env(self, setting: str | None) -> None:
-        flag = _flag("--vec-env")
+        parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        parser.add_argument("--vec-env")
+        flag = parser.parse_known_args()[0].vec_env  # rl_zoo3's own default hides whether it was given
         kind = flag or setting or ("batch" if self._env_id in ENVIRONMENTS else "dummy")
         if kind not in VEC_ENVS:
             raise ConfigError(f"{self.config}: {unknown('vec_env', kind, VEC_ENVS)}")
@@ -128,12 +120,17 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         """The environments of a training or an evaluation, with their wrappers."""
         if self._batched:
             kwargs = {"task": ENVIRONMENTS[self._env_id], **(self.eval_env_kwargs if eval_env else self.env_kwargs)}
-            file = None if eval_env or no_log else Path(self.save_path) / "0"
-            self.vec_env_class = partial(_batch, kwargs, file)
+            file = None if eval_env or no_log else str(Path(self.save_path) / "0")  # with .monitor.csv after it
+
+            def make(makers: list[Callable[[], Any]]) -> VecEnv:
+                """As many rows as SB3's ``make_vec_env`` would make environments."""
+                return VecMonitor(QuadcopterVecEnv(len(makers), **kwargs), file, ("is_success",))
+
+            self.vec_env_class = make
         return super().create_envs(n_envs, eval_env, no_log)
 
     def _load_pretrained_agent(self, hyperparams: Settings, env: VecEnv) -> BaseAlgorithm:
-        if self.algo not in ("dagger", "ppo_bc"):
+        if self.algo not in OWN_ALGORITHMS:
             return super()._load_pretrained_agent(hyperparams, env)  # type: ignore[no-any-return]
         given: Settings = {"tensorboard_log": self.tensorboard_log, "seed": self.seed, "verbose": self.verbose}
         model = ALGOS[self.algo](env=env, device=self.device, **given, **hyperparams)
@@ -155,24 +152,6 @@ def _find_config(given: str, algo: str) -> str:
     """
     nothing_said = Path(given) == Path(rl_zoo3.exp_manager.__file__).parent / "hyperparams" / f"{algo}.yml"
     name = f"{algo}.yml" if nothing_said else given
-    if name in config_names() and (nothing_said or not Path(name).is_file()):
+    if name in SETTINGS.names() and (nothing_said or not Path(name).is_file()):
         return str(resources.files("sb3_quad.zoo_configs").joinpath(name))
     return given
-
-
-def _flag(name: str) -> str | None:
-    """The value of a flag on the command line; argparse's defaults do not tell whether it was given."""
-    arguments = sys.argv[1:]
-    for i, argument in enumerate(arguments):
-        flag, equals, value = argument.partition("=")
-        if flag == name:
-            return value if equals else next(iter(arguments[i + 1 :]), None)
-    return None
-
-
-def _batch(keywords: Settings, file: Path | None, makers: list[Callable[[], Any]]) -> VecEnv:
-    """As many rows as SB3's ``make_vec_env`` would make environments.
-
-    :param file: where episodes are written, ``.monitor.csv`` is added; None: nowhere.
-    """
-    return VecMonitor(QuadcopterVecEnv(len(makers), **keywords), None if file is None else str(file), ("is_success",))

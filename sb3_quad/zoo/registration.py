@@ -4,31 +4,63 @@ from __future__ import annotations
 
 import importlib
 import sys
+from collections.abc import Mapping
+from typing import Any
 
-from sb3_quad.settings.algorithms import get_algorithm
-from sb3_quad.zoo.search import CONVERTERS, SAMPLERS
+from rl_zoo3 import ALGOS
+from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
+from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
+from sb3_quad.settings.config import SETTINGS
+from sb3_quad.settings.literals import parse_mapping
+from sb3_quad.settings.values import convert
+from sb3_quad.tuning.space import load_space
+
+Settings = dict[str, Any]
 OWN_ALGORITHMS = ("dagger", "ppo_bc")
 
 
 def register() -> None:
     """Make them known; calling it again changes nothing."""
-    from rl_zoo3 import ALGOS
-    from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
-
-    ALGOS.update({name: get_algorithm(name) for name in OWN_ALGORITHMS})
-    HYPERPARAMS_SAMPLER.update(SAMPLERS)
-    HYPERPARAMS_CONVERTER.update(CONVERTERS)
-    module = importlib.import_module("rl_zoo3.exp_manager")
+    for name in OWN_ALGORITHMS:
+        ALGOS[name] = get_algorithm(name)
+        register_space(name, next(iter(SETTINGS.read(f"{name}.yml")[0].values())))
     # rl_zoo3's record_video imports exp_manager, which imports custom_envs, which may import this: too early for a
     # subclass of what it is about to define, and none is needed there.
-    if hasattr(module, "ExperimentManager"):
-        _replace_manager()
+    if hasattr(importlib.import_module("rl_zoo3.exp_manager"), "ExperimentManager"):
+        from sb3_quad.zoo.manager import QuadExperimentManager
+
+        for name, module in list(sys.modules.items()):
+            if name.startswith("rl_zoo3.") and hasattr(module, "ExperimentManager"):
+                module.ExperimentManager = QuadExperimentManager  # type: ignore[attr-defined]
 
 
-def _replace_manager() -> None:
-    from sb3_quad.zoo.manager import QuadExperimentManager
+def register_space(algo: str, settings: Mapping[str, Any]) -> None:
+    """Have ``-optimize`` and ``--trial-id`` search as ``tune`` does, around some settings of an algorithm.
 
-    for name, module in list(sys.modules.items()):
-        if name.startswith("rl_zoo3.") and hasattr(module, "ExperimentManager"):
-            module.ExperimentManager = QuadExperimentManager  # type: ignore[attr-defined]
+    rl_zoo3 wants a sampler, which asks a trial for values and gives keywords of the algorithm; and a converter, which gives
+    the settings that the values kept by a study stand for, as plain as YAML holds them.
+    """
+
+    def convert_parameters(parameters: Mapping[str, Any]) -> Settings:
+        parse_mapping(settings.get("policy_kwargs"), "policy_kwargs")  # an expression would be lost, so it is refused
+        found = load_space(algo, settings).settings(parameters)
+        return {name: value for name, value in found.items() if name not in settings or settings[name] != value}
+
+    def sample(trial: Any, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+        load_space(algo, settings).suggest(trial)
+        return to_keywords(algo, convert_parameters(trial.params), "search space")
+
+    HYPERPARAMS_SAMPLER[algo] = sample
+    HYPERPARAMS_CONVERTER[algo] = convert_parameters
+
+
+def to_keywords(algo: str, settings: Settings, where: str) -> Settings:
+    """Settings with those that the algorithm's constructor takes converted to what it takes."""
+    parameters = constructor_parameters(ALGOS[algo])
+    found = {
+        name: convert(each, parameters[name], f"{where}: {name}") for name, each in settings.items() if name in parameters
+    }
+    if isinstance(settings.get("policy_kwargs"), dict):
+        found["policy_kwargs"] = parse_mapping(settings["policy_kwargs"], f"{where}: policy_kwargs")
+    return {**settings, **found}
