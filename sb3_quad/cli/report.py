@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from sb3_quad.cli.output import console
@@ -33,15 +32,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def report(folder: str | Path, overwrite: bool, pictures: bool) -> None:
-    """Write the page of a folder of results, saying what is being done if someone is looking.
+    """Write the page of a folder of results, with a spinner in a terminal; tell where it is.
 
     :raises ConfigError: see :func:`sb3_quad.report.page.write_report`.
     """
     from sb3_quad.report.page import PICTURES, write_report
 
-    if sys.stderr.isatty():
-        with console().status("report") as status:
-            page = write_report(folder, overwrite, pictures, lambda heading: status.update(f"report: {heading}"))
-    else:
+    with console().status("report"):
         page = write_report(folder, overwrite, pictures)
     print(f"saved {page}" + (f", its plots as PNG and SVG in {page.parent / PICTURES}" if pictures else ""))

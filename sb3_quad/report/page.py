@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,17 +18,11 @@ from sb3_quad.report.sections import Section, sections
 PAGE, TABLES, PICTURES = "report.html", "report.md", "figures"
 
 
-def write_report(
-    folder: str | Path,
-    overwrite: bool = False,
-    with_pictures: bool = True,
-    progress: Callable[[str], None] = lambda heading: None,
-) -> Path:
+def write_report(folder: str | Path, overwrite: bool = False, with_pictures: bool = True) -> Path:
     """Write the report of a folder of results: its tables as ``report.md``, its plots, and the page with both.
 
     :param overwrite: replace a report that is there.
     :param with_pictures: also write every plot as PNG and SVG, into ``figures/``.
-    :param progress: told the heading of each section before its plots are drawn.
     :return: the page.
     :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written;
         :class:`MissingExtra` if the page alone could not be written.
@@ -40,11 +34,9 @@ def write_report(
     refuse_existing(page, overwrite)
     parts = sections(results, folder)
     write_text(Path(folder) / TABLES, render_markdown(results, parts))
-    for section in parts if with_pictures else ():
-        progress(section.heading)
-        for plot in section.plots:
-            write_bytes(Path(folder) / PICTURES / f"{plot.name}.png", plot.png)
-            write_bytes(Path(folder) / PICTURES / f"{plot.name}.svg", plot.svg)
+    for plot in (plot for section in parts for plot in section.plots) if with_pictures else ():
+        write_bytes(Path(folder) / PICTURES / f"{plot.name}.png", plot.png)
+        write_bytes(Path(folder) / PICTURES / f"{plot.name}.svg", plot.svg)
     write_text(page, render(results, parts, with_pictures))
     return page
 

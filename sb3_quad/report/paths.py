@@ -72,7 +72,8 @@ def _forces(tracks: Sequence[Track], length: float) -> list[Trace]:
     traces = []
     for track, k, force in found:
         arrow, at = force * length / greatest, track.position[k]
-        across = np.cross(arrow, np.eye(3)[np.argmin(np.abs(arrow))])
+        axis = np.eye(3)[np.argmin(np.abs(arrow))]
+        across = axis - (axis @ arrow) / (arrow @ arrow) * arrow  # upright for a horizontal force
         across *= 0.1 * np.linalg.norm(arrow) / np.linalg.norm(across)
         tip, barb = at + arrow, at + 0.7 * arrow
         text = f"{np.linalg.norm(force):.3g} N at {track.times[k]:.2f} s"
