@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from sb3_quad.cli import main
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
-from sb3_quad.report.vehicle import doubts, lost_whatever_flies
+from sb3_quad.report.vehicle import warnings
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.vehicles.authority import authority, gyration_ratio
 from sb3_quad.vehicles.vehicle import load_vehicle, vehicle_names
@@ -76,22 +76,14 @@ def test_the_geometric_expert_flies_them_with_gains_derived_or_found(name):
         assert np.nanmean(tracking.time_to[0.1]) < 3.0 and tracking.final_error.max() < 0.01
 
 
-def test_doubts_are_about_units():
-    assert not any(doubts(load_vehicle(name), authority(load_vehicle(name))) for name in vehicle_names())
+def test_warnings_are_about_units():
+    assert not any(warnings(load_vehicle(name), authority(load_vehicle(name))) for name in vehicle_names())
     in_grams = ITM.model_copy(update={"inertia": tuple(1000 * each for each in ITM.inertia)})
     weak = ITM.model_copy(update={"thrust_limits": (0.5, 1.1)})
     bulky = ITM.model_copy(update={"collision_radius": 13.5})
     for vehicle, about in ((in_grams, "inertia"), (weak, "thrust"), (bulky, "collision_radius")):
-        assert [doubt.split(":")[0] for doubt in doubts(vehicle, authority(vehicle))] == [about]
+        assert [warning.split(":")[0] for warning in warnings(vehicle, authority(vehicle))] == [about]
     np.testing.assert_allclose(gyration_ratio(in_grams), np.sqrt(1000) * gyration_ratio(ITM))
-
-
-def test_some_starts_are_lost_to_a_weak_vehicle_whatever_flies():
-    weak = ITM.model_copy(update={"thrust_limits": (0.9, 1.05)})
-    lost = lost_whatever_flies(weak, 200, 3)
-    assert lost > lost_whatever_flies(ITM, 200, 3) == 0
-    flown = fly(GeometricExpert(weak), "state_recovery", 200, 3, weak, noise=0.0)
-    assert (~flown.success).sum() >= lost
 
 
 def written(path, **changes):
@@ -107,7 +99,7 @@ def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, cap
     vehicle = load_vehicle(own)
     assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed and "physical" in printed and "tune-expert" in printed
     assert all(f"{each:.1f} rad/s²" in printed for each in authority(vehicle).accelerations)
-    assert re.search(r"success +│ +\S+ % .* 100 %", printed) and "mean time to 0.1 m" in printed and "0 of 24" in printed
+    assert re.search(r"success +│ +\S+ % .* 100 %", printed) and "mean time to 0.1 m" in printed
     assert "thesis" not in printed  # its figures are of another vehicle
 
 

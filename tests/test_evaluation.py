@@ -14,8 +14,8 @@ from rich.console import Console
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
+from sb3_quad.evaluation.metric_tables import comparison
 from sb3_quad.evaluation.summary import summarise
-from sb3_quad.evaluation.tables import comparison
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.vehicles.vehicle import vehicle_names
@@ -155,7 +155,7 @@ def test_tables_say_how_many_arrived():
     assert figures.arrivals[-1].time.value == 5.0 and figures.arrivals[-1].share.value == 0.75
     assert figures.final_error_max == 0.3 and figures.final_offset == pytest.approx((0.2, 0.0, 0.0))
     text = text_of(comparison("title", {"agent": figures}, load_suite("thesis").scenario("tracking"), ["expert"]))
-    for part in ("75 % (", "5.00 ±", "(75 %)", "never", "0.300 m", "thesis: expert", "7.75 s"):
+    for part in ("75 % (", "5.00 ±", "(75 % arrive)", "never", "0.300 m", "thesis: expert", "7.75 s"):
         assert part in text
 
 

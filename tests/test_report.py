@@ -1,10 +1,12 @@
-"""The report: the numbers of the results, every figure as page, PNG and SVG, and a page that a browser shows without help."""
+"""The report: the metrics of the results, every plot as page, PNG and SVG, and a page that a browser shows without help."""
 
 from __future__ import annotations
 
+import io
 import json
 import re
 import shutil
+import sys
 import xml.etree.ElementTree as ElementTree
 from html.parser import HTMLParser
 
@@ -12,17 +14,17 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from rich.console import Console
 
 from sb3_quad.cli import main
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.folder import load_results
+from sb3_quad.evaluation.metric_tables import mark_best
 from sb3_quad.evaluation.records import Failure
-from sb3_quad.report import interactive
-from sb3_quad.report.figures import BarFigure, HeatFigure, Line, LineFigure, PathFigure
+from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render, write_report
 from sb3_quad.report.sections import sections
-from sb3_quad.report.tables import Cell, mark_best
 from sb3_quad.report.tracks import read_tracks
 from sb3_quad.scenarios.load import parse_suite
 
@@ -79,6 +81,18 @@ def page(folder):
     return write_report(folder)
 
 
+@pytest.fixture(scope="module")
+def parts(folder):
+    """The sections of the report by their anchors."""
+    return {section.anchor: section for section in sections(load_results(folder), folder)}
+
+
+def plot_of(parts, anchor, kind):
+    """A plot by its section and the end of its name."""
+    (plot,) = (plot for plot in parts[anchor].plots if plot.name == f"{anchor}_{kind}")
+    return plot
+
+
 class Page(HTMLParser):
     """Tags, attributes that lead somewhere, and text outside of scripts and styles."""
 
@@ -106,10 +120,10 @@ def test_the_page_holds_the_results(folder, page):
     for scenario in results.scenarios:
         assert scenario.heading.split(":")[0].lower() in text.lower()
     assert LABEL in text and results.description in text
-    figures = results.entry("pid", "tracking").metrics
-    assert f"{figures.reward.value:.2f}".replace("-", "−") in text
-    assert f"{figures.arrivals[0].time.value:.2f}" in text and f"{figures.final_error_max:.3f}" in text
-    low, high = figures.success.low, figures.success.high
+    metrics = results.entry("pid", "tracking").metrics
+    assert f"{metrics.reward.value:.2f}".replace("-", "−") in text
+    assert f"{metrics.arrivals[0].time.value:.2f}" in text and f"{metrics.final_error_max:.3f}" in text
+    low, high = metrics.success.low, metrics.success.high
     assert f"{100 * low:.1f} to {100 * high:.1f}" in text
     for figure in ("1.25", "never", "2 to 3", "paper"):  # the reference's
         assert figure in text
@@ -117,78 +131,122 @@ def test_the_page_holds_the_results(folder, page):
 
 def test_nothing_in_the_page_leads_outside(page):
     parsed = Page(page.read_text(encoding="utf-8"))
-    assert {"table", "figure", "script"} <= set(parsed.tags) and not {"b", "small", "iframe", "img"} & set(parsed.tags)
+    assert {"table", "figure", "script", "svg"} <= set(parsed.tags)
+    assert not {"b", "small", "iframe", "img"} & set(parsed.tags)
     assert parsed.tags.count("script") == 3
     for link in parsed.links:
-        assert link.startswith("#") or link == "data:," or (page.parent / link).is_file(), link
+        assert link.startswith(("#", "data:")) or (page.parent / link).is_file(), link
 
 
-def test_every_figure_is_in_the_page_and_beside_it(folder, page):
-    parts = sections(load_results(folder), folder)
-    figures = [figure for section in parts for figure in section.figures]
-    names = [figure.name for figure in figures]
+def test_every_plot_is_in_the_page_and_beside_it(folder, parts, page):
+    plots = [plot for section in parts.values() for plot in section.plots]
+    names = [plot.name for plot in plots]
     assert len(set(names)) == len(names)
-    assert {type(figure) for figure in figures} == {BarFigure, HeatFigure, LineFigure, PathFigure}
+    kinds = {name.rpartition("_")[2] for name in names}
+    assert kinds == {"times", "paths", "error", "limit", "success"}
     text = page.read_text(encoding="utf-8")
-    data = json.loads(re.search(r'<script type="application/json" id="figures">(.*?)</script>', text, re.DOTALL).group(1))
-    assert sorted(data) == sorted(names)
+    data = json.loads(re.search(r'<script type="application/json" id="spaces">(.*?)</script>', text, re.DOTALL).group(1))
+    assert sorted(data) == sorted(name for name in names if name.endswith("_paths"))
+    assert text.split("<script")[0].count("<svg") == len(names) - len(data)
     for name in names:
-        assert f'data-figure="{name}"' in text
+        assert f'data-plot="{name}"' in text
         assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert ElementTree.parse(folder / "figures" / f"{name}.svg").getroot().tag.endswith("svg")
     assert len(list((folder / "figures").iterdir())) == 2 * len(names)
 
 
-def test_axes_say_what_and_in_which_unit(folder):
-    for section in sections(load_results(folder), folder):
-        for figure in section.figures:
-            layout = interactive.draw(figure)["layout"]
-            axes = [*layout.items(), *layout.get("scene", {}).items()]
-            titles = [axis["title"]["text"] for name, axis in axes if "axis" in name and axis["title"]["text"]]
+def test_plots_in_the_page_have_its_colours_and_the_files_their_own(parts):
+    plot = plot_of(parts, "tracking", "times")
+    assert "var(--ink)" in plot.inline and "var(--paper)" in plot.inline and not re.search("#(1c2430|ffffff)", plot.inline)
+    assert b"#1c2430" in plot.svg and b"var(" not in plot.svg
+
+
+def test_plotly_is_only_where_something_can_be_turned(folder, parts):
+    text = render(load_results(folder), [parts["noise"], parts["starts"]], with_pictures=False)
+    assert "<svg" in text and "<script" not in text and len(text) < 1_000_000
+
+
+def test_axes_say_what_and_in_which_unit(parts):
+    for section in parts.values():
+        for plot in section.plots:
+            axes = plot.figure.axes
+            titles = [name for each in axes for name in (each.get_xlabel(), each.get_ylabel()) if name]
             assert len(titles) >= 2
-            if isinstance(figure, PathFigure):
-                assert titles == ["x (m)", "y (m)", "z (m)"]
-            elif isinstance(figure, (LineFigure, BarFigure)):
-                assert all("(" in title or "factor" in title for title in titles), titles
+            assert all("(" in title or "factor" in title for title in titles), titles
+            if plot.space is not None:
+                shown = [plot.space["layout"]["scene"][f"{name}axis"]["title"]["text"] for name in "xyz"]
+                assert shown == ["x (m)", "y (m)", "z (m)"] == [*titles, axes[0].get_zlabel()]
 
 
-def test_paths_are_the_flights(folder):
-    results = load_results(folder)
-    (section,) = (section for section in sections(results, folder) if section.anchor == "hit")
-    (figure,) = (figure for figure in section.figures if isinstance(figure, PathFigure))
-    for path, label in zip(figure.paths, ("pid", LABEL), strict=True):
+def points_of(trace):
+    """The points of a Plotly trace, (n, 3)."""
+    return np.array([trace[name] for name in "xyz"], dtype=float).T
+
+
+def test_paths_are_the_flights(folder, parts):
+    results, plot = load_results(folder), plot_of(parts, "hit", "paths")
+    traces = {}
+    for trace in plot.space["data"]:
+        traces.setdefault(trace["name"], []).append(points_of(trace))
+    lines = {line.get_label(): np.array(line.get_data_3d()).T for line in reversed(plot.figure.axes[0].lines)}
+    for label in ("pid", LABEL):
         track = read_tracks(folder, results.entry(label, "hit"))[0]
-        np.testing.assert_array_equal(path.points[[0, -1]], track.position[[0, -1]])
-        assert path.name == label
-    np.testing.assert_allclose(figure.targets, [[1, 1, 16]])
-    directions = [arrow.vector / np.linalg.norm(arrow.vector) for arrow in figure.arrows]
-    assert len(directions) == 2 and np.allclose(directions, [-(0.5**0.5), -(0.5**0.5), 0.0], atol=1e-6)
+        np.testing.assert_allclose(traces[label][0][[0, -1]], track.position[[0, -1]], rtol=1e-3)
+        np.testing.assert_array_equal(lines[label][[0, -1]], track.position[[0, -1]])
+    np.testing.assert_allclose(traces["target"][0], [[1, 1, 16]])
+    arrows = [points[1] - points[0] for points in traces["force"]]
+    directions = [arrow / np.linalg.norm(arrow) for arrow in arrows]
+    assert len(directions) == 2 and np.allclose(directions, [-(0.5**0.5), -(0.5**0.5), 0.0], atol=0.01)
+    assert all("28.3 N at" in trace["hovertext"] for trace in plot.space["data"] if trace["name"] == "force")
 
 
-def test_a_lost_flight_counts_as_far_away(folder):
-    results = load_results(folder)
-    (section,) = (section for section in sections(results, folder) if section.anchor == "upside_down")
-    (figure,) = (figure for figure in section.figures if isinstance(figure, LineFigure))
-    lost = results.entry("pid", "upside_down").metrics.collisions == 2
-    (line,) = (line for line in figure.lines if line.name == "pid" and not line.faint)
-    assert lost and line.x[-1] < 2.0
-    paths = next(figure for figure in section.figures if isinstance(figure, PathFigure))
-    assert paths.paths[0].lost
+def test_a_lost_flight_counts_as_far_away(folder, parts):
+    metrics = load_results(folder).entry("pid", "upside_down").metrics
+    assert metrics.collisions == 2
+    (line,) = (line for line in plot_of(parts, "upside_down", "error").figure.axes[0].lines if line.get_label() == "pid")
+    assert line.get_xdata()[-1] < 2.0
+    traces = plot_of(parts, "upside_down", "paths").space["data"]
+    assert {trace.get("hovertext") for trace in traces if trace["name"] == "pid"} == {None, "touches the ground"}
 
 
-def test_numbers_that_are_none_leave_gaps():
-    line = Line("a", "#123456", np.array([0.0, 1.0]), np.array([np.nan, 2.0]))
-    trace = interactive.draw(LineFigure("f", "", "x (s)", "y (m)", [line]))["data"][0]
-    assert trace["y"] == [None, 2.0]
-    json.dumps(trace, allow_nan=False)
+def test_numbers_that_are_none_leave_gaps(parts):
+    cross = next(trace for trace in plot_of(parts, "upside_down", "paths").space["data"] if trace.get("hovertext"))
+    assert cross["x"][2] is None and cross["x"][1] is not None
+    json.dumps(cross, allow_nan=False)
+
+
+def test_a_table_reads_the_same_everywhere():
+    cells = [Cell(-1.234, (-1.5, -1.0), best=True), Cell(2.0, (2.0, 2.0)), Cell(words="never"), Cell(3.0, note="a | b")]
+    columns = [Column("a"), Column("b"), Column("c", source="paper"), Column("d", source="paper")]
+    rows = [Row("time", "s", cells), Row("share", "%", [Cell(99.96875, (99.8, 100.0), decimals=1), *[Cell()] * 3])]
+    table = Table(columns, rows, corner="what", title="[title]", caption="caption")
+    assert table.markdown().splitlines() == [
+        "| what | a | b | paper: c | paper: d |",
+        "| --- | --- | --- | --- | --- |",
+        "| time, s | **−1.23** (−1.50 to −1.00) | 2.00 | never | 3.00, a / b |",
+        "| share, % | 100.0 (99.8 to 100.0) |  |  |  |",
+    ]
+    console = Console(file=io.StringIO(), width=200)
+    console.print(table)
+    text = console.file.getvalue()
+    for part in (
+        "[title]",
+        "caption",
+        "-1.23 ± 0.25 s",
+        "2.00 s",
+        "never",
+        "3.00 s (a | b)",
+        "99.97 % (99.8-100)",
+        "paper: c",
+    ):
+        assert part in text
 
 
 @given(value=st.floats(-1e4, 1e4), decimals=st.integers(0, 4))
-def test_cells_split_at_the_decimal_point(value, decimals):
-    cell = Cell(value, decimals=decimals)
-    text = (cell.whole + cell.fraction).replace("−", "-")
+def test_numbers_are_rounded_and_zero_has_no_sign(value, decimals):
+    text = Cell(value, decimals=decimals).number.replace("−", "-")
     assert (float(text) == float(f"{value:.{decimals}f}") and not text.startswith("-0")) or float(text) != 0
-    assert cell.fraction == "" if decimals == 0 else cell.fraction[0] == "." and len(cell.fraction) == decimals + 1
+    assert len(text.partition(".")[2]) == decimals
 
 
 values = st.floats(-10, 10, allow_nan=False)
@@ -199,19 +257,38 @@ values = st.floats(-10, 10, allow_nan=False)
     row=st.sampled_from(["success", "mean time to 1 m"]),
 )
 def test_the_best_is_better_than_all_others_for_certain(cells, row):
-    made = [Cell(sorted(each)[1], sorted(each)[0], sorted(each)[2]) for each in cells]
+    made = [Cell(middle, (low, high)) for low, middle, high in map(sorted, cells)]
     marked = mark_best(row, made)
     for cell in marked:
         others = [other for other in marked if other is not cell]
-        apart = all(cell.low > other.high if row == "success" else cell.high < other.low for other in others)
+        (low, high), ends = cell.ends, [other.ends for other in others]
+        apart = all(low > other[1] if row == "success" else high < other[0] for other in ends)
         assert cell.best == apart
 
 
-def test_failures_are_listed(folder):
-    results = load_results(folder)
-    failed = results.model_copy(update={"failures": [Failure(controller="x<y", scenario="hit", message="no & no")]})
-    text = render(failed, sections(results, folder), with_pictures=False)
+def test_failures_are_listed(folder, parts):
+    failure = Failure(controller="x<y", scenario="hit", message="no & no")
+    failed = load_results(folder).model_copy(update={"failures": [failure]})
+    text = render(failed, list(parts.values()), with_pictures=False)
     assert "x&lt;y" in text and "no &amp; no" in text and "figures/" not in text.split("<script")[0]
+
+
+@pytest.mark.parametrize("module", ["jinja2", "plotly.offline"])
+def test_without_the_extra_there_is_all_but_the_page(module, folder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, module, None)
+    suite = tmp_path / "small.yaml"
+    suite.write_text(
+        "name: small\nscenarios: [{name: hover, target: [0, 0, 15], duration: 0.1, episodes: 1, tolerances: [1]}]"
+    )
+    output = tmp_path / "out"
+    assert main(["evaluate", "pid", "--suite", str(suite), "-o", str(output)]) == 0
+    printed = capsys.readouterr()
+    assert "100 % (" in printed.out and "results in" in printed.out
+    assert printed.err.count("pip install 'sb3_quad[report]'") == 1 and printed.err.count("\n") == 1
+    assert (output / "results.json").is_file() and (output / "report.md").is_file()
+    assert list((output / "figures").glob("*.png")) and not (output / "report.html").exists()
+    assert main(["report", str(output)]) == 2
+    assert "error: report.html needs" in capsys.readouterr().err
 
 
 def test_a_report_is_not_replaced_silently(folder, page, capsys):
@@ -249,19 +326,19 @@ def test_a_browser_shows_it_without_errors_or_requests(page):
         tab.on("pageerror", lambda error: errors.append(str(error)))
         tab.on("request", lambda request: requests.append(request.url))
         tab.goto(page.as_uri())
-        tab.wait_for_selector("html[data-ready=yes]")
-        plots = tab.locator(".plot")
-        names = [plots.nth(number).get_attribute("data-figure") for number in range(plots.count())]
+        plots = tab.locator(".plot, .space")
+        names = [plots.nth(number).get_attribute("data-plot") for number in range(plots.count())]
         assert len(names) == len(list((page.parent / "figures").glob("*.svg")))
         for number, name in enumerate(names):
             plot = plots.nth(number)
             plot.scroll_into_view_if_needed()
-            drawn = "canvas" if plot.get_attribute("data-kind") == "space" else "svg.main-svg"
-            plot.locator(drawn).first.wait_for(state="attached", timeout=60_000)
-            box = plot.locator(drawn).first.bounding_box()
+            drawn = plot.locator("canvas, svg").first
+            drawn.wait_for(state="attached", timeout=60_000)
+            box = drawn.bounding_box()
             assert box is not None and box["width"] > 200 and box["height"] > 100, name
         width = tab.evaluate("document.documentElement.scrollWidth - window.innerWidth")
-        colours = "[getComputedStyle(document.body).backgroundColor, document.querySelector('.plot text').style.fill]"
+        colours = "[document.body, ...document.querySelectorAll('.plot text')].map((each) => getComputedStyle(each)).map("
+        colours += "(style, number) => number ? style.fill : style.backgroundColor).slice(0, 2)"
         light = tab.evaluate(colours)
         tab.emulate_media(color_scheme="dark")
         tab.wait_for_timeout(300)

@@ -17,6 +17,10 @@ class ConfigError(SB3QuadError, ValueError):
     """A file, key or value that does not fit: says which one, what is wrong and what is allowed."""
 
 
+class MissingExtra(ConfigError):
+    """A package that is not installed: says what needs it, and which extra brings it."""
+
+
 class CannotHover(ConfigError):
     """A vehicle whose rotors cannot give hover thrust: too weak, or unable to give as little."""
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import MissingExtra
 
 
 def require(module: str, extra: str, what: str) -> Any:
@@ -13,9 +13,9 @@ def require(module: str, extra: str, what: str) -> Any:
 
     :param extra: of this package, which brings it.
     :param what: needs it, for the message.
-    :raises ConfigError: it cannot be imported; the message says what to install.
+    :raises MissingExtra: it cannot be imported; the message says what to install.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise ConfigError(f"{what} needs {module} ({error}): pip install 'sb3_quad[{extra}]'") from None
+        raise MissingExtra(f"{what} needs {module} ({error}): pip install 'sb3_quad[{extra}]'") from None

@@ -11,8 +11,7 @@ from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.output import console
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
+    from sb3_quad.evaluation.tables import Table
     from sb3_quad.training.benchmark import Measurement
 
 HELP = "Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop."
@@ -66,13 +65,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _table(measurements: list[Measurement]) -> Table:
-    from rich.table import Table
+    from sb3_quad.evaluation.tables import text_table
 
-    table = Table(title="control steps per second (median of 5)", title_justify="left")
-    table.add_column("", no_wrap=True)
-    for name in ("rows", "steps/s", "to the first line"):
-        table.add_column(name, justify="right")
-    reference = measurements[0].rate
-    for each in measurements:
-        table.add_row(each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / reference:,.1f} x")
-    return table
+    first = measurements[0].rate
+    rows = ((each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements)
+    return text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows)

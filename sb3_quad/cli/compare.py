@@ -3,34 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from sb3_quad.training.job import TrainingJob
+from sb3_quad.base.seeds import seed_for
+from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.metric_tables import TASK_SCENARIOS, comparison
+from sb3_quad.evaluation.summary import summarise
+from sb3_quad.evaluation.tables import Table
+from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.scenarios.load import load_suite
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.training.job import TrainingJob
 
 FRESH_EPISODES = 240
-THESIS_VEHICLE = "itm"  # beside another one the thesis has no figures
+THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
 
 
 def task_table(
-    pilots: Mapping[str, Any], task: str, n_episodes: int, seed: int, title: str, beside: Iterable[str] = (), **keywords: Any
+    controllers: Mapping[str, Any], settings: FlightSettings, n: int, seed: int, title: str, beside: Iterable[str] = ()
 ) -> Table:
     """The table of some controllers over the same episodes of a task.
 
+    :param settings: how all of them fly.
+    :param n: how many episodes.
     :param title: what follows the task's name and the number of fresh episodes.
-    :param beside: the columns of the thesis that stand beside them.
-    :param keywords: further arguments of :func:`~sb3_quad.evaluation.flights.fly`, such as ``vehicle``.
+    :param beside: the columns of the thesis that stand beside them; none but of the vehicle that it flew.
     """
-    from sb3_quad.evaluation.flights import fly
-    from sb3_quad.evaluation.summary import summarise
-    from sb3_quad.evaluation.tables import TASK_SCENARIOS, comparison
-    from sb3_quad.scenarios.load import load_suite
-
-    columns = {name: summarise(fly(pilot, task, n_episodes, seed, **keywords)) for name, pilot in pilots.items()}
-    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[task])
-    return comparison(f"{task}: {n_episodes} fresh episodes, {title}", columns, scenario, beside)
+    seeds = range(seed, seed + n)
+    columns = {name: summarise(fly_settings(each, settings, seeds)) for name, each in controllers.items()}
+    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[settings.task])
+    shown = beside if settings.vehicle == THESIS_VEHICLE else ()
+    return comparison(f"{settings.task}: {n} fresh episodes, {title}", columns, scenario, shown)
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
@@ -38,19 +41,8 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
 
     :param job: of an environment of this package.
     """
-    from sb3_quad.experts.resolve import resolve_expert
-    from sb3_quad.training.trainer import FRESH_SEED, for_evaluation
-
-    config = for_evaluation(job)
-    given = config.env_kwargs
-    keywords: dict[str, Any] = dict(config.flight_kwargs)
-    if "task_kwargs" in given:
-        keywords["task_kwargs"] = given["task_kwargs"]
-    if "max_episode_steps" in given:
-        keywords["max_steps"] = given["max_episode_steps"]
-    expert = resolve_expert(config.expert or "pid", keywords.get("vehicle", "itm"))
-    pilots = {"agent": model, "expert": expert}
-    agent = "IL-agent" if config.algo == "dagger" else "RL-agent"
-    beside = (agent, "expert") if keywords.get("vehicle", THESIS_VEHICLE) == THESIS_VEHICLE else ()
-    seed = job.seed + FRESH_SEED
-    return task_table(pilots, str(config.task), FRESH_EPISODES, seed, "the same for both", beside, **keywords)
+    settings = job.flight_settings
+    controllers = {"agent": model, "expert": resolve_expert(job.config.expert or "pid", settings.vehicle)}
+    agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
+    seed = seed_for("table", job.seed)
+    return task_table(controllers, settings, FRESH_EPISODES, seed, "the same for both", (agent, "expert"))

@@ -6,9 +6,9 @@ import argparse
 import sys
 import time
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, MissingExtra, unknown
 from sb3_quad.cli.arguments import whole
-from sb3_quad.cli.output import console
+from sb3_quad.cli.output import console, progress_bar
 from sb3_quad.cli.report import report
 
 HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
@@ -53,12 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Fly, print the table, tell where everything is. Returns the exit code."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
     from sb3_quad.evaluation.controllers import SCALINGS, parse_controllers
     from sb3_quad.evaluation.evaluate import evaluate
-    from sb3_quad.evaluation.tables import overview
+    from sb3_quad.evaluation.metric_tables import overview
     from sb3_quad.scenarios.load import load_suite
 
     if options.scaling not in SCALINGS:
@@ -67,22 +64,19 @@ def run(options: argparse.Namespace) -> int:
     controllers = parse_controllers(options.controllers, options.scaling)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
     start = time.perf_counter()
-    shown = sys.stderr.isatty() if options.progress is None else options.progress
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}", markup=False))
-    with Progress(*columns, console=Console(file=sys.stderr), transient=True, disable=not shown) as bar:
-        task = bar.add_task("loading", total=None)
-
-        def progress(done: int, total: int, name: str) -> None:
-            bar.update(task, completed=done, total=total, description=name)
-
-        results = evaluate(suite, controllers, folder, options.backend, options.workers, options.overwrite, progress)
+    with progress_bar(options.progress) as show:
+        show(0, None, "loading")
+        results = evaluate(suite, controllers, folder, options.backend, options.workers, options.overwrite, show)
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
     if labels:
         console().print(overview(flown, labels, suite.source))
     print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and results.entries:
-        report(folder, overwrite=True, pictures=True)
+        try:
+            report(folder, overwrite=True, pictures=True)
+        except MissingExtra as error:
+            print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
     asked = {spec.label for spec in controllers}
     failures = [failure for failure in results.failures if failure.controller in asked]
     for failure in failures:

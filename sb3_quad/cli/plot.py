@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import glob
-import io
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 
-HELP = "Draw learning curves: success and reward over transitions and wall-clock time, seeds as mean and range."
+HELP = "Draw learning curves: success and reward over timesteps and wall-clock time, seeds as mean and range."
 EXAMPLES = """examples:
   sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
   sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
@@ -30,6 +29,7 @@ def run(options: argparse.Namespace) -> int:
     """Read the runs, draw, write. Returns the exit code."""
     from sb3_quad.base.files import write_bytes
     from sb3_quad.report.curves import plot_curves, read_curve
+    from sb3_quad.report.plots import picture
 
     groups = {}
     for text in options.groups:
@@ -40,15 +40,12 @@ def run(options: argparse.Namespace) -> int:
         if not folders:
             raise ConfigError(f"{name}: no folder fits {pattern}")
         groups[name] = [read_curve(folder, options.task) for folder in folders]
-    output = Path(options.output)
-    kind = output.suffix.removeprefix(".")
+    kind = Path(options.output).suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
-        raise ConfigError(f"--output {output}: must end in .png, .svg or .pdf")
-    figure = plot_curves(groups, dict(_line(text) for text in options.line), options.title)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=130)
-    write_bytes(output, buffer.getvalue())
-    print(f"saved {output}")
+        raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
+    figure = plot_curves(groups, dict(map(_line, options.line)), options.title)
+    write_bytes(options.output, picture(figure, kind, dpi=130))
+    print(f"saved {options.output}")
     return 0
 
 

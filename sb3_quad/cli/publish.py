@@ -5,14 +5,11 @@ from __future__ import annotations
 import argparse
 import subprocess
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 
-if TYPE_CHECKING:
-    from sb3_quad.report.card import Origin
-
-HELP = "Write a trained policy as a small zip for stock PPO, with a card: measured figures, command, seed, versions."
+HELP = "Write a trained policy as a small zip for stock PPO, with a card: measured metrics, command, seed, versions."
 EXAMPLES = """The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 read it too. For
 the card it is flown over fresh episodes: 3,840 recoveries, 960 targets at each of 10, 15 and 20 m.
 
@@ -31,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--name", required=True, metavar="NAME", help="the files are called NAME.zip and NAME.md")
     add("-o", metavar="FOLDER", dest="folder", default=".", help="where they go (here)")
     add("--command", metavar="TEXT", dest="made_by", required=True, help="what trained it, as typed; the card repeats it")
-    add("--episodes", type=int, default=960, metavar="N", help="per figure (960; of recoveries four times as many)")
+    add("--episodes", type=int, default=960, metavar="N", help="flown of each task (960; of recoveries four times as many)")
     add("--overwrite", action="store_true", help="replace the files if they are there")
 
 
@@ -46,16 +43,15 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError(f"--episodes {options.episodes}: must be at least 1")
     if Path(options.name).name != options.name:
         raise ConfigError(f"--name {options.name}: a name without folders; they are for -o")
-    folder = Path(options.folder)
-    zip_file, card_file = folder / f"{options.name}.zip", folder / f"{options.name}.md"
+    zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
-    content, origin, settings = slim_bytes(options.model), _origin(options), _settings(options.model)
-    folder.mkdir(parents=True, exist_ok=True)
+    content, facts, settings = slim_bytes(options.model), _facts(options.model), _settings(options.model)
     write_bytes(zip_file, content)
     rows = measure(load_model(zip_file), options.episodes, **settings)
-    write_text(card_file, write_card(options.name, rows, origin, settings))
-    print(card_file.read_text(encoding="utf-8"))
+    card = write_card(options.name, rows, options.made_by, facts, settings)
+    write_text(card_file, card)
+    print(card)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
     return 0
 
@@ -70,19 +66,17 @@ def _settings(model: str) -> dict[str, Any]:
     return {"vehicle": found.vehicle or "itm", "noise": 0.05}
 
 
-def _origin(options: argparse.Namespace) -> Origin:
+def _facts(model: str) -> dict[str, str]:
     """What the run folder and the checkout know."""
     import stable_baselines3
     import torch
 
     import sb3_quad
-    from sb3_quad.report.card import Origin
     from sb3_quad.training.runs import open_run
 
-    run = open_run(Path(options.model).parent)
-    settings, arguments = run.read_yaml()
-    facts = {
-        "algorithm": f"`{arguments.get('algo')}`, {int(settings['n_timesteps']):,} transitions"
+    settings, arguments = open_run(Path(model).parent).read_yaml()
+    return {
+        "algorithm": f"`{arguments.get('algo')}`, {int(settings['n_timesteps']):,} timesteps"
         + (" after the agent of the stage before" if arguments.get("trained_agent") else ""),
         "environment": f"`{arguments.get('env')}`",
         "expert": f"`{settings.get('expert')}`",
@@ -91,16 +85,12 @@ def _origin(options: argparse.Namespace) -> Origin:
         "versions": f"sb3_quad {sb3_quad.__version__}, stable-baselines3 {stable_baselines3.__version__}, "
         f"torch {torch.__version__}",
     }
-    return Origin(options.made_by, facts)
 
 
 def _commit(checkout: Path) -> str:
     """The commit of a checkout; a mark where files differ from it."""
+    command = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty= and changes"]
     try:
-        head, changes = (
-            subprocess.run(["git", "-C", str(checkout), *arguments], capture_output=True, text=True, check=True).stdout.strip()
-            for arguments in (("rev-parse", "HEAD"), ("status", "--porcelain", "--untracked-files=no"))
-        )
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "not a checkout"
-    return head + (" and changes" if changes else "")

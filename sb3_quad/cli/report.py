@@ -1,20 +1,19 @@
-"""``report``: a folder of results as one page, and its figures as pictures."""
+"""``report``: a folder of results as one page, and its plots as pictures."""
 
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from sb3_quad.cli.output import console
 
-HELP = (
-    "Make report.html from a folder that evaluate has filled: tables, figures that turn and zoom; one file, needs no network."
-)
+HELP = "Make report.html from a folder that evaluate has filled: tables, plots, flights to turn; one file, needs no network."
 EXAMPLES = """examples:
   sb3-quad report evaluations/thesis
   sb3-quad report evaluations/thesis --overwrite      again, after more controllers have joined
-  sb3-quad report evaluations/thesis --no-pictures    the page alone
+  sb3-quad report evaluations/thesis --no-pictures    the page and its tables as report.md alone
+
+Needs pip install 'sb3_quad[report]'.
 """
 
 
@@ -22,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags of ``report``."""
     add = parser.add_argument
     add("folder", metavar="FOLDER", help="what evaluate wrote")
-    add("--pictures", action=argparse.BooleanOptionalAction, default=True, help="also write each figure as PNG and SVG (yes)")
+    add("--pictures", action=argparse.BooleanOptionalAction, default=True, help="also write each plot as PNG and SVG (yes)")
     add("--overwrite", action="store_true", help="replace the report that is there")
 
 
@@ -33,15 +32,12 @@ def run(options: argparse.Namespace) -> int:
 
 
 def report(folder: str | Path, overwrite: bool, pictures: bool) -> None:
-    """Write the page of a folder of results, saying on stderr what is being done.
+    """Write the page of a folder of results, with a spinner in a terminal; tell where it is.
 
     :raises ConfigError: see :func:`sb3_quad.report.page.write_report`.
     """
     from sb3_quad.report.page import PICTURES, write_report
 
-    if sys.stderr.isatty():
-        with console().status("report") as status:
-            page = write_report(folder, overwrite, pictures, lambda heading: status.update(f"report: {heading}"))
-    else:
+    with console().status("report"):
         page = write_report(folder, overwrite, pictures)
-    print(f"saved {page}" + (f", its figures as PNG and SVG in {page.parent / PICTURES}" if pictures else ""))
+    print(f"saved {page}" + (f", its plots as PNG and SVG in {page.parent / PICTURES}" if pictures else ""))

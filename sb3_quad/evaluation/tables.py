@@ -1,160 +1,149 @@
-"""Tables of flights: one column per controller, and others' figures beside them."""
+"""One table for terminals (``rich``), Markdown and the page of a report: metrics with their intervals, or words."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from itertools import groupby
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Literal
 
+import rich.table
 from rich.markup import escape
-from rich.table import Table
-
-from sb3_quad.evaluation.records import Arrival, Estimate, HitLimit, Metrics, Results
-from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
-from sb3_quad.scenarios.vary import axis_name
-
-SUCCESS, REWARD, PATH, MEDIAN, LARGEST = "success", "mean reward", "mean path", "final error, median", "final error, largest"
-FLOWN, REACHED, COMPLETED, COURSE_TIME = "time flown", "waypoints reached", "courses completed", "time of the course"
-HIT, HIT_SIZE = "half survive up to", "which is"
-CAPTION = "(…): 95 % interval; ±: half of it; (… %) after a time: the flights that came so close, if not all"
+from rich.text import Text
 
 
-TASK_SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of the thesis suite
+@dataclass(frozen=True)
+class Cell:
+    """A metric with the ends of its 95 % interval, or words in its place.
 
-
-def time_row(tolerance: float | str) -> str:
-    """The name of the row with the time to a tolerance."""
-    return f"mean time to {float(tolerance):g} m"
-
-
-def rows(figures: Metrics, limit: HitLimit | None = None) -> dict[str, str]:
-    """Figures as text, by the names of the rows; each with its 95 % interval, where that is wider than the last digit."""
-    cells = {SUCCESS: _share(figures.success), REWARD: _mean(figures.reward), FLOWN: _mean(figures.flown, " s")}
-    cells |= {time_row(arrival.tolerance): _arrival(arrival) for arrival in figures.arrivals}
-    cells[PATH] = _mean(figures.path, " m")
-    cells[MEDIAN] = "" if figures.final_error_median is None else f"{figures.final_error_median:.3f} m"
-    cells[LARGEST] = "" if figures.final_error_max is None else f"{figures.final_error_max:.3f} m"
-    if figures.course is not None:
-        cells[REACHED] = _mean(figures.course.reached)
-        cells[COMPLETED] = _share(figures.course.completed)
-        cells[COURSE_TIME] = _mean(figures.course.time, " s") or "never"
-    if limit is not None:
-        cells[HIT], cells[HIT_SIZE] = _limit(limit)
-    return cells
-
-
-def reference_rows(reference: Reference) -> dict[str, str]:
-    """Others' figures as text, by the names of the rows."""
-    given = {SUCCESS: (reference.success, " %"), REWARD: (reference.reward, ""), PATH: (reference.path, " m")}
-    given |= {MEDIAN: (reference.final_error, " m"), FLOWN: (reference.flown, " s")}
-    cells = {name: _figure(figure, unit) for name, (figure, unit) in given.items() if figure is not None}
-    for tolerance, time in reference.time_to.items():
-        cells[time_row(tolerance)] = "never" if time is None else _figure(time, " s")
-    return cells
-
-
-def shown_rows(scenario: Scenario) -> list[str]:
-    """The rows that mean something in a scenario."""
-    if scenario.target.waypoints is not None:
-        return [SUCCESS, REACHED, COMPLETED, COURSE_TIME]
-    if scenario.group is not None:
-        return [SUCCESS, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
-    times = [time_row(tolerance) for tolerance in scenario.tolerances]
-    if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        names = [SUCCESS, REWARD, MEDIAN, LARGEST]
-        if scenario.is_fixed:
-            names.insert(1, FLOWN)
-    else:
-        names = [SUCCESS, REWARD, *times, PATH, MEDIAN, LARGEST]
-    return names + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
-
-
-def comparison(title: str, columns: Mapping[str, Metrics], scenario: Scenario, only: Iterable[str] | None = None) -> Table:
-    """A table of controllers side by side in one scenario, and the columns of its reference figures.
-
-    :param columns: from the name of each controller to its figures.
-    :param only: the reference columns to show; None: all.
+    :param ends: of the interval; an infinite upper end is an unknown one.
+    :param note: small print beside it.
+    :param best: better than all others of its row, and the intervals are apart.
     """
-    table = Table(title=title, title_justify="left", caption=CAPTION, caption_justify="left")
-    table.add_column("", no_wrap=True)
-    kept = [name for name in (scenario.reference if only is None else only) if name in scenario.reference]
-    cells = {name: rows(figures) for name, figures in columns.items()}
-    cells |= {f"thesis: {name}": reference_rows(scenario.reference[name]) for name in kept}
-    for name in cells:
-        table.add_column(escape(name), justify="right")
-    for row in shown_rows(scenario):
-        if any(row in cells[name] for name in columns):
-            table.add_row(row, *(column.get(row, "") for column in cells.values()))
-    return table
+
+    value: float | None = None
+    ends: tuple[float, float] | None = None
+    decimals: int = 2
+    words: str = ""
+    note: str = ""
+    best: bool = False
+
+    @property
+    def number(self) -> str:
+        """The value, with a proper minus sign; empty if there is none."""
+        return "" if self.value is None else self._text(self.value).replace("-", "−")
+
+    @property
+    def interval(self) -> str:
+        """The interval in words; empty where it is narrower than the last digit."""
+        low, high = ("", "") if self.ends is None else map(self._text, self.ends)
+        if low == high:
+            return ""
+        return (f"above {low}" if high == "inf" else f"{low} to {high}").replace("-", "−")
+
+    def in_markdown(self) -> str:
+        """The number, the interval in brackets, the note; the number is bold if it is the best."""
+        number = self.words if self.value is None else self.number
+        number = f"**{number}**" if self.best and number else number
+        return number + (f" ({self.interval})" if self.interval else "") + (f", {self.note}" if self.note else "")
+
+    def in_terminal(self, unit: str) -> str:
+        """The number with its unit; means with ± half of their interval, shares and factors with its ends; the note."""
+        note = f" ({self.note})" if self.note else ""
+        if self.value is None:
+            return self.words + note
+        if unit == "%":
+            ends = "" if self.ends is None else f" ({self.ends[0]:.3g}-{self.ends[1]:.3g})"
+            return f"{self.value:.4g} %{ends}{note}"
+        if unit == "×":
+            return f"{self.number} x" + (f" ({self.interval.replace(' to ', '-')})" if self.interval else "") + note
+        half = self._text(0.0 if self.ends is None else 0.5 * (self.ends[1] - self.ends[0]))
+        spread = f" ± {half}" if float(half) > 0.0 else ""
+        return f"{self._text(self.value)}{spread} {unit}".rstrip() + note
+
+    def _text(self, value: float) -> str:
+        text = f"{value:.{self.decimals}f}"
+        return text.removeprefix("-") if math.isclose(float(text), 0.0) else text
 
 
-def overview(results: Results, controllers: Sequence[str], source: str = "reference") -> Table:
-    """All scenarios in one table: a section each, a column per controller, reference figures in the last column.
+@dataclass(frozen=True)
+class Column:
+    """What heads a column of cells.
 
-    :param controllers: labels, in the order of their columns.
-    :param source: heads the column of the reference figures.
+    :param colour: of the controller it stands for, ``#rrggbb``.
+    :param source: where the metrics come from, if they were not measured here.
     """
-    table = Table(title=results.suite, title_justify="left", caption=CAPTION, caption_justify="left")
-    table.add_column("", no_wrap=True)
-    for label in controllers:
-        table.add_column(escape(label), justify="right")
-    referenced = any(scenario.reference for scenario in results.scenarios)
-    if referenced:
-        table.add_column(escape(source))
-    for group, members in groupby(results.scenarios, lambda scenario: scenario.group or scenario.name):
-        scenarios = list(members)
-        heading = scenarios[0].heading.rsplit(":", 1)[0] if scenarios[0].group else scenarios[0].heading
-        table.add_row(f"[bold]{escape(heading or group)}[/]", end_section=False)
-        for scenario in scenarios:
-            _add_scenario(table, results, scenario, controllers, referenced)
-        table.add_section()
-    return table
+
+    name: str
+    colour: str = ""
+    source: str = ""
+    align: Literal["left", "right"] = "right"
+
+    @property
+    def heading(self) -> str:
+        """The name, the source before it."""
+        return f"{self.source}: {self.name}" if self.source else self.name
 
 
-def _add_scenario(table: Table, results: Results, scenario: Scenario, controllers: Sequence[str], referenced: bool) -> None:
-    entries = [results.entry(label, scenario.name) for label in controllers]
-    cells = [rows(entry.metrics, entry.hit_limit) if entry is not None else None for entry in entries]
-    others = {name: reference_rows(reference) for name, reference in scenario.reference.items()}
-    cell = ", ".join(f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items())
-    names = shown_rows(scenario)
-    for row in names:
-        name = row if not cell else cell if row == SUCCESS else ""
-        name = f"{cell}, {row}" if cell and len(names) > 1 else name
-        values = ["failed" if column is None and row == names[0] else (column or {}).get(row, "") for column in cells]
-        beside = "; ".join(f"{who} {column[row]}" for who, column in others.items() if row in column)
-        table.add_row(f"  {escape(name)}", *values, *([escape(beside)] if referenced else []))
+@dataclass(frozen=True)
+class Row:
+    """A metric with its unit, and a cell for each column. Without cells it heads the rows below it."""
+
+    name: str
+    unit: str = ""
+    cells: Sequence[Cell] = ()
 
 
-def _arrival(arrival: Arrival) -> str:
-    if arrival.time is None:
-        return "never"
-    text = _mean(arrival.time, " s")
-    return text if arrival.share.value == 1.0 else f"{text} ({100 * arrival.share.value:.3g} %)"
+@dataclass(frozen=True)
+class Table:
+    """Rows of cells. ``rich`` prints it as it is; ``page.html.j2`` makes HTML of it.
+
+    :param corner: heads the rows' names.
+    :param title: above the table and ``caption`` below it, in terminals.
+    """
+
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+    corner: str = ""
+    title: str = ""
+    caption: str = ""
+
+    def markdown(self) -> str:
+        """The lines of the table; the units stand with the names of the rows."""
+        lines = [[self.corner, *(column.heading for column in self.columns)], ["---"] * (1 + len(self.columns))]
+        for row in self.rows:
+            name = f"{row.name}, {row.unit}" if row.unit else row.name
+            lines.append([name, *(cell.in_markdown() for cell in row.cells)])
+        return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
+
+    def __rich__(self) -> rich.table.Table:
+        """The table as ``rich`` prints it; the units stand with the numbers."""
+        table = rich.table.Table(title=escape(self.title) or None, caption=escape(self.caption) or None)
+        table.title_justify = table.caption_justify = "left"
+        table.show_header = any([self.corner, *(column.heading for column in self.columns)])
+        table.add_column(Text(self.corner), no_wrap=True)
+        for column in self.columns:
+            table.add_column(Text(column.heading), justify=column.align)
+        for row in self.rows:
+            if not row.cells:
+                table.add_section()
+            texts = (Text(cell.in_terminal(row.unit), "bold" if cell.best else "") for cell in row.cells)
+            table.add_row(Text(row.name, "" if row.cells else "bold"), *texts)
+        return table
 
 
-def _share(estimate: Estimate) -> str:
-    return f"{_percent(estimate.value)} % ({100 * estimate.low:.3g}-{100 * estimate.high:.3g})"
+def text_table(
+    title: str,
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    align: Literal["left", "right"] = "right",
+    caption: str = "",
+) -> Table:
+    """A table of words.
 
-
-def _mean(estimate: Estimate | None, unit: str = "") -> str:
-    if estimate is None:
-        return ""
-    half = (estimate.high - estimate.low) / 2
-    return f"{estimate.value:.2f}" + (f" ± {half:.2f}" if half >= 0.005 else "") + unit
-
-
-def _limit(limit: HitLimit) -> tuple[str, str]:
-    factor = limit.trials[-1].factor if limit.factor is None else limit.factor
-    size = " and ".join(f"{factor * part:.1f} {unit}" for part, unit in ((limit.force, "N"), (limit.torque, "N m")) if part)
-    if limit.factor is None:
-        return f"more than {factor:g} x", f"more than {size}"
-    high = "" if limit.high is None else f"{limit.high:.2f}"
-    return f"{factor:.2f} x ({limit.low:.2f}-{high})", size
-
-
-def _figure(figure: NumberOrRange, unit: str) -> str:
-    values = figure if isinstance(figure, tuple) else (figure,)
-    return "-".join(_percent(value) if unit == " %" else f"{value:g}" for value in values) + unit
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2f}".rstrip("0").rstrip(".")
+    :param heads: of all columns, that of the rows' names first.
+    :param rows: each begins with its name.
+    """
+    columns = [Column(head, align=align) for head in heads[1:]]
+    filled = [Row(name, "", [Cell(words=text) for text in texts]) for name, *texts in rows]
+    return Table(columns, filled, heads[0], title, caption)

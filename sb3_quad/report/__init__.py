@@ -1,1 +1,1 @@
-"""A folder of results as one page to read, and each of its figures as a picture."""
+"""A folder of results as one page to read, and each of its plots as a picture."""

@@ -1,30 +1,28 @@
-"""Learning curves from run folders: success and reward over transitions and over wall-clock time (Figs. 4.3 and 4.4)."""
+"""Learning curves from run folders: success and reward over timesteps and over wall-clock time (Figs. 4.3 and 4.4)."""
 
 from __future__ import annotations
 
-import zipfile
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
+from matplotlib.figure import Figure
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import read_arrays
+from sb3_quad.report.plots import band, styled
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-FloatArray = npt.NDArray[np.float64]
+NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file
 
 
 @dataclass(frozen=True, eq=False)
 class Curve:
     """The evaluations of one run, k of them.
 
-    :param timesteps: transitions, (k,).
+    :param timesteps: (k,).
     :param seconds: of training, evaluations along the way included, (k,).
     :param success: share of successful episodes, (k,).
     :param reward: mean per episode, (k,).
@@ -44,59 +42,40 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
     """
     path = Path(run) / ("evaluations.npz" if task is None else f"evaluations_{task}.npz")
     if not path.is_file():
-        if task is not None:
-            raise ConfigError(f"{path}: no such file; {task} is none of this run's eval_tasks")
-        raise ConfigError(f"{path}: no such file; a run that was trained with --eval-episodes 0 has no curve")
-    try:
-        with np.load(path) as file:
-            return Curve(
-                np.asarray(file["timesteps"], dtype=np.float64),
-                np.asarray(file["seconds"], dtype=np.float64),
-                file["successes"].mean(axis=1),
-                file["results"].mean(axis=1),
-            )
-    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path}: cannot be read ({error})") from None
+        reason = "a run that was trained with --eval-episodes 0 has no curve"
+        raise ConfigError(f"{path}: no such file; " + (f"{task} is none of this run's eval_tasks" if task else reason))
+    arrays = read_arrays(path)
+    if missing := NAMES - arrays.keys():
+        raise ConfigError(f"{path}: cannot be read ({', '.join(sorted(missing))}: no such array)")
+    timesteps, seconds = (np.asarray(arrays[name], dtype=np.float64) for name in ("timesteps", "seconds"))
+    return Curve(timesteps, seconds, arrays["successes"].mean(axis=1), arrays["results"].mean(axis=1))
 
 
+@styled
 def plot_curves(groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple[float, float]], title: str = "") -> Figure:
-    """Four panels: success and reward, each over transitions and over wall-clock time.
+    """Four panels: success and reward, each over timesteps and over wall-clock time.
 
-    :param groups: from the name of an agent to the curves of its seeds; the mean is drawn, with the seeds' range around it.
+    :param groups: from the name of an agent to the curves of its seeds; their mean is drawn, with their range around it.
     :param lines: from a name to (success share, mean reward): drawn as horizontal lines, such as the expert's.
     """
-    from matplotlib.figure import Figure
-
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     panels = figure.subplots(2, 2, sharex="col", sharey="row")
-    for column, (axis, scale, label) in enumerate(
-        (("timesteps", 1e6, "transitions in millions"), ("seconds", 60.0, "wall-clock time in minutes"))
-    ):
-        for row, (value, factor, name) in enumerate((("success", 100.0, "success in %"), ("reward", 1.0, "mean reward"))):
-            panel = panels[row, column]
-            for number, (group, curves) in enumerate(groups.items()):
-                _draw(panel, curves, axis, scale, value, factor, f"C{number}", group)
-            for number, (line, figures) in enumerate(lines.items()):
-                style = ("--", ":", "-.")[number % 3]
-                panel.axhline(figures[row] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
-            panel.grid(alpha=0.25)
-            panel.spines[["top", "right"]].set_visible(False)
-            if row == 1:
-                panel.set_xlabel(label)
-            if column == 0:
-                panel.set_ylabel(name)
-    panels[0, 0].legend(frameon=False, loc="lower right")
+    axes = (("timesteps", 1e6, "timesteps in millions"), ("seconds", 60.0, "wall-clock time in minutes"))
+    values = (("success", 100.0, "success in %"), ("reward", 1.0, "mean reward"))
+    for (row, (value, factor, name)), (column, (axis, scale, label)) in itertools.product(enumerate(values), enumerate(axes)):
+        panel = panels[row, column]
+        panel.set(xlabel=label, ylabel=name)
+        panel.label_outer()
+        for number, (group, curves) in enumerate(groups.items()):
+            times = [getattr(curve, axis) for curve in curves]
+            grid = np.linspace(max(each[0] for each in times), min(each[-1] for each in times), 200)  # that all runs have
+            rows = [factor * np.interp(grid, getattr(curve, axis), getattr(curve, value)) for curve in curves]
+            ends = np.stack([np.mean(rows, axis=0), np.min(rows, axis=0), np.max(rows, axis=0)])
+            seeds = f" ({len(curves)} seeds)" if len(curves) > 1 else ""
+            band(panel, f"C{number}", group + seeds, grid / scale, ends)
+        for number, (line, heights) in enumerate(lines.items()):
+            style = ("--", ":", "-.")[number % 3]
+            panel.axhline(heights[row] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
+    panels[0, 0].legend(loc="lower right")
     figure.suptitle(title)
     return figure
-
-
-def _draw(
-    panel: Axes, curves: Sequence[Curve], axis: str, scale: float, value: str, factor: float, color: str, label: str
-) -> None:
-    ends = [getattr(curve, axis)[-1] for curve in curves]
-    grid = np.linspace(max(getattr(curve, axis)[0] for curve in curves), min(ends), 200)
-    rows = np.stack([np.interp(grid, getattr(curve, axis), getattr(curve, value)) for curve in curves]) * factor
-    panel.plot(
-        grid / scale, rows.mean(axis=0), color=color, label=f"{label} ({len(curves)} seeds)" if len(curves) > 1 else label
-    )
-    panel.fill_between(grid / scale, rows.min(axis=0), rows.max(axis=0), color=color, alpha=0.2, linewidth=0)

@@ -1,37 +1,31 @@
-"""``report.html``: one file that needs nothing else; its tables as ``report.md`` and the figures as pictures beside it."""
+"""``report.html``: one file that needs nothing else; its tables as ``report.md`` and the plots as pictures beside it."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.extras import require
 from sb3_quad.base.files import refuse_existing, write_bytes, write_text
+from sb3_quad.drawing.palette import colours_of
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.records import Results
-from sb3_quad.report import interactive, pictures
-from sb3_quad.report.figures import LineFigure
-from sb3_quad.report.markdown import render_markdown
 from sb3_quad.report.sections import Section, sections
 
 PAGE, TABLES, PICTURES = "report.html", "report.md", "figures"
 
 
-def write_report(
-    folder: str | Path,
-    overwrite: bool = False,
-    with_pictures: bool = True,
-    progress: Callable[[str], None] = lambda heading: None,
-) -> Path:
-    """Write the report of a folder of results; its tables as ``report.md`` too.
+def write_report(folder: str | Path, overwrite: bool = False, with_pictures: bool = True) -> Path:
+    """Write the report of a folder of results: its tables as ``report.md``, its plots, and the page with both.
 
     :param overwrite: replace a report that is there.
-    :param with_pictures: also write every figure as PNG and SVG, into ``figures/``.
-    :param progress: told the heading of each section before its pictures are made.
+    :param with_pictures: also write every plot as PNG and SVG, into ``figures/``.
     :return: the page.
-    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written.
+    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written;
+        :class:`MissingExtra` if the page alone could not be written.
     """
     page = Path(folder) / PAGE
     results = load_results(folder)
@@ -39,48 +33,51 @@ def write_report(
         raise ConfigError(f"{folder}: holds no flights, only failures; there is nothing to report")
     refuse_existing(page, overwrite)
     parts = sections(results, folder)
-    if with_pictures:
-        for section in parts:
-            progress(section.heading)
-            for figure in section.figures:
-                for name, content in pictures.files(figure).items():
-                    write_bytes(Path(folder) / PICTURES / name, content)
     write_text(Path(folder) / TABLES, render_markdown(results, parts))
+    for plot in (plot for section in parts for plot in section.plots) if with_pictures else ():
+        write_bytes(Path(folder) / PICTURES / f"{plot.name}.png", plot.png)
+        write_bytes(Path(folder) / PICTURES / f"{plot.name}.svg", plot.svg)
     write_text(page, render(results, parts, with_pictures))
     return page
 
 
-def render(results: Results, parts: list[Section], with_pictures: bool) -> str:
-    """The page as text."""
-    from jinja2 import Environment, PackageLoader, StrictUndefined
-    from plotly.offline import get_plotlyjs
+def render(results: Results, parts: Sequence[Section], with_pictures: bool) -> str:
+    """The page as text.
 
-    from sb3_quad.drawing.palette import colours_of
-
-    figures = {figure.name: interactive.draw(figure) for section in parts for figure in section.figures}
-    environment = Environment(
-        loader=PackageLoader("sb3_quad.report", "templates"),
+    :raises MissingExtra: Jinja2 is not installed, or Plotly, where there are flights in space.
+    """
+    jinja2 = require("jinja2", "report", PAGE)
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("sb3_quad.report", "templates"),
         autoescape=True,
-        undefined=StrictUndefined,
+        undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    kept = {name: {"data": figure["data"], "layout": figure["layout"]} for name, figure in figures.items()}
-    return environment.get_template("page.html.j2").render(
+    spaces = {plot.name: plot.space for section in parts for plot in section.plots if plot.space is not None}
+    text: str = environment.get_template("page.html.j2").render(
         results=results,
         sections=parts,
-        heights={name: figure["height"] for name, figure in figures.items()},
-        kinds={name: "space" if "scene" in figure["layout"] else "plane" for name, figure in figures.items()},
-        narrow={
-            figure.name for section in parts for figure in section.figures if isinstance(figure, LineFigure) and figure.marks
-        },
         colours=colours_of([record.label for record in results.controllers]),
         flights=sum(entry.metrics.n for entry in results.entries),
         backends=sorted({entry.backend for entry in results.entries}),
         pictures=PICTURES if with_pictures else "",
-        figures_json=_for_script(kept),
-        plotly=get_plotlyjs(),
+        spaces=_for_script(spaces),
+        plotly=require("plotly.offline", "report", PAGE).get_plotlyjs() if spaces else "",
     )
+    return text
+
+
+def render_markdown(results: Results, parts: Sequence[Section]) -> str:
+    """The tables as text, for the pages of a repository: a heading, what it is about, and a table for each section.
+
+    An interval (95 %) stands in brackets; the best of a row is bold where its interval is apart from all others.
+    """
+    blocks = [f"# Suite {results.suite}"]
+    for part in parts:
+        texts = (" ".join(text.split()) for text in (part.description, part.facts) if text)
+        blocks += [f"## {part.heading}", *texts, *(table.markdown() for table in part.tables)]
+    return "\n\n".join(blocks) + "\n"
 
 
 def _for_script(content: Any) -> str:

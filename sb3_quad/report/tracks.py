@@ -1,17 +1,17 @@
-"""Sampled flights as a report draws them."""
+"""The sampled flights that a report shows."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.records import Entry
 
-FloatArray = npt.NDArray[np.float64]
 OUTCOMES = {"success": "", "collision": "touches the ground", "out_of_range": "leaves the range"}
 
 
@@ -37,9 +37,19 @@ class Track:
 
     @property
     def targets(self) -> FloatArray:
-        """The targets flown to, one after the other, (n, 3), m."""
+        """The targets, one after the other, (n, 3), m."""
         changed = np.flatnonzero((np.diff(self.target, axis=0) != 0).any(axis=1)) + 1
         return np.asarray(self.target[[0, *changed]])
+
+
+@dataclass(frozen=True, eq=False)
+class Flown:
+    """One controller in one scenario: its colour, its metrics, its sampled flights."""
+
+    label: str
+    colour: str
+    entry: Entry
+    tracks: Sequence[Track]
 
 
 def read_tracks(folder: str | Path, entry: Entry) -> list[Track]:
@@ -48,10 +58,8 @@ def read_tracks(folder: str | Path, entry: Entry) -> list[Track]:
     :raises ConfigError: a missing or damaged file.
     """
     arrays = read_flights(Path(folder) / entry.flights)
-    if "samples" not in arrays:
-        return []
     tracks = []
-    for number, samples in enumerate(arrays["samples"].tolist()):
+    for number, samples in enumerate(arrays.get("samples", np.array([], dtype=np.int64)).tolist()):
         position, target, wrench = (
             np.asarray(arrays[name][number, :samples], dtype=np.float64) for name in ("position", "target", "wrench")
         )

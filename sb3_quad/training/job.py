@@ -9,6 +9,7 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import check_seed
 from sb3_quad.settings.config import TrainingConfig
+from sb3_quad.settings.flight import FlightSettings
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,16 @@ class TrainingJob:
             raise ConfigError(f"n_eval_envs {self.n_eval_envs}: must be at least 1")
         if self.log_interval < 1:
             raise ConfigError(f"log_interval {self.log_interval}: must be at least 1")
+
+    @property
+    def for_evaluation(self) -> TrainingConfig:
+        """The settings with the environments as evaluations have them."""
+        return self.config.for_evaluation(self.eval_env_kwargs)
+
+    @property
+    def flight_settings(self) -> FlightSettings:
+        """How the agent is judged, in an environment of this package."""
+        return self.for_evaluation.flight_settings
 
     def arguments(self) -> dict[str, Any]:
         """What args.yml holds: everything but the settings, which config.yml holds."""

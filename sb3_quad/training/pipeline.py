@@ -48,7 +48,7 @@ from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.hover import trim_hover
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import for_evaluation, resume, train
+from sb3_quad.training.trainer import resume, train
 from sb3_quad.training.trim import trim
 
 STATUS_FILE = "pipeline.yml"
@@ -242,7 +242,7 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
 def _trimmed(agent: Path, job: TrainingJob, kind: str, report: Callable[[str], None]) -> Path:
     """Trim the agent in a zip; the trimmed one lies beside it."""
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
-    seed, settings = seed_for("trim", job.seed), for_evaluation(job).flight_settings
+    seed, settings = seed_for("trim", job.seed), job.flight_settings
     if kind == "hover":
         hover = trim_hover(model, seed, settings)
         done = f"action at the target {hover.before:.4f} from hover, now {hover.after:.4f}"

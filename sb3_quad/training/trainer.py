@@ -76,7 +76,7 @@ def train(
         if job.trained_agent is not None:
             transfer_policy(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
-        run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": for_evaluation(job).env_kwargs})
+        run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": job.for_evaluation.env_kwargs})
         on_start(run)
         return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps, should_continue)
 
@@ -121,11 +121,6 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
     finally:
         for env in made:
             env.close()
-
-
-def for_evaluation(job: TrainingJob) -> TrainingConfig:
-    """The settings with the environments as evaluations have them."""
-    return job.config.for_evaluation(job.eval_env_kwargs)
 
 
 def _expert(config: TrainingConfig) -> dict[str, Any]:

@@ -1,0 +1,284 @@
+"""The plots of a report, drawn by matplotlib: bars, lines and heat maps of a scenario's results."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.evaluation.records import Estimate
+from sb3_quad.report.tracks import Flown, Track
+from sb3_quad.scenarios.scenario import Scenario
+from sb3_quad.scenarios.vary import axis_label, axis_name
+
+INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
+FORCE = "#db1a24"
+WIDE, HALF = 7.7, 5.0  # inches: over the whole page, and so that two stand side by side
+DPI, LINE_POINTS = 150, 400  # points that a flight is drawn with, at most
+POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
+STYLE: Any = {
+    "font.size": 9,
+    "axes.titlesize": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.linewidth": 0.6,
+    "legend.frameon": False,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "sb3_quad",
+    "text.parse_math": False,
+    "grid.color": GRID,
+    "figure.facecolor": PAPER,
+    "axes.facecolor": PAPER,
+    **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.labelcolor", "ytick.labelcolor"), INK),
+    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), QUIET),
+}
+styled = matplotlib.rc_context(STYLE)
+METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # left out: the same results give the same file
+
+
+@dataclass(frozen=True, eq=False)
+class Plot:
+    """A plot of a report.
+
+    :param name: of its files; unique in a report.
+    :param space: the same in three dimensions, ``data`` and ``layout`` of Plotly, to be turned in the page; None: the page
+        shows the picture.
+    """
+
+    name: str
+    caption: str
+    figure: Figure
+    space: dict[str, Any] | None = None
+
+    @property
+    def narrow(self) -> bool:
+        """Whether two of its width stand side by side."""
+        return float(self.figure.get_figwidth()) <= HALF
+
+    @cached_property
+    def svg(self) -> bytes:
+        """The plot as an SVG file."""
+        return picture(self.figure, "svg", bbox_inches="tight", metadata=METADATA)
+
+    @cached_property
+    def png(self) -> bytes:
+        """The plot as a PNG file."""
+        return picture(self.figure, "png", bbox_inches="tight", dpi=DPI)
+
+    @property
+    def inline(self) -> str:
+        """The plot as a part of the page: an ``svg`` element in the page's colours, which may be dark."""
+        text = self.svg.decode("utf-8")
+        text = text[text.index("<svg") :]
+        for colour, name in ((INK, "ink"), (QUIET, "quiet"), (GRID, "grid"), (PAPER, "paper")):
+            text = text.replace(colour, f"var(--{name})")
+        return re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", text)  # names of groups, which others have, too
+
+
+@styled
+def picture(figure: Figure, kind: str, **options: Any) -> bytes:
+    """A figure of matplotlib as a file of some kind, such as ``png``; ``options`` are those of its ``savefig``."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=kind, **options)
+    return buffer.getvalue()
+
+
+def legend(figure: Figure, axes: Any, first: Sequence[str] = ()) -> None:
+    """Every name once above the axes, those of ``first`` before others."""
+    handles, names = axes.get_legend_handles_labels()
+    found = dict(zip(names, handles, strict=True))
+    order = sorted(found, key=lambda name: name not in first)
+    columns = min(len(order), 5 if sum(map(len, order)) < 60 else 3)
+    figure.legend([found[name] for name in order], order, loc="outside upper left", ncols=columns)
+
+
+def _axes(width: float, x_label: str, y_label: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(width, 3.3), layout="constrained")
+    axes = figure.subplots()
+    axes.set(xlabel=x_label, ylabel=y_label)
+    return figure, axes
+
+
+def _ends(estimates: Sequence[Estimate | None], factor: float = 1.0) -> FloatArray:
+    """Values and both ends of their intervals, (3, n); NaN where there is none."""
+    names = ("value", "low", "high")
+    return factor * np.array([[np.nan if each is None else getattr(each, name) for each in estimates] for name in names])
+
+
+def band(axes: Axes, colour: str, label: str, x: FloatArray, ends: FloatArray, **style: Any) -> None:
+    """A line and the band around it; ``ends`` are values, low and high, (3, n)."""
+    axes.plot(x, ends[0], color=colour, label=label, **{"linewidth": 1.6, **style})
+    axes.fill_between(x, ends[1], ends[2], color=colour, alpha=0.16, linewidth=0)
+
+
+@styled
+def arrivals_plot(scenario: Scenario, flown: Sequence[Flown], source: str) -> Plot:
+    """Bars of the mean times to each tolerance, cf. Figs. 4.6 and 4.7.
+
+    :param source: where the reference metrics come from.
+    """
+    figure, axes = _axes(WIDE, "tolerance (m)", "time (s)")
+    places, width = np.arange(len(scenario.tolerances)), 0.75 / len(flown)
+    for number, each in enumerate(flown):
+        arrivals = each.entry.metrics.arrivals
+        value, low, high = _ends([arrival.time for arrival in arrivals])
+        spread, middle = np.stack([value - low, high - value]), places + (number - 0.5 * (len(flown) - 1)) * width
+        bars = {"ecolor": INK, "elinewidth": 0.9, "capsize": 2}
+        axes.bar(middle, value, 0.92 * width, color=each.colour, label=each.label, yerr=spread, error_kw=bars)
+        for x, y, arrival in zip(middle, high, arrivals, strict=True):
+            if arrival.time is not None and arrival.share.value < 1.0:
+                note = f"{100 * arrival.share.value:.3g} %"
+                axes.annotate(note, (x, y), (0, 3), textcoords="offset points", rotation=90, ha="center", fontsize=6.5)
+    for (name, reference), marker in zip(scenario.reference.items(), "Dos^" * len(scenario.reference), strict=False):
+        given = {float(key): float(np.mean(time)) for key, time in reference.time_to.items() if time is not None}
+        if given.keys() & set(scenario.tolerances):
+            heights = [given.get(tolerance, np.nan) for tolerance in scenario.tolerances]
+            style: Any = {"color": INK, "markerfacecolor": PAPER, "markeredgewidth": 1.3, "markersize": 6, "zorder": 4}
+            axes.plot(places, heights, marker, label=f"{source}: {name}", **style)
+    axes.set_xticks(places, [f"{tolerance:g}" for tolerance in scenario.tolerances])
+    axes.grid(axis="x", visible=False)
+    legend(figure, axes, [each.label for each in flown])
+    caption = (
+        "Mean time until the vehicle is first within a tolerance of its target, over the flights that get there; "
+        "their share, if not all, stands above."
+    )
+    return Plot(f"{scenario.name}_times", caption, figure)
+
+
+@styled
+def errors_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
+    """Distances from the target over time, of controllers with sampled flights."""
+    figure, axes = _axes(WIDE, "time (s)", "distance from target (m)")
+    for each in flown:
+        x, ends = _quantiles(each.tracks)
+        if scenario.is_fixed:
+            band(axes, each.colour, each.label, x, ends)
+            continue
+        for track in each.tracks:
+            stride = max(1, -(-len(track.times) // LINE_POINTS))
+            axes.plot(track.times[::stride], track.error[::stride], color=each.colour, linewidth=0.6, alpha=0.45)
+        axes.plot(x, ends[0], color=each.colour, label=each.label, linewidth=1.8)
+    for wrench in scenario.wrenches:
+        if wrench.duration is not None and wrench.start + wrench.duration < scenario.duration:
+            axes.axvspan(wrench.start, wrench.start + wrench.duration, facecolor=FORCE, edgecolor=FORCE, alpha=0.16)
+            style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "va": "top"}
+            axes.annotate("push" if wrench.duration > 0.2 else "hit", (wrench.start, 1.0), (2, -2), **style)
+    axes.set_ylim(bottom=0.0)
+    legend(figure, axes)
+    count = len(flown[0].tracks)
+    spread = f"band: least to greatest of {count} flights"
+    spread = spread if scenario.is_fixed else f"thin: {count} flights of each controller"
+    caption = f"Thick: median, {spread}. A lost flight counts as infinitely far: a median ends where half are lost."
+    return Plot(f"{scenario.name}_error", caption, figure)
+
+
+def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
+    """Times, (k,), and the median, least and greatest error, (3, k); NaN where it is infinite."""
+    longest = max(tracks, key=lambda track: len(track.times))
+    errors = np.full((len(tracks), len(longest.times)), np.inf)
+    for row, track in zip(errors, tracks, strict=True):
+        row[: len(track.times)] = track.error
+    stride = max(1, -(-len(longest.times) // LINE_POINTS))
+    ends = np.quantile(errors[:, ::stride], (0.5, 0.0, 1.0), axis=0, method="higher")
+    return longest.times[::stride], np.where(np.isfinite(ends), ends, np.nan)
+
+
+@styled
+def hits_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
+    """Shares of flights that survive, over the size of force and torque."""
+    figure, axes = _axes(WIDE, "factor of force and torque", "survived (%)")
+    for each in flown:
+        if each.entry.hit_limit is not None:
+            trials = sorted(each.entry.hit_limit.trials, key=lambda trial: trial.factor)
+            factors = np.array([trial.factor for trial in trials])
+            band(axes, each.colour, each.label, factors, _ends([trial.survived for trial in trials], 100.0), **POINTS)
+    axes.set_xscale("log", base=2)
+    axes.set_ylim(-3.0, 103.0)
+    axes.xaxis.set_major_formatter("{x:g}")
+    legend(figure, axes)
+    caption = "Flights that survive when force and torque are scaled by a factor, with 95 % intervals."
+    return Plot(f"{scenario.name}_limit", caption, figure)
+
+
+@styled
+def group_plots(scenarios: Sequence[Scenario], flown: Sequence[Sequence[Flown]]) -> list[Plot]:
+    """The plots of the cells that ``vary`` makes of a scenario: curves over one quantity, or heat maps over several.
+
+    :param flown: of each cell.
+    """
+    cells: dict[str, list[tuple[Scenario, Flown]]] = {}
+    for scenario, entries in zip(scenarios, flown, strict=True):
+        for each in entries:
+            cells.setdefault(each.label, []).append((scenario, each))
+    return _sweep(cells) if len(scenarios[0].cell) == 1 else [_heat_map(scenarios, cells)]
+
+
+def _sweep(cells: Mapping[str, Sequence[tuple[Scenario, Flown]]]) -> list[Plot]:
+    first = next(iter(cells.values()))[0][0]
+    (key,) = first.cell
+    (success, shares), (error, distances) = (_axes(HALF, _label(key), name) for name in ("success (%)", "final distance (m)"))
+    for label, members in cells.items():
+        metrics, colour = [each.entry.metrics for _, each in members], members[0][1].colour
+        x = np.array([scenario.cell[key] for scenario, _ in members])
+        band(shares, colour, label, x, _ends([each.success for each in metrics], 100.0), **POINTS)
+        medians = [np.nan if each.final_error_median is None else each.final_error_median for each in metrics]
+        distances.plot(x, medians, color=colour, label=label, **POINTS)
+    shares.set_ylim(-3.0, 103.0)
+    distances.set_ylim(bottom=0.0)
+    legend(success, shares)
+    legend(error, distances)
+    caption = "Median of the final error of flights that were not lost."
+    success_plot = Plot(f"{first.group}_success", "Success, with 95 % intervals.", success)
+    return [success_plot, Plot(f"{first.group}_error", caption, error)]
+
+
+def _heat_map(scenarios: Sequence[Scenario], cells: Mapping[str, Sequence[tuple[Scenario, Flown]]]) -> Plot:
+    """Success over the first two keys: a row of panels for each controller, a column for each combination of the others."""
+    keys = list(scenarios[0].cell)
+    x_values, y_values = (sorted({scenario.cell[key] for scenario in scenarios}) for key in keys[:2])
+    columns = list(dict.fromkeys(_rest(scenario) for scenario in scenarios))
+    figure = Figure(figsize=(1.2 + 2.2 * len(columns), 0.5 + 1.7 * len(cells)), layout="constrained")
+    panels = figure.subplots(len(cells), len(columns), sharex=True, sharey=True, squeeze=False)
+    for row, (label, members) in zip(panels, cells.items(), strict=True):
+        for axes, column in zip(row, columns, strict=True):
+            grid = np.full((len(y_values), len(x_values)), np.nan)
+            for scenario, each in members:
+                if _rest(scenario) == column:
+                    x, y = x_values.index(scenario.cell[keys[0]]), y_values.index(scenario.cell[keys[1]])
+                    grid[y, x] = success = 100.0 * each.entry.metrics.success.value
+                    style = {"ha": "center", "va": "center", "fontsize": 7, "color": "#101010" if success > 60 else "#fefefe"}
+                    axes.text(x + 0.5, y + 0.5, f"{success:.0f}", **style)
+            image = axes.pcolormesh(grid, vmin=0, vmax=100, cmap="viridis", edgecolors=PAPER, linewidth=0.8)
+            axes.set_title(f"{label}, {column}".rstrip(", "), loc="left", color=members[0][1].colour)
+            axes.set_xticks(np.arange(len(x_values)) + 0.5, [f"{value:g}" for value in x_values])
+            axes.set_yticks(np.arange(len(y_values)) + 0.5, [f"{value:g}" for value in y_values])
+            axes.grid(visible=False)
+            axes.set(xlabel=_label(keys[0]), ylabel=_label(keys[1]))
+            axes.label_outer()
+    figure.colorbar(image, ax=panels.ravel().tolist(), label="success (%)", shrink=0.9)
+    names = ", ".join(axis_name(key).replace("_", " ") for key in keys)
+    return Plot(f"{scenarios[0].group}_success", f"Success in % over {names}.", figure)
+
+
+def _label(key: str) -> str:
+    return axis_label(key).replace("_", " ")
+
+
+def _rest(scenario: Scenario) -> str:
+    """The values of all but the first two keys of a cell, with their units."""
+    parts = []
+    for key in list(scenario.cell)[2:]:
+        name, _, unit = _label(key).partition(" (")
+        parts.append(f"{name} {scenario.cell[key]:g} {unit.removesuffix(')')}".strip())
+    return ", ".join(parts)
