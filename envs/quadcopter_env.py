@@ -190,9 +190,7 @@ class QuadcopterEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
         self._open()
 
     def _open(self) -> None:
-        self._body = BulletBody(
-            self._vehicle, self._size if self.render_mode == "human" else None, visuals=self.render_mode == "rgb_array"
-        )
+        self._body = BulletBody(self._vehicle, self._size if self.render_mode == "human" else None)
         self._renderer = None
         if self._body.has_window or self.render_mode == "rgb_array":
             self._renderer = Renderer(self._vehicle, self._body, *self._size)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
+from sb3_quad.drawing.models import rotor_turning
+from sb3_quad.drawing.scene import Pose
 from sb3_quad.evaluation.fleets import PyBulletFleet
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import Plan, fly_fleet
 from sb3_quad.simulation.state import POSITION, TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
-
-FloatArray = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,16 @@ class Recording:
         """r, (T + 1, 3), world frame, m."""
         return self.state[POSITION].T
 
+    @cached_property
+    def rotor_angles(self) -> FloatArray:
+        """How far the drawn rotors have turned, (4, T + 1), rad."""
+        return np.cumsum(rotor_turning(self.vehicle, self.state), axis=1) * self.vehicle.control_step
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """The points by which a camera's direction is chosen, (n, 3), m."""
+        return np.concatenate([self.path[::5], self.targets])
+
     @property
     def targets(self) -> FloatArray:
         """The targets flown to, one after the other, (k, 3), world frame, m."""
@@ -70,6 +82,14 @@ class Recording:
         first = max(0, step - round(seconds / self.vehicle.control_step))
         recent = self.wrench[:, first : step + 1]
         return np.asarray(recent[:, int(np.argmax(np.linalg.norm(recent, axis=0)))])
+
+    def vehicle_and_target(self, step: int) -> FloatArray:
+        """Where both are, (2, 3), world frame, m."""
+        return np.stack([self.state[POSITION, step], self.state[TARGET, step]])
+
+    def pose(self, step: int, seconds: float = 0.4) -> Pose:
+        """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
+        return Pose(self.state[:, step], self.wrench_around(step, seconds), self.rotor_angles[:, step])
 
     def at(self, seconds: float) -> int:
         """The index of the last state not later than ``seconds``."""
@@ -95,7 +115,7 @@ def record(
         ``noise`` and ``observation_std``.
     :param n_steps: control steps of an episode that nothing ends before.
     :param plan: what happens whoever flies; of one episode.
-    :param deterministic: whether a policy gives the mean of its actions, or a sample.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
     :raises ConfigError: a controller that cannot be asked, keywords that the environment refuses.
     :raises ControllerError: a controller that fails in flight.
     """
@@ -113,7 +133,7 @@ def record(
 
 
 class _Sampling:
-    """A policy whose actions are drawn, not their mean."""
+    """A policy whose actions are samples, not their mean."""
 
     def __init__(self, policy: Any) -> None:
         self._policy = policy
@@ -139,7 +159,5 @@ class _EveryStep(Recorder):
     def push(self, state: QuadcopterState, wrench: FloatArray) -> None:
         self.wrenches.append(wrench[0].copy())
 
-    def sample(
-        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
-    ) -> None:
+    def sample(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         self.states.append(state.array[:, 0].copy())

@@ -10,14 +10,13 @@ import numpy as np
 import pybullet as p
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.drawing.client import has_display, open_window
-from sb3_quad.drawing.framing import broadside, following_cameras
+from sb3_quad.drawing.camera import broadside, following_cameras
 from sb3_quad.drawing.palette import colours_of, rgb
-from sb3_quad.drawing.scenery import DrawnTarget, DrawnVehicle, DrawnWrench, rotor_turning, scale_of
-from sb3_quad.envs.rendering import furnish_window, point_window
-from sb3_quad.show.film import FPS, HOLD, MARGIN, sight
+from sb3_quad.drawing.scene import Scene
+from sb3_quad.drawing.window import furnish_window, has_display, open_window, point_window, start_drawing
+from sb3_quad.show.film import FPS, MARGIN, frame_times
 from sb3_quad.show.recording import Recording
-from sb3_quad.simulation.state import POSITION, TARGET
+from sb3_quad.simulation.state import TARGET
 
 WINDOW_FIELD_OF_VIEW = math.radians(60.0)  # PyBullet's, vertical
 
@@ -39,7 +38,7 @@ class Window:
 
     def __init__(self, width: int, height: int) -> None:
         check_window()
-        self.width, self.height = width, height
+        self.aspect = width / height
         self.client = open_window(width, height)
 
     def show(self, recordings: Sequence[Recording], speed: float = 1.0) -> bool:
@@ -47,14 +46,14 @@ class Window:
         p.resetSimulation(physicsClientId=self.client)
         p.removeAllUserDebugItems(physicsClientId=self.client)
         furnish_window(self.client)
-        players = [_Player(each, self.client, colour) for each, colour in zip(recordings, _colours(recordings), strict=True)]
-        p.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1, physicsClientId=self.client)
-        last = max(float(recording.times[-1]) for recording in recordings)
-        times = np.minimum(np.arange(round((last / speed + HOLD) * FPS) + 1) * speed / FPS, last)
-        seen = [np.concatenate([_where(recording, seconds) for recording in recordings]) for seconds in times]
-        ahead = broadside(np.concatenate([sight(recording) for recording in recordings]))
-        margin, aspect = MARGIN * scale_of(recordings[0].vehicle), self.width / self.height
-        cameras = following_cameras(seen, max(speed / FPS, 1e-3), margin, aspect, ahead, WINDOW_FIELD_OF_VIEW)
+        colours = colours_of([recording.name for recording in recordings])
+        players = [_Player(each, self.client, rgb(colours[each.name])) for each in recordings]
+        start_drawing(self.client)
+        times = frame_times(recordings, speed)
+        seen = [np.concatenate([each.vehicle_and_target(each.at(seconds)) for each in recordings]) for seconds in times]
+        forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
+        margin, frame_seconds = MARGIN * players[0].scene.scale, max(speed / FPS, 1e-3)
+        cameras = following_cameras(seen, frame_seconds, margin, self.aspect, forward, WINDOW_FIELD_OF_VIEW)
         begun, number = time.perf_counter(), 0
         while number < len(times):
             try:
@@ -77,37 +76,20 @@ class _Player:
     """One flight in the window."""
 
     def __init__(self, recording: Recording, client: int, colour: tuple[float, float, float]) -> None:
-        scale = scale_of(recording.vehicle)
         self.recording, self.client, self.colour = recording, client, colour
-        self.vehicle = DrawnVehicle(recording.vehicle, client)
-        self.target, self.wrench = DrawnTarget(client, scale), DrawnWrench(client, scale)
-        turning = rotor_turning(recording.vehicle, recording.state)
-        self.rotor_angles = np.cumsum(turning, axis=1) * recording.vehicle.control_step
-        self.drawn_to = 0
-        self.name = -1
+        self.scene = Scene(recording.vehicle, client)
+        self.drawn_to, self.name = 0, -1
 
     def move_to(self, seconds: float) -> None:
         recording, step = self.recording, self.recording.at(seconds)
-        state = recording.state[:, step]
-        self.vehicle.place(state, self.rotor_angles[:, step])
-        self.target.place(state[TARGET], state[None, POSITION])
-        self.wrench.place(state, recording.wrench_around(step))
+        self.scene.place([recording.pose(step)], recording.state[None, TARGET, step])
         if step == self.drawn_to:
             return
         ends = recording.path[[self.drawn_to, step]].tolist()
         p.addUserDebugLine(*ends, lineColorRGB=self.colour, lineWidth=3.0, physicsClientId=self.client)
-        above = (state[POSITION] + np.array([0.0, 0.0, 0.6 * scale_of(recording.vehicle)])).tolist()
+        above = (recording.path[step] + np.array([0.0, 0.0, 0.6 * self.scene.scale])).tolist()
         options = {"replaceItemUniqueId": self.name} if self.name >= 0 else {}
         self.name = p.addUserDebugText(
             recording.name, above, textColorRGB=self.colour, textSize=1.2, physicsClientId=self.client, **options
         )
         self.drawn_to = step
-
-
-def _where(recording: Recording, seconds: float) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    state = recording.state[:, recording.at(seconds)]
-    return np.stack([state[POSITION], state[TARGET]])
-
-
-def _colours(recordings: Sequence[Recording]) -> list[tuple[float, float, float]]:
-    return [rgb(colour) for colour in colours_of([recording.name for recording in recordings]).values()]
