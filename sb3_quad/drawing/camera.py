@@ -15,8 +15,6 @@ FIELD_OF_VIEW = math.radians(30.0)  # vertical; narrow, so that near and far are
 CHASE_FIELD_OF_VIEW = math.radians(54.0)
 ELEVATIONS = math.radians(-45.0), math.radians(52.0)  # of a chasing camera
 ELEVATION_AT_TARGET = math.radians(-8.0)
-DOWN = math.radians(14.0), math.radians(16.0)  # of the way to the target, so that both are seen
-CHASE_ELEVATIONS = math.radians(-40.0), math.radians(55.0)
 DOWN = math.radians(5.0)  # how far cameras of films look down
 LOWEST = 0.3  # height of a camera at least, m
 SMOOTHING = 0.35  # standard deviation of a camera's smoothing over time, s
@@ -67,13 +65,9 @@ def framing_camera(
     """
     axes, slope = _axes(forward), math.tan(field_of_view / 2)
     half = np.array([slope * aspect, slope])
-    local = points @ axes.T
-    centre = np.zeros(2)
-    for _ in range(30):  # where the picture's middle lies depends on the distance, and the other way round
-        depth, across = local[:, :1] + _distance(local, centre, half, margin), local[:, 1:] - centre
-        middle = 0.5 * (((across - margin) / depth).min(axis=0) + ((across + margin) / depth).max(axis=0))
-        centre = centre + middle * float(depth.mean())
-    return Camera(_above_ground(np.array([-_distance(local, centre, half, margin), *centre]) @ axes), axes, slope)
+    before, after = _needed(points @ axes.T, half, margin)
+    distance = float((0.5 * (before + after) / half).max())
+    return Camera(_above_ground(np.array([-distance, *(0.5 * (after - before))]) @ axes), axes, slope)
 
 
 def following_cameras(
@@ -97,7 +91,8 @@ def following_cameras(
     smooth = np.stack([np.convolve(column, weights / weights.sum(), "valid") for column in padded.T], axis=1)
     half = np.array([slope * aspect, slope])
     for place, each in zip(smooth, points, strict=True):  # farther away where smoothing has cut something off
-        place[0] = min(place[0], -_distance(each @ axes.T, place[1:], half, 0.6 * margin))
+        before, after = _needed(each @ axes.T, half, 0.6 * margin)
+        place[0] = min(place[0], -(np.maximum(after - place[1:], before + place[1:]) / half).max())
     return [Camera(_above_ground(place @ axes), axes, slope) for place in smooth]
 
 
@@ -147,13 +142,14 @@ def _axes(forward: FloatArray) -> FloatArray:
     return np.stack([forward, right, np.cross(right, forward)])
 
 
-def _distance(local: FloatArray, centre: FloatArray, half: FloatArray, margin: float) -> float:
-    """How far behind the origin a camera must be to see balls of radius ``margin`` at ``local``, (n, 3) along its axes.
+def _needed(local: FloatArray, half: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
+    """How far a camera must see, in the plane through the origin, to the left and down, and to the right and up; (2,) each.
 
-    :param centre: its place to the right and up, (2,).
+    :param local: (n, 3), points to be seen with ``margin`` around them, along the camera's axes.
     :param half: tangents of half its fields of view, (2,).
     """
-    return float(((np.abs(local[:, 1:] - centre) + margin) / half - local[:, :1]).max())
+    across, room = local[:, 1:], margin - half * local[:, :1]
+    return (room - across).max(axis=0), (room + across).max(axis=0)
 
 
 def _above_ground(eye: FloatArray) -> FloatArray:

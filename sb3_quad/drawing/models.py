@@ -128,10 +128,13 @@ def arrow(length: float, radius: float) -> Mesh:
     return _revolve(np.array([(0.0, 0.0), (radius, 0.0), (radius, neck), (head, neck), (0.0, length)]), 20)
 
 
-def ring(radius: float, thickness: float) -> Mesh:
-    """A ring about the z axis."""
+def rings(radius: float, thickness: float) -> Mesh:
+    """Two upright rings around the origin, at right angles to each other."""
     angle = np.linspace(0.0, 2.0 * np.pi, 9)
-    return _revolve(np.stack([radius + thickness * np.cos(angle), thickness * np.sin(angle)], axis=1), 48)
+    ring = _revolve(np.stack([radius + thickness * np.cos(angle), thickness * np.sin(angle)], axis=1), 48)
+    points, triangles = ring["vertices"], ring["indices"]
+    upright = np.concatenate([points[:, [2, 0, 1]], points[:, [1, 2, 0]]])
+    return {"vertices": upright, "indices": [*triangles, *(corner + len(points) for corner in triangles)]}
 
 
 def _revolve(profile: FloatArray, segments: int) -> Mesh:

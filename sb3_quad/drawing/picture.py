@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pybullet as p
@@ -29,17 +29,13 @@ VISIBILITY = 90.0  # distance at which 1/e of the ground is still seen through t
 THINNEST = 1.8  # width of a line at least, pixels
 
 
-@dataclass(frozen=True, eq=False)
-class Overlay:
-    """What is laid over a picture: a line through ``points``, (n, 3), or the flat shape that they surround.
+class Overlay(NamedTuple):
+    """What is laid over a picture: a line through points, or with no width the flat shape that they surround."""
 
-    :param width: of the line, m; None: a shape.
-    """
-
-    points: FloatArray
+    points: FloatArray  # (n, 3)
     colour: Sequence[float]
     opacity: float
-    width: float | None = None
+    width: float | None = None  # m
 
 
 def take_picture(
@@ -66,22 +62,13 @@ def take_picture(
         physicsClientId=client,
     )
     # Without numpy at PyBullet's build time these are flat tuples.
-    colours = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
-    colours[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
-    drawn = np.asarray(Pillow.fromarray(colours).reduce(SUPERSAMPLING), dtype=np.float32) / 255.0
+    drawn = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
+    drawn[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
     depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
-    picture = backdrop(camera, width, height, shadows)
-    picture += drawn[..., 3:] * (drawn[..., :3] - picture)
-    for overlay in overlays:
-        screen = camera.project(overlay.points, wide, high)
-        if overlay.width is None:
-            polygons = np.stack(
-                [np.broadcast_to(screen.mean(axis=0), screen.shape), screen, np.roll(screen, 1, axis=0)], axis=1
-            )
-        else:
-            polygons = _ribbon(screen, overlay.width * high / (2.0 * camera.slope))
-        _lay_over(picture, depth, polygons, overlay.colour, overlay.opacity)
-    return np.asarray(255.0 * picture + 0.5, dtype=np.uint8)
+    both = Pillow.alpha_composite(Pillow.fromarray(drawn), draw_overlays(overlays, camera, depth))
+    small = np.asarray(both.reduce(SUPERSAMPLING), dtype=np.float32)
+    behind = 255.0 * backdrop(camera, width, height, shadows)
+    return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
 
 
 def backdrop(camera: Camera, width: int, height: int, shadows: FloatArray) -> Float32Array:
@@ -115,6 +102,29 @@ def backdrop(camera: Camera, width: int, height: int, shadows: FloatArray) -> Fl
     return picture
 
 
+def draw_overlays(overlays: Sequence[Overlay], camera: Camera, depth: Float32Array) -> Pillow.Image:
+    """Overlays where nothing of less ``depth``, (height, width), m, is before them; elsewhere the picture is transparent."""
+    high, wide = depth.shape
+    picture, away = Pillow.new("RGBA", (wide, high)), Pillow.new("F", (wide, high), np.inf)
+    draw, draw_away = ImageDraw.Draw(picture), ImageDraw.Draw(away)
+    for overlay in overlays:
+        screen = camera.project(overlay.points, wide, high)
+        if overlay.width is None:
+            polygons = np.stack(
+                [np.broadcast_to(screen.mean(axis=0), screen.shape), screen, np.roll(screen, 1, axis=0)], axis=1
+            )
+        else:
+            polygons = _ribbon(screen, overlay.width * high / (2.0 * camera.slope))
+        colour = tuple(round(255 * part) for part in (*overlay.colour[:3], overlay.opacity))
+        for polygon in polygons[(polygons[:, :, 2] > NEAR).all(axis=1)]:
+            corners = polygon[:, :2].clip(-1e4, 1e4).ravel().tolist()
+            draw.polygon(corners, fill=colour)
+            draw_away.polygon(corners, fill=float(polygon[:, 2].mean()))
+    seen = np.asarray(picture).copy()
+    seen[..., 3] *= np.asarray(away) < depth
+    return Pillow.fromarray(seen)
+
+
 def _ribbon(screen: FloatArray, width: float) -> FloatArray:
     """A line as quadrilaterals, (n - 1, 4, 3), from points of it, (n, 3); each point a column, a row and a depth.
 
@@ -128,32 +138,3 @@ def _ribbon(screen: FloatArray, width: float) -> FloatArray:
     aside = np.column_stack([half * along[:, ::-1] * (-1.0, 1.0), np.zeros(len(screen))])
     left, right = screen - aside, screen + aside
     return np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
-
-
-def _lay_over(
-    picture: Float32Array, depth: Float32Array, polygons: FloatArray, colour: Sequence[float], opacity: float
-) -> None:
-    """Draw polygons into a picture, in place, where nothing is nearer than they are.
-
-    :param depth: (SUPERSAMPLING height, SUPERSAMPLING width), of what is in the picture, m.
-    :param polygons: (n, k, 3), column, row (pixels of ``depth``) and depth of each corner.
-    """
-    polygons = polygons[(polygons[:, :, 2] > NEAR).all(axis=1)]
-    if not len(polygons):
-        return
-    high, wide = depth.shape
-    corners = polygons[:, :, :2].reshape(-1, 2) / SUPERSAMPLING
-    left, top = np.clip(np.floor(corners.min(axis=0)).astype(int), 0, (wide // SUPERSAMPLING, high // SUPERSAMPLING))
-    right, bottom = np.clip(np.ceil(corners.max(axis=0)).astype(int) + 1, 0, (wide // SUPERSAMPLING, high // SUPERSAMPLING))
-    if left >= right or top >= bottom:
-        return
-    nearest = depth[SUPERSAMPLING * top : SUPERSAMPLING * bottom, SUPERSAMPLING * left : SUPERSAMPLING * right]
-    mask = Pillow.new("F", nearest.shape[::-1], np.inf)
-    draw = ImageDraw.Draw(mask)
-    shifted = polygons[:, :, :2] - SUPERSAMPLING * np.array([left, top])
-    for polygon, away in zip(shifted.clip(-1e4, 1e4), polygons[:, :, 2].mean(axis=1).tolist(), strict=True):
-        draw.polygon(polygon.ravel().tolist(), fill=away)
-    seen = (np.asarray(mask) < nearest).reshape(bottom - top, SUPERSAMPLING, right - left, SUPERSAMPLING)
-    share = opacity * seen.mean(axis=(1, 3), dtype=np.float32)[..., None]
-    part = picture[top:bottom, left:right]
-    part += share * (np.asarray(colour[:3], dtype=np.float32) - part)

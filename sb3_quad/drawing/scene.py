@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import weakref
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pybullet as p
@@ -23,21 +23,14 @@ FORCE: Colour = (0.86, 0.10, 0.14, 1.0)
 TORQUE: Colour = (0.55, 0.15, 0.75, 1.0)
 RING = 0.42  # radius of the rings around a target, m, for a vehicle of the default one's size
 LEVEL = (0.0, 0.0, 0.0, 1.0)
-UPRIGHT = ((0.5**0.5, 0.0, 0.0, 0.5**0.5), (0.0, 0.5**0.5, 0.0, 0.5**0.5))  # of the two rings
 
 
-@dataclass(frozen=True, eq=False)
-class Pose:
-    """A vehicle as it is to be drawn.
+class Pose(NamedTuple):
+    """A vehicle as it is to be drawn: its state, the wrench that acts on it, and the angles of its rotors."""
 
-    :param state: (STATE_SIZE,).
-    :param wrench: that acts on it, (12,): force in the world frame, force in the body frame, torques likewise.
-    :param rotor_angles: (4,), rad.
-    """
-
-    state: FloatArray
-    wrench: FloatArray
-    rotor_angles: FloatArray
+    state: FloatArray  # (STATE_SIZE,)
+    wrench: FloatArray  # (12,): force in the world frame, force in the body frame, N; torques likewise, N m
+    rotor_angles: FloatArray  # (4,), rad
 
 
 class Scene:
@@ -57,11 +50,9 @@ class Scene:
             self._close = weakref.finalize(self, p.disconnect, self.client)
         self.scale, self.span = size * models.scale_of(vehicle), size * models.span(vehicle)
         self._vehicles = [_VehicleBodies(vehicle, self.client, size) for _ in range(n_vehicles)]
-        ball, ring = [models.Part(p.GEOM_SPHERE, radius=0.14)], models.ring(RING * self.scale, 0.014 * self.scale)
-        self._targets = [
-            (add_body(ball, MARKER, self.client), *(add_mesh(ring, MARKER, self.client) for _ in UPRIGHT))
-            for _ in range(n_targets)
-        ]
+        ball, rings = [models.Part(p.GEOM_SPHERE, radius=0.14)], models.rings(RING * self.scale, 0.014 * self.scale)
+        self._balls = [add_body(ball, MARKER, self.client) for _ in range(n_targets)]
+        self._rings = [add_mesh(rings, MARKER, self.client) for _ in range(n_targets)]
         self._discs: list[Overlay] = []
         self._shadows = np.zeros((0, 3))
 
@@ -72,11 +63,10 @@ class Scene:
         for pose, vehicle in zip(poses, self._vehicles, strict=True):
             vehicle.place(pose)
             self._discs += vehicle.discs(pose)
-        for target, (ball, *rings) in zip(targets, self._targets, strict=True):
+        for target, ball, rings in zip(targets, self._balls, self._rings, strict=True):
             hidden = (np.linalg.norm(positions - target, axis=1) < 0.7 * self.scale).any()  # where it would hide a vehicle
             move_body(ball, NOWHERE if hidden else target.tolist(), LEVEL, self.client)
-            for ring, turned in zip(rings, UPRIGHT, strict=True):
-                move_body(ring, target.tolist(), turned, self.client)
+            move_body(rings, target.tolist(), LEVEL, self.client)
         shadows = [[*positions[-1, :2], self.span]]  # all of them would blacken the ground
         self._shadows = np.array(shadows + [[*target[:2], RING * self.scale] for target in targets])
 
@@ -112,14 +102,13 @@ class _VehicleBodies:
             move_body(body, position, (x, y, z, w), self.client)
         for body, centre, angle in zip(self.rotors, self.centres.tolist(), pose.rotor_angles.tolist(), strict=True):
             turned = p.getQuaternionFromEuler((0.0, 0.0, angle))
-            move_body(body, *p.multiplyTransforms(position, (x, y, z, w), centre, turned), self.client)
+            at, attitude = p.multiplyTransforms(position, (x, y, z, w), centre, turned)
+            move_body(body, at, attitude, self.client)
         rotation = QuadcopterState(pose.state[:, None]).rotation[0]
         for body, (in_world, in_body) in zip((self.force, self.torque), pose.wrench.reshape(2, 2, 3), strict=True):
-            vector = in_world + rotation @ in_body
-            away = float(np.linalg.norm(vector))
-            x, y, z = (vector / max(away, 1e-12)).tolist()
-            from_z = p.getQuaternionFromEuler((0.0, math.acos(z), math.atan2(y, x)))
-            move_body(body, position if away else NOWHERE, from_z, self.client)
+            x, y, z = (in_world + rotation @ in_body).tolist()
+            along = p.getQuaternionFromEuler((0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)))
+            move_body(body, position if any((x, y, z)) else NOWHERE, along, self.client)
 
     def discs(self, pose: Pose) -> list[Overlay]:
         """The discs in which its rotors turn."""

@@ -10,9 +10,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.runs import RunFolder, find_run, latest_checkpoint
 
-# Of the settings of an environment, those that a flight to be shown can have.
-KEYWORDS = ("task", "task_kwargs", "vehicle", "noise", "observation_std", "max_episode_steps")
-
 
 @dataclass(frozen=True)
 class Agent:
@@ -28,27 +25,30 @@ class Agent:
     env_kwargs: dict[str, Any]
 
 
-def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int = "result") -> Agent:
+def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None) -> Agent:
     """The agent of a run.
 
     :param exp_id: number of the run; 0: the latest.
-    :param which: ``result`` (trimmed, else best, else last), ``best``, ``last checkpoint``, or the number of transitions of a
-        checkpoint.
+    :param which: ``best``, ``last checkpoint``, or the timesteps of a checkpoint; None: trimmed, else best, else last.
     :raises ConfigError: no such run or file, or one whose environment cannot be shown.
     """
     run = find_run(log_folder, algo, env_id, exp_id)
-    path = _path(run, which)
+    if isinstance(which, int):
+        path = run.checkpoint(which)
+    elif which == "last checkpoint":
+        path = latest_checkpoint(run)
+    else:
+        path = run.best_model if which == "best" else run.result
     if not path.is_file():
-        raise ConfigError(
-            f"{path}: no such file; the run holds {', '.join(sorted(each.name for each in run.path.glob('*.zip')))}"
-        )
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
     return Agent(f"{algo} {run.path.name}", path, _env_kwargs(run))
 
 
 def _env_kwargs(run: RunFolder) -> dict[str, Any]:
-    """What the run's agent is to be flown with.
+    """What the run's agent was judged with.
 
-    :raises ConfigError: settings that cannot be read, or that put more around the environment than a flight to be shown has.
+    :raises ConfigError: settings that cannot be read, or a wrapper around the environment that flights to be shown lack.
     """
     settings, arguments = run.read_yaml()
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
@@ -58,18 +58,3 @@ def _env_kwargs(run: RunFolder) -> dict[str, Any]:
         return parse_mapping(arguments["env_kwargs"], f"{run.arguments}: env_kwargs")
     given = [parse_mapping(settings.get(key), f"{run.config}: {key}") for key in ("env_kwargs", "eval_env_kwargs")]
     return {**given[0], **given[1]}
-
-
-def check_keywords(env_kwargs: dict[str, Any]) -> None:
-    """:raises ConfigError: a setting that a flight to be shown cannot have."""
-    for key in env_kwargs:
-        if key not in KEYWORDS:
-            raise ConfigError(f"env_kwargs {key}: enjoy can set {', '.join(KEYWORDS)}")
-
-
-def _path(run: RunFolder, which: str | int) -> Path:
-    if isinstance(which, int):
-        return run.checkpoint(which)
-    if which == "last checkpoint":
-        return latest_checkpoint(run)
-    return run.best_model if which == "best" else run.result

@@ -17,11 +17,13 @@ from sb3_quad.scenarios.draw import DrawnWrench, draw_episodes, wrench_changes
 from sb3_quad.scenarios.load import explain, load_suite
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.scenarios.scenario import Scenario
-from sb3_quad.show.agents import check_keywords
 from sb3_quad.show.recording import Recording, record
 from sb3_quad.simulation.checks import vector
 from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+
+# Of the keywords of an environment, those that a flight to be shown can have.
+KEYWORDS = ("task", "task_kwargs", "vehicle", "noise", "observation_std", "max_episode_steps")
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +50,9 @@ class Setting:
         :raises ConfigError: an unknown keyword, task or vehicle, a target that is none.
         """
         given = dict(keywords)
-        check_keywords(given)
+        for key in given:
+            if key not in KEYWORDS:
+                raise ConfigError(f"env_kwargs {key}: enjoy can set {', '.join(KEYWORDS)}")
         n_steps = given.pop("max_episode_steps", MAX_EPISODE_STEPS)
         if isinstance(n_steps, bool) or not isinstance(n_steps, int) or n_steps < 1:
             raise ConfigError(f"max_episode_steps {n_steps!r}: must be a whole number of at least 1")
@@ -132,21 +136,17 @@ def fly_all(
     number = 0
     while left > 0 and (number == 0 or n_timesteps is not None):
         steps = min(left, setting.n_steps)
-        episode = [
-            _fly(setting, name if n_envs == 1 else f"seed {each}, {name}", controller, each, steps, deterministic)
-            for name, controller in controllers.items()
-            for each in range(seed + number, seed + number + n_envs)
-        ]
+        episode = []
+        for name, controller in controllers.items():
+            for each in range(seed + number, seed + number + n_envs):
+                label = name if n_envs == 1 else f"seed {each}, {name}"
+                try:
+                    episode.append(setting.fly(label, controller, each, steps, deterministic))
+                except ControllerError as error:
+                    raise ControllerError(f"controller {label}: {error}") from error
         yield episode
         left -= max(len(recording.times) - 1 for recording in episode)
         number += n_envs
-
-
-def _fly(setting: Setting, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:
-    try:
-        return setting.fly(name, controller, seed, n_steps, deterministic)
-    except ControllerError as error:
-        raise ControllerError(f"controller {name}: {error}") from error
 
 
 def _target(target: Sequence[float], vehicle: Vehicle) -> npt.NDArray[np.float64]:

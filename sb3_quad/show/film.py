@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray, Image
-from sb3_quad.drawing.camera import broadside, following_cameras, framing_camera
+from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
 from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.palette import colours_of, rgb
 from sb3_quad.drawing.picture import Overlay
@@ -23,36 +23,29 @@ SMALL = 0.2  # a vehicle whose breadth is less of the picture's height is shown 
 CLOSE_UP, GAP = 0.34, 8  # side of that picture, of the panel's; its distance from the edges, pixels
 
 
-class Film:
-    """Frames of several flights side by side, which start together and are seen from one direction.
-
-    :param recordings: one for each panel.
-    :param width: of a panel, pixels; ``height`` likewise, its header not counted.
-    :param speed: of time in the film; 0.5 is slow motion.
-    """
-
-    def __init__(self, recordings: Sequence[Recording], width: int, height: int, speed: float = 1.0) -> None:
-        times = frame_times(recordings, speed)
-        forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-        colours = colours_of([recording.name for recording in recordings])
-        self._panels = [_Panel(each, times, forward, colours[each.name], width, height) for each in recordings]
-        self.n_frames = len(times)
-
-    def frames(self) -> Iterator[Image]:
-        """Its frames, uint8 (height, width, 3), all of one size, FPS of them a second."""
-        for number in range(self.n_frames):
-            yield side_by_side([panel.picture(number) for panel in self._panels], PANELS_ABREAST)
-
-    def close(self) -> None:
-        """Give the simulations back; calling it twice is fine."""
-        for panel in self._panels:
-            panel.scene.close()
-
-
 def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
     """The times of flight, s, that the frames of a film of several flights show."""
     last = max(float(recording.times[-1]) for recording in recordings)
     return np.minimum(np.arange(round((last / speed + HOLD) * FPS) + 1) * speed / FPS, last)
+
+
+def film_frames(recordings: Sequence[Recording], width: int, height: int, speed: float = 1.0) -> Iterator[Image]:
+    """The frames of a film, FPS of them a second, uint8 (height, width, 3), all of one size.
+
+    :param recordings: one for each panel; they start together and are seen from one direction.
+    :param width: of a panel, pixels; ``height`` likewise, its header not counted.
+    :param speed: of time in the film; 0.5 is slow motion.
+    """
+    times = frame_times(recordings, speed)
+    forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
+    colours = colours_of([recording.name for recording in recordings])
+    panels = [_Panel(each, times, forward, colours[each.name], width, height) for each in recordings]
+    try:
+        for number in range(len(times)):
+            yield side_by_side([panel.picture(number) for panel in panels], PANELS_ABREAST)
+    finally:
+        for panel in panels:
+            panel.scene.close()
 
 
 class _Panel:
@@ -68,43 +61,39 @@ class _Panel:
         seen = [recording.vehicle_and_target(step) for step in self.steps]
         frame_seconds = max(float(times[1] - times[0]), 1e-3)
         self.cameras = following_cameras(seen, frame_seconds, MARGIN * self.scene.scale, width / height, forward)
-        self.left, self.top = self._free_corner(seen)
-        self.shown = -1, np.zeros((0, 0, 3), dtype=np.uint8)
+        self.corner = self._free_corner(seen)
+        self.shown: tuple[object, Image] | None = None
 
     def picture(self, number: int) -> Image:
         """Frame ``number`` of this flight."""
-        before = self.shown[0]
-        if before >= 0 and self._stands(before, number):
-            return self.shown[1]
-        recording, step, camera = self.recording, self.steps[number], self.cameras[number]
-        self.scene.place([recording.pose(step)], recording.state[None, TARGET, step])
-        trail = Overlay(recording.path[: step + 1 : 2], rgb(self.colour), 0.75, width=0.03 * self.scene.scale)
-        pixels = self.scene.picture(camera, self.width, self.height, [trail])
-        position = recording.path[step]
-        if self.scene.span < SMALL * float((position - camera.eye) @ camera.axes[0]) * camera.slope:
-            near = framing_camera(position[None], 1.15 * self.scene.span, 1.0, self.forward)
-            left, top, side = self.left, self.top, self.side
-            pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
-            pixels[top : top + side, left : left + side] = self.scene.picture(near, side, side, [trail])
-        font_size = max(12, round(self.height / 26))
-        self.shown = number, with_header(pixels, recording.name, [self._caption(step)], self.colour, font_size)
+        step, camera = self.steps[number], self.cameras[number]
+        key = step, camera.eye.round(3).tolist()
+        if self.shown is None or self.shown[0] != key:
+            lines = [self._caption(step)]
+            font_size = max(12, round(self.height / 26))
+            self.shown = key, with_header(self._draw(step, camera), self.recording.name, lines, self.colour, font_size)
         return self.shown[1]
 
-    def _stands(self, before: int, number: int) -> bool:
-        """Whether nothing moves between two frames: the flight is over, and the camera rests."""
-        over = self.steps[before] == self.steps[number] == len(self.recording.times) - 1
-        return over and float(np.abs(self.cameras[number].eye - self.cameras[before].eye).max()) < 1e-3
+    def _draw(self, step: int, camera: Camera) -> Image:
+        recording, scene, side = self.recording, self.scene, self.side
+        scene.place([recording.pose(step)], recording.state[None, TARGET, step])
+        trail = Overlay(recording.path[: step + 1 : 2], rgb(self.colour), 0.75, width=0.03 * scene.scale)
+        pixels = scene.picture(camera, self.width, self.height, [trail])
+        position = recording.path[step]
+        if scene.span < SMALL * float((position - camera.eye) @ camera.axes[0]) * camera.slope:
+            near = framing_camera(position[None], 1.15 * scene.span, 1.0, self.forward)
+            left, top = self.corner
+            pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
+            pixels[top : top + side, left : left + side] = scene.picture(near, side, side, [trail])
+        return pixels
 
     def _free_corner(self, seen: Sequence[FloatArray]) -> tuple[int, int]:
         """Left and top of the close-up, in the corner in which vehicle and target are seen least."""
-        places = zip(self.cameras, seen, strict=True)
-        spots = np.concatenate([camera.project(points, self.width, self.height)[:, :2] for camera, points in places])
-        right, bottom = self.width - self.side - GAP, self.height - self.side - GAP
-
-        def hidden(corner: tuple[int, int]) -> int:
-            return int(((spots > np.array(corner) - GAP) & (spots < np.array(corner) + self.side + GAP)).all(axis=1).sum())
-
-        return min([(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)], key=hidden)
+        pairs = zip(self.cameras, seen, strict=True)
+        spots = np.concatenate([camera.project(points, self.width, self.height)[:, :2] for camera, points in pairs])
+        right, bottom, half = self.width - self.side - GAP, self.height - self.side - GAP, self.side / 2
+        corners = [(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)]
+        return min(corners, key=lambda corner: int((np.abs(spots - corner - half) < half + GAP).all(axis=1).sum()))
 
     def _caption(self, step: int) -> str:
         recording = self.recording

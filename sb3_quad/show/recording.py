@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose
 from sb3_quad.evaluation.fleets import PyBulletFleet
@@ -101,27 +100,24 @@ def record(
     controller: Any,
     seed: int,
     n_steps: int,
-    task: Any = "target_tracking",
-    task_kwargs: Mapping[str, Any] | None = None,
-    vehicle: str | Vehicle = "itm",
-    noise: float = 0.05,
-    observation_std: npt.ArrayLike | None = None,
     plan: Plan | None = None,
     deterministic: bool = True,
+    **keywords: Any,
 ) -> Recording:
     """Fly one episode on PyBullet and write it all down.
 
-    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`, as are ``task``, ``task_kwargs``, ``vehicle``,
-        ``noise`` and ``observation_std``.
+    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param n_steps: control steps of an episode that nothing ends before.
     :param plan: what happens whoever flies; of one episode.
     :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
+    :param keywords: ``task``, ``task_kwargs``, ``vehicle``, ``noise`` and ``observation_std``, as of the environment.
     :raises ConfigError: a controller that cannot be asked, keywords that the environment refuses.
     :raises ControllerError: a controller that fails in flight.
     """
+    own = {"task": "target_tracking", "task_kwargs": None, "vehicle": "itm", "noise": 0.05, **keywords}
     pilot = controller if deterministic or not hasattr(controller, "predict") else _Sampling(controller)
     recorder = _EveryStep()
-    fleet = PyBulletFleet([seed], task, task_kwargs, vehicle, noise, n_steps, observation_std)
+    fleet = PyBulletFleet([seed], max_steps=n_steps, **own)
     try:
         flights = fly_fleet(fleet, pilot, plan or Plan(), n_steps, (), recorder)
     finally:
@@ -129,11 +125,11 @@ def record(
     lost = "" if flights.success[0] else "collision" if flights.collision[0] else "out of range"
     states, wrenches = np.stack(recorder.states, axis=1), np.stack(recorder.wrenches, axis=1)
     times = np.arange(states.shape[1], dtype=np.float64) * recorder.control_step
-    return Recording(name, load_vehicle(vehicle), times, states, wrenches, float(flights.reward[0]), lost)
+    return Recording(name, load_vehicle(own["vehicle"]), times, states, wrenches, float(flights.reward[0]), lost)
 
 
 class _Sampling:
-    """A policy whose actions are samples, not their mean."""
+    """A policy whose actions are drawn, not their mean."""
 
     def __init__(self, policy: Any) -> None:
         self._policy = policy
@@ -159,5 +155,7 @@ class _EveryStep(Recorder):
     def push(self, state: QuadcopterState, wrench: FloatArray) -> None:
         self.wrenches.append(wrench[0].copy())
 
-    def sample(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+    def sample(
+        self, step: int, state: QuadcopterState, actions: npt.NDArray[np.float32], flying: npt.NDArray[np.bool_]
+    ) -> None:
         self.states.append(state.array[:, 0].copy())

@@ -120,11 +120,13 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View, co
 
 
 def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
-    """The time of each pose and where it is written: at the first side of it that is inside the picture and free."""
+    """The time of each pose and where it is written: at the first place beside it that is inside the picture and free."""
     places, breadth = view.project(recording.path[list(steps)])
-    centres, halves = list(places), [np.full(2, 0.4 * each) for each in breadth]  # of what must not be hidden
-    steep = np.ptp(places[:, 1]) > np.ptp(places[:, 0])
-    sides = np.array([(-1, 0), (1, 0), (0, -1), (0, 1)] if steep else [(0, -1), (0, 1), (-1, 0), (1, 0)])
+    centres, halves = list(places), [np.full(2, 0.35 * each) for each in breadth]  # of what must not be hidden
+    # Left of a steep path, above a level one, else around the pose from there.
+    turns = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
+    angles = turns + (np.pi if np.ptp(places[:, 1]) > np.ptp(places[:, 0]) else -np.pi / 2)
+    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     tags = []
     for step, place, reach in zip(steps, places, 0.5 * breadth, strict=True):
         text = f"{recording.times[step]:.2f} s"
