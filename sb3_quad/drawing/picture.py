@@ -26,7 +26,7 @@ GROUND_DARK = np.array([0.50, 0.60, 0.46], dtype=np.float32)
 SQUARE = 2.0  # side of the ground's squares, m
 SHADOW = 0.45  # share of the light that a shadow takes
 VISIBILITY = 90.0  # distance at which 1/e of the ground is still seen through the haze, m
-THINNEST = 1.8  # width of a line at least, pixels
+THINNEST = 1.4  # width of a line at least, pixels
 
 
 class Overlay(NamedTuple):

@@ -13,16 +13,11 @@ from sb3_quad.training.runs import RunFolder, find_run, latest_checkpoint
 
 @dataclass(frozen=True)
 class Agent:
-    """A trained agent.
+    """A trained agent."""
 
-    :param label: heads its picture.
-    :param path: of its zip.
-    :param env_kwargs: the settings of the environment it was judged in.
-    """
-
-    label: str
-    path: Path
-    env_kwargs: dict[str, Any]
+    label: str  # heads its picture
+    path: Path  # of its zip
+    env_kwargs: dict[str, Any]  # the settings of the environment it was judged in
 
 
 def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None) -> Agent:

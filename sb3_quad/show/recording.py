@@ -21,27 +21,15 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A flight of T control steps.
-
-    ==========  ====================  =========================================================================
-    name        shape                 meaning
-    ==========  ====================  =========================================================================
-    times       (T + 1,)              s since the start
-    state       (STATE_SIZE, T + 1)   the true state, laid out as in :mod:`sb3_quad.simulation.state`
-    wrench      (12, T + 1)           that acted during the step before: force in the world and in the body
-                                      frame (N), torques likewise (N m)
-    reward                            sum of the rewards
-    lost                              how it was lost: ``collision``, ``out of range``, or empty
-    ==========  ====================  =========================================================================
-    """
+    """A flight of T control steps."""
 
     name: str
     vehicle: Vehicle
-    times: FloatArray
-    state: FloatArray
-    wrench: FloatArray
-    reward: float
-    lost: str
+    times: FloatArray  # (T + 1,), s since the start
+    state: FloatArray  # (STATE_SIZE, T + 1), the true state, laid out as in sb3_quad.simulation.state
+    wrench: FloatArray  # (12, T + 1), of the step before: force in the world and in the body frame, N; torques likewise, N m
+    reward: float  # sum of the rewards
+    lost: str  # how it was lost: "collision", "out of range", or empty
 
     @property
     def error(self) -> FloatArray:
