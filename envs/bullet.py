@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.bullet import p
-from sb3_quad.drawing.client import has_display, load_urdf_text, open_window
-from sb3_quad.drawing.urdf import vehicle_urdf
+from sb3_quad.drawing.window import has_display, open_window
 from sb3_quad.simulation.engine.rotors import write_body
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -29,11 +28,10 @@ class BulletBody:
     :param vehicle: mass, inertia, gravity, collision radius and physics step.
     :param window: width and height in pixels of PyBullet's window, of which it allows one per process; None: no window.
         Without a display there is none either, and a line on stderr says so.
-    :param visuals: load the body's looks, too; only needed for pictures.
     :raises ConfigError: the window cannot be opened.
     """
 
-    def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None, visuals: bool = False) -> None:
+    def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
         self.has_window = window is not None and has_display()
         if window is not None and not self.has_window:
             print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
@@ -42,9 +40,10 @@ class BulletBody:
         self._close = weakref.finalize(self, _disconnect, self.client)
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
         p.setPhysicsEngineParameter(fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client)
-        flags = p.URDF_USE_INERTIA_FROM_FILE | (0 if visuals else p.URDF_IGNORE_VISUAL_SHAPES)
-        self.body = load_urdf_text(vehicle_urdf(vehicle), self.client, flags=flags)
-        p.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        ball = p.createCollisionShape(p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client)
+        self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=self.client)
+        inertia = {"localInertiaDiagonal": vehicle.inertia, "linearDamping": 0.0, "angularDamping": 0.0}
+        p.changeDynamics(self.body, -1, **inertia, physicsClientId=self.client)
         p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=self.client)
 
     @property

@@ -173,8 +173,7 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
         self._open()
 
     def _open(self) -> None:
-        window = self._size if self.render_mode == "human" else None
-        self._body = BulletBody(self.vehicle, window, visuals=self.render_mode == "rgb_array")
+        self._body = BulletBody(self.vehicle, self._size if self.render_mode == "human" else None)
         self._renderer = None
         if self._body.has_window or self.render_mode == "rgb_array":
             self._renderer = Renderer(self.vehicle, self._body, *self._size)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import xml.etree.ElementTree as ElementTree
 from typing import Any
 
 import gymnasium
@@ -10,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.drawing import meshes
-from sb3_quad.drawing.urdf import frame_urdfs, rotor_urdf, vehicle_urdf
+from sb3_quad.drawing import models
+from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -125,34 +125,41 @@ def test_bad_size_is_refused(size: Any) -> None:
         QuadcopterEnv(render_mode="rgb_array", render_width=size)
 
 
-def test_urdf_is_one_rigid_body_with_the_vehicle_numbers() -> None:
+def test_the_body_has_the_numbers_of_the_vehicle() -> None:
     vehicle = load_vehicle("itm")
-    root = ElementTree.fromstring(vehicle_urdf(vehicle))
-    assert len(root.findall("link")) == 1 and not root.findall("joint")
-    assert float(root.find("link/inertial/mass").get("value")) == vehicle.mass  # type: ignore[union-attr, arg-type]
-    inertia = root.find("link/inertial/inertia")
-    assert inertia is not None
-    assert tuple(float(inertia.get(key, "nan")) for key in ("ixx", "iyy", "izz")) == vehicle.inertia
-    assert len(root.findall("link/visual")) >= 10
-    for urdf in (*frame_urdfs(vehicle), *(rotor_urdf(vehicle, rotor) for rotor in range(4))):
-        assert float(ElementTree.fromstring(urdf).find("link/inertial/mass").get("value")) == 0.0  # type: ignore[union-attr, arg-type]
+    body = BulletBody(vehicle)
+    mass, _, inertia, *at = p.getDynamicsInfo(body.body, -1, physicsClientId=body.client)[:5]
+    assert mass == vehicle.mass and tuple(inertia) == vehicle.inertia
+    assert at == [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]
+    assert p.getNumBodies(physicsClientId=body.client) == 1 and p.getNumJoints(body.body, physicsClientId=body.client) == 0
+    body.close()
 
 
-def test_urdf_survives_any_name() -> None:
-    vehicle = load_vehicle("itm").model_copy(update={"name": '<"&> ü'})
-    ElementTree.fromstring(vehicle_urdf(vehicle))
-    QuadcopterEnv(vehicle=vehicle).close()
+def test_what_is_only_drawn_has_no_mass_and_touches_nothing(env: QuadcopterEnv) -> None:
+    client = env._body.client
+    drawn = [p.getBodyUniqueId(k, physicsClientId=client) for k in range(p.getNumBodies(physicsClientId=client))]
+    drawn.remove(env._body.body)
+    assert len(drawn) >= 10
+    for body in drawn:
+        assert p.getDynamicsInfo(body, -1, physicsClientId=client)[0] == 0.0
+        assert not p.getCollisionShapeData(body, -1, physicsClientId=client)
 
 
-@pytest.mark.parametrize("mesh", [meshes.arrow(0.5, 0.01), meshes.ring(0.4, 0.02)], ids=["arrow", "ring"])
-def test_meshes_are_closed_and_face_outwards(mesh: Any) -> None:
+def test_any_name_of_a_vehicle_will_do() -> None:
+    QuadcopterEnv(vehicle=load_vehicle("itm").model_copy(update={"name": '<"&> ü'})).close()
+
+
+@pytest.mark.parametrize(
+    ("mesh", "expected"),
+    [
+        (models.arrow(0.5, 0.01), np.pi * 0.01**2 * 0.36 + np.pi * 0.024**2 * 0.14 / 3),
+        (models.rings(0.4, 0.02), 2 * 2 * np.pi**2 * 0.4 * 0.02**2),
+    ],
+    ids=["arrow", "rings"],
+)
+def test_meshes_are_closed_and_face_outwards(mesh: Any, expected: float) -> None:
     """The volume by the divergence theorem is that of the solid, so that no triangle is missing or turned inside out."""
     points, triangles = np.array(mesh["vertices"]), np.array(mesh["indices"]).reshape(-1, 3)
     a, b, c = points[triangles].transpose(1, 0, 2)
     volume = np.einsum("ij,ij->", a, np.cross(b, c)) / 6
-    neck, head = 0.72 * 0.5, 0.28 * 0.5
-    arrow = np.pi * 0.01**2 * neck + np.pi * 0.024**2 * head / 3
-    ring = 2 * np.pi**2 * 0.4 * 0.02**2
-    expected = arrow if np.ptp(points[:, 2]) > 0.3 else ring
     assert 0.85 * expected < volume < 1.01 * expected
-    np.testing.assert_allclose(np.linalg.norm(mesh["normals"], axis=1), 1.0, atol=1e-9)

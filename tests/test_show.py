@@ -17,18 +17,16 @@ from PIL import Image
 
 from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
-from sb3_quad.drawing import framing
-from sb3_quad.drawing.backdrop import Camera
+from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
 from sb3_quad.drawing.labels import header_height, side_by_side, with_header
-from sb3_quad.drawing.lines import draw_line, project
-from sb3_quad.drawing.scenery import SUPERSAMPLING, Picture
+from sb3_quad.drawing.picture import Overlay, draw_overlays
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.settings.config import load_config
 from sb3_quad.show import sequence
 from sb3_quad.show.episodes import Setting, fly_all, scenario_setting
-from sb3_quad.show.film import FPS, HOLD, Film
+from sb3_quad.show.film import FPS, HOLD, film_frames, frame_times
 from sb3_quad.show.recording import record
 from sb3_quad.show.video import write_video
 from sb3_quad.simulation.state import POSITION, TARGET
@@ -106,18 +104,20 @@ def looking_along_x():
 
 
 def test_points_are_seen_where_they_are():
-    columns, rows, depth = project(looking_along_x(), np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]]), 80, 40).T
+    columns, rows, depth = looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]]), 80, 40).T
     np.testing.assert_allclose(columns, [40, 60, 40, 40])
     np.testing.assert_allclose(rows, [20, 20, 0, 20])
     np.testing.assert_allclose(depth, [4, 4, 4, 2])
 
 
 @pytest.mark.parametrize(("distance", "seen"), [(3.0, True), (8.0, False), (-3.0, False)])
-def test_lines_are_hidden_by_what_is_before_them(distance, seen):
-    picture = Picture(np.zeros((40, 80, 3), np.uint8), np.full((40 * SUPERSAMPLING, 80 * SUPERSAMPLING), 5.0, np.float32))
-    points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0]])
-    draw_line(picture, looking_along_x(), points, (1.0, 0.0, 0.0), 0.1)
-    assert (picture.pixels[:, :, 0] > 200).any() == seen and not picture.pixels[:, :, 1:].any()
+@pytest.mark.parametrize("width", [0.1, None])
+def test_lines_and_discs_are_hidden_by_what_is_before_them(distance, seen, width):
+    points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0], [distance, 0.0, 0.5]])
+    overlay = Overlay(points, (1.0, 0.0, 0.0), 0.8, width)
+    drawn = np.asarray(draw_overlays([overlay], looking_along_x(), np.full((40, 80), 5.0, np.float32)))
+    assert (drawn[..., 3] > 200).any() == (drawn[..., 3] > 0).any() == seen
+    assert (drawn[drawn[..., 3] > 0, :3] == (255, 0, 0)).all()
 
 
 coordinates = st.floats(-20, 20, allow_nan=False)
@@ -128,7 +128,7 @@ clouds = st.lists(st.tuples(coordinates, coordinates, st.floats(10, 40)), min_si
 @settings(max_examples=50)
 def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(points, aspect, course):
     ahead = np.array([np.cos(course), np.sin(course), 0.0])
-    camera = framing.framing_camera(points, 1.0, aspect, ahead)
+    camera = framing_camera(points, 1.0, aspect, ahead)
     forward, right, up = ((points - camera.eye) @ camera.axes.T).T
     filled = np.stack([(np.abs(right) + 1.0) / (camera.slope * aspect), (np.abs(up) + 1.0) / camera.slope]) / forward
     assert filled.max() == pytest.approx(1.0, abs=1e-6)
@@ -136,9 +136,9 @@ def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(poi
 
 def test_a_following_camera_never_loses_what_it_follows(fall):
     points = [fall.state[:, step][np.array([[0, 1, 2], [17, 18, 19]])] for step in range(0, len(fall.times), 4)]
-    cameras = framing.following_cameras(points, 0.04, 0.9, 1.0, np.array([0.0, 1.0, 0.0]))
+    cameras = following_cameras(points, 0.04, 0.9, 1.0, np.array([0.0, 1.0, 0.0]))
     for camera, each in zip(cameras, points, strict=True):
-        columns, rows, _ = project(camera, each, 100, 100).T
+        columns, rows, _ = camera.project(each, 100, 100).T
         assert ((columns > 0) & (columns < 100) & (rows > 0) & (rows < 100)).all()
     eyes = np.array([camera.eye for camera in cameras])
     assert np.abs(np.diff(eyes, n=2, axis=0)).max() < 0.6  # m per frame²: no jolts
@@ -146,34 +146,37 @@ def test_a_following_camera_never_loses_what_it_follows(fall):
 
 def test_broadside_looks_across_the_motion():
     line = np.outer(np.linspace(0, 5, 20), [3.0, 4.0, 1.0])
-    assert abs(framing.broadside(line) @ [0.6, 0.8, 0.0]) < 1e-6
+    assert abs(broadside(line) @ [0.6, 0.8, 0.0]) < 1e-6
 
 
 def test_sheets_suit_video_codecs():
     panels = [np.zeros((31, 41, 3), np.uint8)] * 4
     sheet = side_by_side(panels, columns=3)
     assert sheet.shape[0] % 2 == sheet.shape[1] % 2 == 0 and sheet.shape[0] >= 62 and sheet.shape[1] >= 123
-    assert with_header(panels[0], "pid", ["a", "b"], (1, 2, 3), 10).shape == (31 + header_height(2, 10), 41, 3)
+    assert with_header(panels[0], "pid", ["a", "b"], "#010203", 10).shape == (31 + header_height(2, 10), 41, 3)
 
 
 def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
-    film = Film([fall, hit], 64, 48, speed=0.5)
-    assert film.n_frames == round((fall.times[-1] / 0.5 + HOLD) * FPS) + 1
-    frames = film.frames()
+    times = frame_times([fall, hit], 0.5)
+    assert len(times) == round((fall.times[-1] / 0.5 + HOLD) * FPS) + 1
+    assert times[0] == 0.0 and times[-1] == fall.times[-1] and np.diff(times).max() == pytest.approx(0.5 / FPS)
+    frames = film_frames([fall, hit], 64, 48, 0.5)
     some = [next(frames) for _ in range(6)]
-    film.close()
-    film.close()
+    frames.close()
     assert all(frame.shape == some[0].shape and frame.dtype == np.uint8 for frame in some)
     assert not np.array_equal(some[0], some[5])
+    whole = list(film_frames([hit], 64, 48))
+    assert len(whole) == len(frame_times([hit], 1.0))
+    assert np.abs(whole[-1].astype(int) - whole[-FPS // 4]).mean() < 1.0
 
 
 def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
-    view = sequence._view([fall, hit], [len(fall.times) - 1, 60], 300, 400)
+    view = sequence._view([fall, hit], [len(fall.times) - 1, 60], (300, 400))
     poses = sequence._apart(fall, len(fall.times) - 1, view)
     assert poses[0] == 0 and poses[-1] == len(fall.times) - 1 and len(poses) > 4
-    screen = view.project(fall.path[poses])
-    gaps = np.linalg.norm(screen[:, None, :2] - screen[None, :, :2], axis=2)[np.triu_indices(len(poses), 1)]
-    assert gaps.min() > 0.7 * view.pixels(screen[:, 2]).min()
+    places, breadth = view.project(fall.path[poses])
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(len(poses), 1)]
+    assert gaps.min() > 0.7 * breadth.min()
     assert hit.pushes[0] in sequence._apart(hit, 60, view)
     picture = sequence.sequence([fall, hit], times=[0.0, 0.5], size=(120, 100))
     assert picture.shape[0] > 100 and picture.shape[1] >= 240 and picture.std() > 20
@@ -208,7 +211,7 @@ def test_an_interrupted_video_leaves_what_was_there(tmp_path):
 def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["enjoy", "pid", "--record", str(tmp_path / "film.mp4")]) == 2
-    assert "pip install sb3_quad[video]" in capsys.readouterr().err
+    assert "sb3_quad[video]" in capsys.readouterr().err
 
 
 def test_the_command_draws_and_tells(tmp_path, capsys):
@@ -378,4 +381,4 @@ def test_record_video_names_what_is_wrong(arguments, message, capsys, monkeypatc
 def test_record_video_names_the_packages_it_misses(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["record-video", "-i", "agent.zip"]) == 2
-    assert "pip install sb3_quad[video]" in capsys.readouterr().err
+    assert "sb3_quad[video]" in capsys.readouterr().err

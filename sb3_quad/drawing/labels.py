@@ -6,15 +6,15 @@ from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
+import matplotlib
 import numpy as np
-import numpy.typing as npt
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image as Pillow
+from PIL import ImageDraw, ImageFont
 
-Colour = tuple[int, int, int]
-Box = tuple[float, float, float, float]  # left, top, right, bottom, pixels
+from sb3_quad.base.arrays import Image
 
-INK: Colour = (24, 32, 44)
-PAPER: Colour = (255, 255, 255)
+INK = (24, 32, 44)
+PLATE = (255, 255, 255, 205)
 STEP = 1.3  # between lines of text, in font sizes
 SMALLER = 0.88  # font size of what stands below a heading
 
@@ -22,70 +22,43 @@ SMALLER = 0.88  # font size of what stands below a heading
 @cache
 def font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
     """DejaVu Sans, ``size`` in pixels."""
-    import matplotlib
-
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path(), "fonts", "ttf", name)), size)
 
 
-class Canvas:
-    """A picture to write on.
-
-    :param pixels: uint8 (height, width, 3); is not changed.
-    """
-
-    def __init__(self, pixels: npt.NDArray[np.uint8]) -> None:
-        self.image = Image.fromarray(pixels)
-        self.draw = ImageDraw.Draw(self.image, "RGBA")
-
-    @property
-    def pixels(self) -> npt.NDArray[np.uint8]:
-        """The picture, uint8 (height, width, 3)."""
-        return np.asarray(self.image, dtype=np.uint8)
-
-    def tag(self, text: str, centre: tuple[float, float], size: int) -> Box:
-        """A small plate with ``text`` around ``centre``; the room it takes."""
-        box = tag_box(text, centre, size)
-        self.draw.rounded_rectangle(box, radius=0.3 * size, fill=(*PAPER, 205))
-        self.draw.text(centre, text, font=font(size), fill=INK, anchor="mm")
-        return box
-
-    def line(self, start: tuple[float, float], end: tuple[float, float], colour: Colour, width: int = 1) -> None:
-        """A straight line."""
-        self.draw.line((*start, *end), fill=(*colour, 190), width=width)
+def tag_size(text: str, size: int) -> tuple[float, float]:
+    """Width and height of a tag, pixels; ``size`` of the font."""
+    return font(size).getlength(text) + 0.7 * size, 1.5 * size
 
 
-def tag_box(text: str, centre: tuple[float, float], size: int) -> Box:
-    """The room that :meth:`Canvas.tag` takes."""
-    half = 0.5 * font(size).getlength(text) + 0.35 * size
-    return centre[0] - half, centre[1] - 0.75 * size, centre[0] + half, centre[1] + 0.75 * size
+def with_tags(pixels: Image, tags: Sequence[tuple[str, tuple[float, float]]], size: int) -> Image:
+    """A picture with small plates on it, each a text and its centre, column and row; ``size`` of the font."""
+    image = Pillow.fromarray(pixels)
+    draw = ImageDraw.Draw(image, "RGBA")
+    for text, (column, row) in tags:
+        width, height = tag_size(text, size)
+        box = (column - width / 2, row - height / 2, column + width / 2, row + height / 2)
+        draw.rounded_rectangle(box, radius=0.3 * size, fill=PLATE)
+        draw.text((column, row), text, font=font(size), fill=INK, anchor="mm")
+    return np.asarray(image)
 
 
-def overlap(one: Box, other: Box) -> float:
-    """The area that two boxes share, pixels."""
-    wide = min(one[2], other[2]) - max(one[0], other[0])
-    high = min(one[3], other[3]) - max(one[1], other[1])
-    return max(wide, 0.0) * max(high, 0.0)
+def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, size: int) -> Image:
+    """A picture with a white band above it: a bar in ``colour``, a bold heading, and lines below.
 
-
-def with_header(
-    pixels: npt.NDArray[np.uint8], heading: str, lines: Sequence[str], colour: Colour, size: int
-) -> npt.NDArray[np.uint8]:
-    """A picture with a white band above it: a bar in ``colour``, a bold heading, and lines below; ``size``: of the font.
-
+    :param colour: as ``#rrggbb``.
+    :param size: of the font, pixels.
     :return: uint8; as wide, and higher by :func:`header_height`.
     """
-    height, width = pixels.shape[:2]
-    band = header_height(len(lines), size)
-    image = np.full((band + height, width, 3), 255, dtype=np.uint8)
-    image[band:] = pixels
-    canvas = Canvas(image)
-    bar = 0.45 * size
-    canvas.draw.rectangle((0, 0, bar, band - 1), fill=(*colour, 255))
-    fonts = [font(size, bold=True), *(font(round(SMALLER * size)) for _ in lines)]
-    for number, (face, line) in enumerate(zip(fonts, [heading, *lines], strict=True)):
-        canvas.draw.text((bar + 0.7 * size, 0.35 * size + number * STEP * size), line, font=face, fill=INK)
-    return canvas.pixels
+    band, bar = header_height(len(lines), size), 0.45 * size
+    image = Pillow.new("RGB", (pixels.shape[1], band + pixels.shape[0]), "white")
+    image.paste(Pillow.fromarray(pixels), (0, band))
+    draw = ImageDraw.Draw(image)
+    draw.rectangle((0, 0, bar, band - 1), fill=colour)
+    for number, line in enumerate([heading, *lines]):
+        face = font(round(SMALLER * size)) if number else font(size, bold=True)
+        draw.text((bar + 0.7 * size, (0.35 + number * STEP) * size), line, font=face, fill=INK)
+    return np.asarray(image)
 
 
 def header_height(n_lines: int, size: int) -> int:
@@ -93,11 +66,10 @@ def header_height(n_lines: int, size: int) -> int:
     return round((0.7 + STEP * (1 + n_lines)) * size)
 
 
-def side_by_side(pictures: Sequence[npt.NDArray[np.uint8]], columns: int, gap: int = 4) -> npt.NDArray[np.uint8]:
+def side_by_side(pictures: Sequence[Image], columns: int, gap: int = 4) -> Image:
     """Pictures of one size in rows of ``columns``, on white; even in width and height, as video codecs ask for."""
     height, width = pictures[0].shape[:2]
-    rows = -(-len(pictures) // columns)
-    columns = min(columns, len(pictures))
+    rows, columns = -(-len(pictures) // columns), min(columns, len(pictures))
     high, wide = rows * (height + gap) - gap, columns * (width + gap) - gap
     sheet = np.full((high + high % 2, wide + wide % 2, 3), 255, dtype=np.uint8)
     for number, picture in enumerate(pictures):

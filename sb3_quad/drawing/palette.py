@@ -17,9 +17,3 @@ def rgb(colour: str) -> tuple[float, float, float]:
     """``#rrggbb`` as red, green and blue in [0, 1]."""
     red, green, blue = (int(colour[place : place + 2], 16) / 255 for place in (1, 3, 5))
     return red, green, blue
-
-
-def rgb255(colour: str) -> tuple[int, int, int]:
-    """``#rrggbb`` as red, green and blue from 0 to 255."""
-    red, green, blue = (round(255 * part) for part in rgb(colour))
-    return red, green, blue

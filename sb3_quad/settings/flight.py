@@ -29,6 +29,10 @@ class FlightSettings(Frozen):
         """Keywords of an environment."""
         return dict(self)
 
+    def given(self) -> dict[str, Any]:
+        """The keywords that are not left at their defaults."""
+        return {name: getattr(self, name) for name in self.model_fields if name in self.model_fields_set}
+
     def with_changes(self, **changes: Any) -> FlightSettings:
         """The same with some fields changed.
 

@@ -4,72 +4,40 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.settings.literals import parse_mapping
-from sb3_quad.training.runs import RunFolder, find_run, latest_checkpoint
-
-# Of the settings of an environment, those that a flight to be shown can have.
-KEYWORDS = ("task", "task_kwargs", "vehicle", "noise", "observation_std", "max_episode_steps")
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.training.runs import find_run
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A trained agent.
+    """A trained agent."""
 
-    :param label: heads its picture.
-    :param path: of its zip.
-    :param env_kwargs: the settings of the environment it was judged in.
-    """
-
-    label: str
-    path: Path
-    env_kwargs: dict[str, Any]
+    label: str  # heads its picture
+    path: Path  # of its zip
+    settings: FlightSettings  # that it was judged with
 
 
-def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int = "result") -> Agent:
+def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None) -> Agent:
     """The agent of a run.
 
     :param exp_id: number of the run; 0: the latest.
-    :param which: ``result`` (trimmed, else best, else last), ``best``, ``last checkpoint``, or the number of transitions of a
-        checkpoint.
-    :raises ConfigError: no such run or file, or one whose environment cannot be shown.
+    :param which: ``best``, ``last checkpoint``, or the timesteps of a checkpoint; None: trimmed, else best, else last.
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
     """
     run = find_run(log_folder, algo, env_id, exp_id)
-    path = _path(run, which)
+    if isinstance(which, int):
+        path = run.checkpoint(which)
+    elif which == "last checkpoint":
+        path = run.latest_checkpoint()
+    else:
+        path = run.best_model if which == "best" else run.result
     if not path.is_file():
-        raise ConfigError(
-            f"{path}: no such file; the run holds {', '.join(sorted(each.name for each in run.path.glob('*.zip')))}"
-        )
-    return Agent(f"{algo} {run.path.name}", path, _env_kwargs(run))
-
-
-def _env_kwargs(run: RunFolder) -> dict[str, Any]:
-    """What the run's agent is to be flown with.
-
-    :raises ConfigError: settings that cannot be read, or that put more around the environment than a flight to be shown has.
-    """
-    settings, arguments = run.read_yaml()
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
+    settings, _ = run.read_yaml()
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
         if settings.get(key):
             raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    if arguments.get("env_kwargs") is not None:
-        return parse_mapping(arguments["env_kwargs"], f"{run.arguments}: env_kwargs")
-    given = [parse_mapping(settings.get(key), f"{run.config}: {key}") for key in ("env_kwargs", "eval_env_kwargs")]
-    return {**given[0], **given[1]}
-
-
-def check_keywords(env_kwargs: dict[str, Any]) -> None:
-    """:raises ConfigError: a setting that a flight to be shown cannot have."""
-    for key in env_kwargs:
-        if key not in KEYWORDS:
-            raise ConfigError(f"env_kwargs {key}: enjoy can set {', '.join(KEYWORDS)}")
-
-
-def _path(run: RunFolder, which: str | int) -> Path:
-    if isinstance(which, int):
-        return run.checkpoint(which)
-    if which == "last checkpoint":
-        return latest_checkpoint(run)
-    return run.best_model if which == "best" else run.result
+    return Agent(f"{algo} {run.path.name}", path, run.flight_settings())

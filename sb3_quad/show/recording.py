@@ -2,45 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.drawing.models import rotor_turning
+from sb3_quad.drawing.scene import Pose
 from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
 from sb3_quad.experts.controller import observation_function
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.state import POSITION, TARGET, QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
-
-FloatArray = npt.NDArray[np.float64]
+from sb3_quad.vehicles.vehicle import Vehicle
 
 
 @dataclass(frozen=True, eq=False)
 class Recording:
-    """A flight of T control steps.
-
-    ==========  ====================  =========================================================================
-    name        shape                 meaning
-    ==========  ====================  =========================================================================
-    times       (T + 1,)              s since the start
-    state       (STATE_SIZE, T + 1)   the true state, laid out as in :mod:`sb3_quad.simulation.state`
-    wrench      (12, T + 1)           that acted during the step before: force in the world and in the body
-                                      frame (N), torques likewise (N m)
-    reward                            sum of the rewards
-    lost                              how it was lost: ``collision``, ``out of range``, or empty
-    ==========  ====================  =========================================================================
-    """
+    """A flight of T control steps."""
 
     name: str
     vehicle: Vehicle
-    times: FloatArray
-    state: FloatArray
-    wrench: FloatArray
-    reward: float
-    lost: str
+    times: FloatArray  # (T + 1,), s since the start
+    state: FloatArray  # (STATE_SIZE, T + 1), the true state, laid out as in sb3_quad.simulation.state
+    wrench: FloatArray  # (12, T + 1), of the step before: force in the world and in the body frame, N; torques likewise, N m
+    reward: float  # sum of the rewards
+    lost: str  # how it was lost: "collision", "out of range", or empty
 
     @property
     def error(self) -> FloatArray:
@@ -51,6 +39,16 @@ class Recording:
     def path(self) -> FloatArray:
         """r, (T + 1, 3), world frame, m."""
         return self.state[POSITION].T
+
+    @cached_property
+    def rotor_angles(self) -> FloatArray:
+        """How far the drawn rotors have turned, (4, T + 1), rad."""
+        return np.cumsum(rotor_turning(self.vehicle, self.state), axis=1) * self.vehicle.control_step
+
+    @property
+    def landmarks(self) -> FloatArray:
+        """The points by which a camera's direction is chosen, (n, 3), m."""
+        return np.concatenate([self.path[::5], self.targets])
 
     @property
     def targets(self) -> FloatArray:
@@ -71,6 +69,14 @@ class Recording:
         recent = self.wrench[:, first : step + 1]
         return np.asarray(recent[:, int(np.argmax(np.linalg.norm(recent, axis=0)))])
 
+    def vehicle_and_target(self, step: int) -> FloatArray:
+        """Where both are, (2, 3), world frame, m."""
+        return np.stack([self.state[POSITION, step], self.state[TARGET, step]])
+
+    def pose(self, step: int, seconds: float = 0.4) -> Pose:
+        """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
+        return Pose(self.state[:, step], self.wrench_around(step, seconds), self.rotor_angles[:, step])
+
     def at(self, seconds: float) -> int:
         """The index of the last state not later than ``seconds``."""
         return max(0, int(np.searchsorted(self.times, seconds + 1e-9, side="right")) - 1)
@@ -79,41 +85,26 @@ class Recording:
 def record(
     name: str,
     controller: Any,
+    settings: FlightSettings,
     seed: int,
-    n_steps: int,
-    task: Any = "target_tracking",
-    task_kwargs: Mapping[str, Any] | None = None,
-    vehicle: str | Vehicle = "itm",
-    noise: float = 0.05,
-    observation_std: npt.ArrayLike | None = None,
     plan: Plan | None = None,
     deterministic: bool = True,
 ) -> Recording:
     """Fly one episode on PyBullet and write it all down.
 
-    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`, as are ``task``, ``task_kwargs``, ``vehicle``,
-        ``noise`` and ``observation_std``.
-    :param n_steps: control steps of an episode that nothing ends before.
+    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param plan: what happens whoever flies; of one episode.
-    :param deterministic: whether a policy gives the mean of its actions, or a sample.
-    :raises ConfigError: a controller that cannot be asked, keywords that the environment refuses.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
+    :raises ConfigError: a controller that cannot be asked, settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight.
     """
-    pilot = controller if deterministic or not hasattr(controller, "predict") else observation_function(controller, False)
+    flown = controller if deterministic or not hasattr(controller, "predict") else observation_function(controller, False)
     recorder = _EveryStep()
-    settings = FlightSettings(
-        task=task,
-        task_kwargs=None if task_kwargs is None else dict(task_kwargs),
-        vehicle=vehicle,
-        noise=noise,
-        observation_std=observation_std,
-        max_episode_steps=n_steps,
-    )
-    flights = fly_settings(pilot, settings, [seed], "pybullet", (), [recorder], plan)
+    flights = fly_settings(flown, settings, [seed], "pybullet", (), [recorder], plan)
     lost = "" if flights.success[0] else "collision" if flights.collision[0] else "out of range"
     states, wrenches = np.stack(recorder.states, axis=1), np.stack(recorder.wrenches, axis=1)
-    times = np.arange(states.shape[1], dtype=np.float64) * recorder.control_step
-    return Recording(name, load_vehicle(vehicle), times, states, wrenches, float(flights.reward[0]), lost)
+    times = np.arange(states.shape[1], dtype=np.float64) * recorder.vehicle.control_step
+    return Recording(name, recorder.vehicle, times, states, wrenches, float(flights.reward[0]), lost)
 
 
 class _EveryStep(Hook):
@@ -124,7 +115,7 @@ class _EveryStep(Hook):
         self.wrenches: list[FloatArray] = [np.zeros(12)]
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        self.control_step = vehicle.control_step
+        self.vehicle = vehicle
         self.states.append(state.array[:, 0].copy())
 
     def before_step(self, state: QuadcopterState, observation: Any, wrench: FloatArray, flying: Any) -> None:

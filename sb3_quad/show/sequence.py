@@ -6,20 +6,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from sb3_quad.drawing.backdrop import Camera
-from sb3_quad.drawing.framing import FIELD_OF_VIEW, broadside, framing_camera
-from sb3_quad.drawing.labels import Box, Canvas, overlap, side_by_side, tag_box, with_header
-from sb3_quad.drawing.lines import project
-from sb3_quad.drawing.palette import colours_of, rgb, rgb255
-from sb3_quad.drawing.scenery import rotor_turning
-from sb3_quad.drawing.stage import Pose, Scene, Stage, Trail
-from sb3_quad.drawing.urdf import arm_length, rotor_radius
+from sb3_quad.base.arrays import BoolArray, FloatArray, Image
+from sb3_quad.drawing.camera import Camera, broadside, framing_camera
+from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_tags
+from sb3_quad.drawing.models import span
+from sb3_quad.drawing.palette import colours_of, rgb
+from sb3_quad.drawing.picture import Overlay
+from sb3_quad.drawing.scene import Scene
 from sb3_quad.show.recording import Recording
-
-FloatArray = npt.NDArray[np.float64]
-Picture = npt.NDArray[np.uint8]
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
@@ -38,17 +33,15 @@ class _View:
     size: float  # how much larger than life vehicles are drawn
     breadth: float  # of a drawn vehicle, m
 
-    def project(self, points: FloatArray) -> FloatArray:
-        return project(self.camera, points, self.width, self.height)
-
-    def pixels(self, depth: FloatArray | float) -> FloatArray:
-        """The breadth of a vehicle at a depth, pixels."""
-        return np.asarray(self.breadth * self.height / (2.0 * self.camera.slope * np.asarray(depth)))
+    def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where points, (n, 3), are in the picture, (n, 2), and how broad vehicles are there, (n,); pixels."""
+        screen = self.camera.project(points, self.width, self.height)
+        return screen[:, :2], self.breadth * self.height / (2.0 * self.camera.slope * screen[:, 2])
 
 
 def sequence(
     recordings: Sequence[Recording], times: Sequence[float] | None = None, size: tuple[int, int] | None = None
-) -> Picture:
+) -> Image:
     """One panel for each recording, all seen by the same camera.
 
     :param times: s, at which poses are drawn; None: as many as do not hide one another.
@@ -56,13 +49,12 @@ def sequence(
     :return: uint8 (height, about panels * width, 3).
     """
     ends = [_end(recording) if times is None else recording.at(max(times)) for recording in recordings]
-    width, height = size or _proportions(recordings, ends)
-    view = _view(recordings, ends, width, height)
+    view = _view(recordings, ends, size)
     colours = colours_of([recording.name for recording in recordings])
     panels = []
     for recording, end in zip(recordings, ends, strict=True):
-        chosen = _apart(recording, end, view) if times is None else _at(recording, times)
-        panels.append(_panel(recording, chosen, end, view, colours[recording.name]))
+        steps = _apart(recording, end, view) if times is None else sorted({recording.at(seconds) for seconds in times})
+        panels.append(_panel(recording, steps, end, view, colours[recording.name]))
     return side_by_side(panels, columns=len(panels))
 
 
@@ -72,95 +64,82 @@ def _end(recording: Recording) -> int:
     return min(int(away[-1]) + 1 if away.size else 0, len(recording.times) - 1)
 
 
-def _at(recording: Recording, times: Sequence[float]) -> list[int]:
-    return sorted({recording.at(seconds) for seconds in times})
-
-
-def _points(recordings: Sequence[Recording], ends: Sequence[int]) -> FloatArray:
+def _view(recordings: Sequence[Recording], ends: Sequence[int], size: tuple[int, int] | None) -> _View:
     paths = [recording.path[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
-    return np.concatenate([*paths, *(recording.targets for recording in recordings)])
+    points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
+    forward = broadside(points)
+    width, height = size or _proportions(points, forward)
+    breadth = 2.0 * span(recordings[0].vehicle)
+    enlarged = 1.0
+    for _ in range(20):  # a larger vehicle needs a camera farther away
+        camera = framing_camera(points, 0.6 * enlarged * breadth, width / height, forward)
+        depth = float(np.median((points - camera.eye) @ camera.axes[0]))
+        wanted = VEHICLE_SHARE * 2.0 * camera.slope * depth / breadth
+        enlarged = float(np.clip(0.5 * (enlarged + wanted), 1.0, LARGEST))
+    return _View(camera, width, height, enlarged, enlarged * breadth)
 
 
-def _proportions(recordings: Sequence[Recording], ends: Sequence[int]) -> tuple[int, int]:
-    points = _points(recordings, ends)
-    x, y, _ = broadside(points)
-    high = float(np.ptp(points[:, 2]))
-    wide = float(np.ptp(points[:, 0] * y - points[:, 1] * x))
+def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
+    x, y = forward[:2] / np.linalg.norm(forward[:2])
+    high, wide = float(np.ptp(points[:, 2])), float(np.ptp(points[:, 0] * y - points[:, 1] * x))
     ratio = float(np.clip((wide + 0.3 * high + 1.0) / (high + 0.3 * wide + 1.0), *RATIOS))
     width = 2 * round((AREA * ratio) ** 0.5 / 2)
     return width, 2 * round(AREA / width / 2)
 
 
-def _view(recordings: Sequence[Recording], ends: Sequence[int], width: int, height: int) -> _View:
-    points = _points(recordings, ends)
-    vehicle = recordings[0].vehicle
-    breadth = 2.0 * (arm_length(vehicle) + rotor_radius(vehicle))
-    ahead = broadside(points)
-    size = 1.0
-    for _ in range(20):  # a larger vehicle needs a camera farther away
-        camera = framing_camera(points, 0.6 * size * breadth, width / height, ahead)
-        depth = float(np.median(project(camera, points, width, height)[:, 2]))
-        wanted = VEHICLE_SHARE * 2.0 * camera.slope * depth / breadth
-        size = float(np.clip(0.5 * (size + wanted), 1.0, LARGEST))
-    return _View(camera, width, height, size, size * breadth)
-
-
 def _apart(recording: Recording, end: int, view: _View) -> list[int]:
     """Steps whose poses do not hide one another: each is the first that is clear of those before it."""
-    screen = view.project(recording.path[: end + 1])
-    breadth = view.pixels(screen[:, 2])
+    places, breadth = view.project(recording.path[: end + 1])
 
-    def clear_of(steps: Sequence[int], step: int) -> npt.NDArray[np.bool_]:
-        gaps = np.linalg.norm(screen[steps, :2] - screen[step, :2], axis=1)
-        return np.asarray(gaps > APART * breadth[step])
+    def clear_of(steps: Sequence[int], step: int) -> BoolArray:
+        return np.asarray(np.linalg.norm(places[steps] - places[step], axis=1) > APART * breadth[step])
 
     chosen = [0]
     for step in range(1, end + 1):
         if clear_of(chosen, step).all():
             chosen.append(step)
-    # When it was pushed, and how it was lost, is to be seen: what would hide that gives way.
+    # When it was pushed and how it was lost must be seen: poses that would hide that are left out.
     for step in (*(push for push in recording.pushes if push <= end), *([end] if recording.lost else [])):
-        chosen = [each for each in chosen if each == 0 or clear_of([each], step)[0]]
-        chosen = sorted({*chosen, step})
+        chosen = sorted({step, *(each for each in chosen if each == 0 or clear_of([each], step)[0])})
     return chosen
 
 
-def _panel(recording: Recording, chosen: Sequence[int], end: int, view: _View, colour: str) -> Picture:
-    angles = np.cumsum(rotor_turning(recording.vehicle, recording.state), axis=1) * recording.vehicle.control_step
-    poses = [Pose(recording.state[:, k], recording.wrench[:, k], angles[:, k]) for k in chosen]
-    trail = Trail(recording.path[: end + 1], rgb(colour), width=0.05 * view.breadth, opacity=0.85)
-    stage = Stage(recording.vehicle, len(poses), len(recording.targets), view.size)
-    try:
-        pixels = stage.picture(Scene(poses, recording.targets, [trail]), view.camera, FIELD_OF_VIEW, view.width, view.height)
-    finally:
-        stage.close()
-    canvas = Canvas(pixels)
+def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View, colour: str) -> Image:
+    scene = Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)
+    scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
+    trail = Overlay(recording.path[: end + 1], rgb(colour), 0.85, width=0.05 * view.breadth)
+    pixels = scene.picture(view.camera, view.width, view.height, [trail])
+    scene.close()
     size = max(12, round(view.height / 34))
-    _tag_times(canvas, recording, chosen, view, round(0.92 * size))
+    tag = round(0.92 * size)
+    pixels = with_tags(pixels, _time_tags(recording, steps, view, tag), tag)
     lines = [_outcome(recording, end)]
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
-    return with_header(canvas.pixels, recording.name, lines, rgb255(colour), size)
+    return with_header(pixels, recording.name, lines, colour, size)
 
 
-def _tag_times(canvas: Canvas, recording: Recording, chosen: Sequence[int], view: _View, size: int) -> None:
-    """The time beside each pose, where it hides least."""
-    screen = view.project(recording.path[list(chosen)])
-    half = 0.5 * view.pixels(screen[:, 2])
-    vehicles: list[Box] = [(x - r, y - r, x + r, y + r) for (x, y, _), r in zip(screen, 0.8 * half, strict=True)]
-    taken = [*vehicles]
-    path = view.project(recording.path[::3])[:, :2]
-    for step, (x, y, _), reach in zip(chosen, screen, half, strict=True):
+def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
+    """The time of each pose and where it is written: at the first place beside it that is inside the picture and free."""
+    places, breadth = view.project(recording.path[list(steps)])
+    centres, halves = list(places), [np.full(2, 0.35 * each) for each in breadth]  # of what must not be hidden
+    # Left of a steep path, above a level one, else around the pose from there.
+    turns = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
+    angles = turns + (np.pi if np.ptp(places[:, 1]) > np.ptp(places[:, 0]) else -np.pi / 2)
+    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    tags = []
+    for step, place, reach in zip(steps, places, 0.5 * breadth, strict=True):
         text = f"{recording.times[step]:.2f} s"
-        places = []
-        for angle in np.radians(np.arange(0, 360, 30)):
-            centre = (x + (reach + 2.6 * size) * np.cos(angle), y + (reach + 1.2 * size) * np.sin(angle))
-            box = tag_box(text, centre, size)
-            outside = overlap(box, (0, 0, view.width, view.height)) < 0.999 * (box[2] - box[0]) * (box[3] - box[1])
-            crossed = ((path > box[:2]) & (path < box[2:])).all(axis=1).sum()
-            places.append((1e6 * outside + sum(overlap(box, other) for other in taken) + 4.0 * crossed, centre))
-        _, centre = min(places)
-        taken.append(canvas.tag(text, centre, size))
+        half = 0.5 * np.array(tag_size(text, size))
+        around = place + sides * (reach + 0.4 * size + half)
+        free = (around >= half).all(axis=1) & (around <= (view.width, view.height) - half).all(axis=1)
+        for centre, other in zip(centres, halves, strict=True):
+            free &= (np.abs(around - centre) >= half + other).any(axis=1)
+        chosen = around[int(np.argmax(free))]
+        centres.append(chosen)
+        halves.append(half)
+        tags.append((text, (float(chosen[0]), float(chosen[1]))))
+    return tags
 
 
 def _outcome(recording: Recording, end: int) -> str:

@@ -1,0 +1,147 @@
+"""The shapes that vehicles, targets and arrows are drawn with, as PyBullet bodies without mass that touch nothing; m."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.bullet import p
+from sb3_quad.simulation.state import ROTOR_SPEEDS
+from sb3_quad.vehicles.vehicle import Vehicle
+
+Vector: TypeAlias = tuple[float, float, float]
+Colour: TypeAlias = tuple[float, float, float, float]
+Mesh: TypeAlias = dict[str, Any]  # vertices and triangles, as createVisualShape takes them
+
+DARK: Colour = (0.13, 0.14, 0.17, 1.0)
+GREY: Colour = (0.55, 0.58, 0.62, 1.0)
+BLUE: Colour = (0.10, 0.36, 0.75, 1.0)
+FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
+WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
+REFERENCE_ARM = 0.24
+SLOWED = 12.0  # the drawn rotors turn that much slower than real ones, which would seem to stand or turn backwards in a film
+NOWHERE: Vector = (0.0, 0.0, -1000.0)
+
+
+class Part(NamedTuple):
+    """A part of a body: a box (its sides), a cylinder along z, or a ball; angles in rad, roll before yaw."""
+
+    shape: int
+    at: Vector = (0.0, 0.0, 0.0)
+    box: Vector = (0.0, 0.0, 0.0)
+    radius: float = 0.0
+    length: float = 0.0
+    roll: float = 0.0
+    yaw: float = 0.0
+
+
+def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
+    """A body of at most 16 parts, out of sight; its number."""
+    shape = p.createVisualShapeArray(
+        shapeTypes=[part.shape for part in parts],
+        halfExtents=[[side / 2 for side in part.box] for part in parts],
+        radii=[part.radius for part in parts],
+        lengths=[part.length for part in parts],
+        rgbaColors=[colour for _ in parts],
+        visualFramePositions=[part.at for part in parts],
+        visualFrameOrientations=[p.getQuaternionFromEuler((part.roll, 0.0, part.yaw)) for part in parts],
+        physicsClientId=client,
+    )
+    return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
+
+
+def add_mesh(mesh: Mesh, colour: Colour, client: int) -> int:
+    """A body that is a mesh, out of sight; its number."""
+    shape = p.createVisualShape(p.GEOM_MESH, rgbaColor=colour, physicsClientId=client, **mesh)
+    return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
+
+
+def move_body(body: int, position: Sequence[float], quaternion: Sequence[float], client: int) -> None:
+    """Move a body; the quaternion is (x, y, z, w), as PyBullet's are."""
+    p.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
+
+
+def arm_length(vehicle: Vehicle) -> float:
+    """Distance of the outermost rotor from the centre of mass, m."""
+    return max(math.hypot(x, y) for x, y in vehicle.rotor_positions)
+
+
+def rotor_radius(vehicle: Vehicle) -> float:
+    """Radius at which neighbouring rotors are drawn just clear of each other, m."""
+    return 0.44 * min(math.dist(one, other) for one, other in itertools.combinations(vehicle.rotor_positions, 2))
+
+
+def span(vehicle: Vehicle) -> float:
+    """Radius of the vehicle with its rotors, m."""
+    return arm_length(vehicle) + rotor_radius(vehicle)
+
+
+def scale_of(vehicle: Vehicle) -> float:
+    """The vehicle's size, in that of the default one; distances in pictures are multiples of it."""
+    return arm_length(vehicle) / REFERENCE_ARM
+
+
+def rotor_turning(vehicle: Vehicle, state: FloatArray) -> FloatArray:
+    """How fast the drawn rotors turn about body z, for the columns of ``state``, (STATE_SIZE, n): (4, n), rad/s."""
+    return np.asarray(-np.sign(vehicle.rotor_directions)[:, None] * state[ROTOR_SPEEDS] / SLOWED)
+
+
+def frame(arm: float, foot: float, centres: FloatArray) -> dict[Colour, list[Part]]:
+    """A vehicle without its rotors, by colour: PyBullet's window gives a body one colour only.
+
+    :param foot: height of the landing skids' feet, below zero.
+    :param centres: of the rotors, (4, 3).
+    """
+    parts = {
+        DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02 * arm), radius=0.30 * arm, length=0.10 * arm)],
+        BLUE: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.10 * arm), radius=0.24 * arm, length=0.06 * arm)],
+        GREY: [Part(p.GEOM_BOX, (-0.02 * arm, 0.0, -0.10 * arm), (0.34 * arm, 0.20 * arm, 0.12 * arm))],
+        FRONT: [Part(p.GEOM_SPHERE, (0.30 * arm, 0.0, 0.04 * arm), radius=0.075 * arm)],  # a camera
+    }
+    for x, y, z in centres.tolist():
+        beam = math.hypot(x, y), 0.09 * arm, 0.06 * arm
+        parts[FRONT if x > 0 else DARK].append(Part(p.GEOM_BOX, (x / 2, y / 2, 0.02 * arm), beam, yaw=math.atan2(y, x)))
+        parts[GREY].append(Part(p.GEOM_CYLINDER, (x, y, 0.45 * z), radius=0.09 * arm, length=0.9 * z))
+    for y in (-0.32 * arm, 0.32 * arm):
+        parts[DARK].append(Part(p.GEOM_BOX, (0.0, y, foot + 0.02 * arm), (0.8 * arm, 0.04 * arm, 0.04 * arm)))
+        for x in (-0.2 * arm, 0.2 * arm):
+            parts[DARK].append(Part(p.GEOM_BOX, (x, 0.9 * y, foot / 2), (0.03 * arm, 0.03 * arm, -foot)))
+    return parts
+
+
+def rotor(radius: float, pitch: float) -> list[Part]:
+    """A hub and two blades in the plane z = 0, pitched by an angle, rad."""
+    length = 0.94 * radius
+    blade = length, 0.15 * radius, 0.02 * radius
+    ends = [Part(p.GEOM_BOX, (side * length / 2, 0.0, 0.0), blade, roll=side * pitch) for side in (1.0, -1.0)]
+    return [Part(p.GEOM_CYLINDER, radius=0.09 * radius, length=0.16 * radius), *ends]
+
+
+def arrow(length: float, radius: float) -> Mesh:
+    """An arrow along +z from the origin."""
+    neck, head = 0.72 * length, 2.4 * radius
+    return _revolve(np.array([(0.0, 0.0), (radius, 0.0), (radius, neck), (head, neck), (0.0, length)]), 20)
+
+
+def rings(radius: float, thickness: float) -> Mesh:
+    """Two upright rings around the origin, at right angles to each other."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 9)
+    ring = _revolve(np.stack([radius + thickness * np.cos(angle), thickness * np.sin(angle)], axis=1), 48)
+    points, triangles = ring["vertices"], ring["indices"]
+    upright = np.concatenate([points[:, [2, 0, 1]], points[:, [1, 2, 0]]])
+    return {"vertices": upright, "indices": [*triangles, *(corner + len(points) for corner in triangles)]}
+
+
+def _revolve(profile: FloatArray, segments: int) -> Mesh:
+    """The surface that ``profile``, (k, 2), radius and height, sweeps out about z; the outside lies to its right."""
+    angle = np.linspace(0.0, 2.0 * np.pi, segments, endpoint=False)
+    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(segments)], axis=1)
+    corner = np.arange(len(profile) * segments).reshape(-1, segments)
+    a, b = corner[:-1], np.roll(corner, -1, axis=1)[:-1]
+    triangles = np.stack([a, b, b + segments, a, b + segments, a + segments], axis=-1)
+    return {"vertices": (profile[:, None, [0, 0, 1]] * circle).reshape(-1, 3), "indices": triangles.ravel().tolist()}
