@@ -24,8 +24,9 @@ from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.settings.config import load_config
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show import sequence
-from sb3_quad.show.episodes import Setting, fly_all, scenario_setting
+from sb3_quad.show.episodes import Setting, fly_all
 from sb3_quad.show.film import FPS, HOLD, film_frames, frame_times
 from sb3_quad.show.recording import record
 from sb3_quad.show.video import write_video
@@ -39,20 +40,20 @@ VIDEO = importlib.util.find_spec("imageio_ffmpeg") is not None
 @pytest.fixture(scope="module")
 def fall():
     """An upside-down start that the PID expert does not survive."""
-    plan = scenario_setting("thesis:recovery_s1")
+    plan = Setting.of_scenario("thesis:recovery_s1")
     return plan.fly("pid", PIDExpert(), 0, 1500, True)
 
 
 @pytest.fixture(scope="module")
 def hit():
     """A hit on the way to a target."""
-    setting = Setting.from_keywords({"task": "target_tracking", "noise": 0.0}, target=(3, 0, 16), wrench=HIT)
+    setting = Setting.fixed(FlightSettings(task="target_tracking", noise=0.0), target=(3, 0, 16), wrench=HIT)
     return setting.fly("pid", PIDExpert(), 0, 60, True)
 
 
 def test_a_recording_is_the_flight_of_the_environment():
     expert = PIDExpert()
-    recording = record("pid", expert, seed=3, n_steps=40, task="state_recovery")
+    recording = record("pid", expert, FlightSettings(task="state_recovery", max_episode_steps=40), seed=3)
     env = QuadcopterEnv(task="state_recovery")
     env.reset(seed=3)
     total = 0.0
@@ -79,7 +80,7 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
 
 
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
-    setting = Setting.from_keywords({"task": "state_recovery", "max_episode_steps": 20})
+    setting = Setting.fixed(FlightSettings(task="state_recovery", max_episode_steps=20))
     episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50, True))
     assert [len(a.times) - 1 for a, _ in episodes] == [20, 20, 10]
     for first, second in episodes:
@@ -89,13 +90,13 @@ def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
 
 
 def test_a_controller_that_fails_is_named():
-    setting = Setting.from_keywords({"task": "state_recovery"})
+    setting = Setting.fixed(FlightSettings(task="state_recovery"))
     with pytest.raises(ControllerError, match=r"controller odd: .*shape"):
         list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5, True))
 
 
 def test_a_course_has_all_its_targets():
-    recording = scenario_setting("thesis:waypoints_plane").fly("pid", PIDExpert(), 0, 900, True)
+    recording = Setting.of_scenario("thesis:waypoints_plane").fly("pid", PIDExpert(), 0, 900, True)
     np.testing.assert_array_equal(recording.targets[:2], [[0, 10, 25], [0, 20, 15]])
 
 
@@ -348,7 +349,7 @@ def test_record_video_films_the_agent_of_a_run(run_folder, tmp_path, capsys):
 
 
 def test_episodes_side_by_side_have_one_seed_after_the_other():
-    setting = Setting.from_keywords({"task": "state_recovery", "max_episode_steps": 5})
+    setting = Setting.fixed(FlightSettings(task="state_recovery", max_episode_steps=5))
     abreast = list(fly_all({"pid": PIDExpert()}, setting, 5, 10, True, n_envs=2))
     alone = list(fly_all({"pid": PIDExpert()}, setting, 5, 20, True))
     assert [len(episode) for episode in abreast] == [2, 2]
