@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli import main, tune_expert
+from sb3_quad.cli import main
+from sb3_quad.cli.commands import tune_expert
 from sb3_quad.evaluation.expert_figures import by_start, start_states
 from sb3_quad.tuning import expert
 from sb3_quad.tuning.expert import ExpertObjective, ExpertSearch, with_gains

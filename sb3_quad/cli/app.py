@@ -2,25 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 import sys
 from collections.abc import Sequence
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
-from sb3_quad.cli import (
-    benchmark,
-    check_vehicle,
-    enjoy,
-    evaluate,
-    export,
-    plot,
-    publish,
-    record_video,
-    report,
-    train,
-    tune,
-    tune_expert,
-)
-from sb3_quad.cli.arguments import Parser
+from sb3_quad.cli import arguments
+from sb3_quad.cli.parser import Parser
 
 EPILOG = """examples:
   sb3-quad train                                                          both stages, imitation then PPO with cloning
@@ -39,19 +28,10 @@ exit codes:
   143  interrupted by SIGTERM, after saving
 """
 COMMANDS = {
-    "train": train,
-    "evaluate": evaluate,
-    "report": report,
-    "enjoy": enjoy,
-    "record-video": record_video,
-    "export": export,
-    "publish": publish,
-    "benchmark": benchmark,
-    "plot": plot,
-    "tune": tune,
-    "check-vehicle": check_vehicle,
-    "tune-expert": tune_expert,
+    module.name.replace("_", "-"): importlib.import_module(f"{arguments.__name__}.{module.name}")
+    for module in pkgutil.iter_modules(arguments.__path__)
 }
+"""The flags of each command, by its name."""
 
 
 def make_parser() -> Parser:
@@ -66,16 +46,17 @@ def make_parser() -> Parser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
+    given = list(sys.argv[1:] if argv is None else argv)
     parser = make_parser()
     try:
-        if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
-            raise ConfigError(unknown("command", arguments[0], COMMANDS))
-        options = parser.parse(arguments)
+        if given and not given[0].startswith("-") and given[0] not in COMMANDS:
+            raise ConfigError(unknown("command", given[0], COMMANDS))
+        options = parser.parse(given)
         if options.command is None:
             parser.print_help()
             return 0
-        return int(COMMANDS[options.command].run(options))
+        command = importlib.import_module(f"sb3_quad.cli.commands.{options.command.replace('-', '_')}")
+        return int(command.run(options))
     except SB3QuadError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

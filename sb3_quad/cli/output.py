@@ -1,38 +1,31 @@
-"""Where tables and progress are shown."""
+"""Where lines, tables and progress are shown."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 FILE_WIDTH = 140  # columns where the output is no terminal: a table there need not wrap
 Show = Callable[[int, "int | None", str], None]
 
 
+def print_line(line: str) -> None:
+    """Print a line at once, also into a pipe."""
+    print(line, flush=True)
+
+
 def console() -> Console:
     """A console as wide as the terminal, or as wide as any table here needs in a file or pipe."""
-    from rich.console import Console
-
     return Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
 
 
-def make_table(title: str, *columns: str, left: int = 1) -> Table:
-    """An empty table.
-
-    :param left: this many columns hold words, and are aligned to the left.
-    """
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left")
-    for number, name in enumerate(columns):
-        table.add_column(name, justify="left" if number < left else "right")
-    return table
+def shows_progress(wanted: bool | None) -> bool:
+    """Whether a progress bar is shown: in a terminal, unless asked otherwise."""
+    return sys.stderr.isatty() if wanted is None else wanted
 
 
 @contextmanager
@@ -41,16 +34,10 @@ def progress_bar(wanted: bool | None) -> Iterator[Show]:
 
     :param wanted: None: in a terminal.
     """
-    if not (sys.stderr.isatty() if wanted is None else wanted):
-        yield lambda done, total, text: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True))
     description = TextColumn("{task.description}", markup=False)
-    screen = Console(file=sys.stderr)
+    options = {"console": Console(file=sys.stderr), "disable": not shows_progress(wanted)}
     # Lines printed meanwhile appear above the bar, or go where stdout leads.
-    with Progress(*columns, description, console=screen, transient=True, redirect_stdout=sys.stdout.isatty()) as bar:
+    with Progress(*columns, description, transient=True, redirect_stdout=sys.stdout.isatty(), **options) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total, text: bar.update(task, completed=done, total=total, description=text)

@@ -31,7 +31,13 @@ class FlightSettings(Frozen):
 
     def given(self) -> dict[str, Any]:
         """The keywords that are not left at their defaults."""
-        return {name: getattr(self, name) for name in self.model_fields if name in self.model_fields_set}
+        return {name: value for name, value in self if name in self.model_fields_set}
+
+    def in_any_task(self) -> dict[str, Any]:
+        """Of these, what an agent must be flown with in any task: vehicle, noise and scaling."""
+        return {
+            name: value for name, value in self.given().items() if name not in ("task", "task_kwargs", "max_episode_steps")
+        }
 
     def with_changes(self, **changes: Any) -> FlightSettings:
         """The same with some fields changed.

@@ -111,6 +111,11 @@ def is_pipeline(conf_file: str | Path) -> bool:
     return "stages" in SETTINGS.read(conf_file)[0]
 
 
+def is_pipeline_run(folder: Path) -> bool:
+    """Whether a folder is a pipeline's rather than a single run's."""
+    return (folder / STATUS_FILE).is_file()
+
+
 def load_pipeline(conf_file: str | Path) -> Pipeline:
     """The pipeline in a file, by path or by the name of one in the package.
 

@@ -4,44 +4,24 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.cli.arguments import whole
 from sb3_quad.cli.compare import task_table
 from sb3_quad.cli.output import console
-
-if TYPE_CHECKING:
-    from sb3_quad.vehicles.vehicle import Vehicle
-
-HELP = "Say whether a vehicle can hover, what authority it has, and how the experts fly it."
-EXAMPLES = """examples:
-  sb3-quad check-vehicle my.yaml            a vehicle of your own
-  sb3-quad check-vehicle crazyflie          one that comes with the package: crazyflie, hummingbird, itm
-  sb3-quad check-vehicle my.yaml -n 0       by its parameters alone, nothing is flown
-
-exit code 1: its rotors cannot give hover thrust. What a vehicle's file holds: docs/vehicles.md
-"""
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags of ``check-vehicle``."""
-    parser.add_argument("vehicle", metavar="VEHICLE", help="name or YAML file")
-    parser.add_argument(
-        "-n", "--episodes", type=whole, default=480, metavar="N", help="flown of each task by each expert, true state (480)"
-    )
-    parser.add_argument("--seed", type=whole, default=0, help="of the episodes, which no search and no training has seen (0)")
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.report.vehicle import authority_table, parameter_table, warnings
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.vehicles.authority import authority
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
 def run(options: argparse.Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
     if options.episodes < 0 or not 0 <= options.seed < 2**31:
         raise ConfigError(f"--episodes {options.episodes}, --seed {options.seed}: must be at least 0")
-    from sb3_quad.report.vehicle import authority_table, parameter_table, warnings
-    from sb3_quad.vehicles.authority import authority
-    from sb3_quad.vehicles.vehicle import load_vehicle
-
     try:
         vehicle = load_vehicle(options.vehicle)
     except CannotHover as error:
@@ -58,14 +38,10 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _fly(source: str, vehicle: Vehicle, episodes: int, seed: int) -> None:
-    from sb3_quad.envs.registration import ENVIRONMENTS
-    from sb3_quad.experts.geometric import GeometricExpert
-    from sb3_quad.experts.pid import PIDExpert
-
     gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
     controllers = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}
     for task in ENVIRONMENTS.values():
-        title = "the same for both, true state"
-        console().print(task_table(controllers, task, episodes, seed, title, vehicle=vehicle, noise=0.0))
+        settings = FlightSettings(task=task, vehicle=vehicle, noise=0.0)
+        console().print(task_table(controllers, settings, episodes, seed, "the same for both, true state"))
     if vehicle.geometric_gains is None:
         print(f"gains found for it, mostly better ones: sb3-quad tune-expert --vehicle {source}")

@@ -1,13 +1,11 @@
-"""``record-video``: a trained agent's flights as a film, in the folder of its run."""
+"""The flags of ``record-video``."""
 
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli import enjoy
-from sb3_quad.cli.arguments import whole
+from sb3_quad.cli.arguments.enjoy import add_flight_arguments
+from sb3_quad.cli.parser import whole
 from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Record a trained agent as a film; as enjoy --record does, with the flags and folders of rl-zoo's record_video."
@@ -25,20 +23,10 @@ Films need pip install 'sb3_quad[video]'. Several controllers, scenarios and pus
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The flags of rl-zoo's ``record_video.py``, with their meanings."""
     add = parser.add_argument
-    enjoy.add_flight_arguments(parser)
+    add_flight_arguments(parser)
     agent = "an agent of any SB3 algorithm, or a name such as itm-recovery, instead of one of the log folder"
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=agent)
     add("-n", "--n-timesteps", type=whole, default=1000, metavar="N", help="control steps, over as many episodes (1000)")
     add("-o", "--output-folder", metavar="DIR", help="where the film goes (videos, beside the agent's zip)")
     parser.set_defaults(controllers=[], task=None, scenario=None, target=None, force=None, torque=None, at=None, lasting=None)
     parser.set_defaults(sequence=None, times=None, no_render=False)
-
-
-def run(options: argparse.Namespace) -> int:
-    """Fly, draw, write. Returns the exit code."""
-    if (options.trained_agent is None) == (options.algo is None):
-        raise ConfigError("whose flight? Give a run by --algo and --env, or an agent by -i; one of both")
-    env_id, agent = enjoy.known_environment(options), enjoy.chosen_agent(options).path
-    folder = Path(options.output_folder) if options.output_folder else agent.parent / "videos"
-    options.record = str(folder / f"{agent.stem}-{env_id}-seed-{options.seed}-{options.n_timesteps}-steps.mp4")
-    return enjoy.run(options)

@@ -1,15 +1,10 @@
-"""``evaluate``: any number of controllers through a suite of scenarios, side by side on the same episodes."""
+"""The flags of ``evaluate``."""
 
 from __future__ import annotations
 
 import argparse
-import sys
-import time
 
-from sb3_quad.base.errors import ConfigError, MissingExtra, unknown
-from sb3_quad.cli.arguments import whole
-from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.cli.report import report
+from sb3_quad.cli.parser import whole
 
 HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
 EXAMPLES = """controllers:
@@ -49,37 +44,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--overwrite", action="store_true", help="replace results of these controllers that were flown otherwise")
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="renew report.html and its plots (yes)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
-
-
-def run(options: argparse.Namespace) -> int:
-    """Fly, print the table, tell where everything is. Returns the exit code."""
-    from sb3_quad.evaluation.controllers import SCALINGS, parse_controllers
-    from sb3_quad.evaluation.evaluate import evaluate
-    from sb3_quad.evaluation.metric_tables import overview
-    from sb3_quad.scenarios.load import load_suite
-
-    if options.scaling not in SCALINGS:
-        raise ConfigError(unknown("scaling", options.scaling, SCALINGS))
-    suite = load_suite(options.suite).with_changes(options.scenario, options.episodes, options.seed, options.vehicle)
-    controllers = parse_controllers(options.controllers, options.scaling)
-    folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
-    start = time.perf_counter()
-    with progress_bar(options.progress) as show:
-        show(0, None, "loading")
-        results = evaluate(suite, controllers, folder, options.backend, options.workers, options.overwrite, show)
-    flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
-    labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
-    if labels:
-        console().print(overview(flown, labels, suite.source))
-    print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
-    if options.report and results.entries:
-        try:
-            report(folder, overwrite=True, pictures=True)
-        except MissingExtra as error:
-            print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
-    asked = {spec.label for spec in controllers}
-    failures = [failure for failure in results.failures if failure.controller in asked]
-    for failure in failures:
-        where = "" if failure.scenario is None else f", scenario {failure.scenario}"
-        print(f"failed: {failure.controller}{where}: {failure.message}", file=sys.stderr)
-    return 1 if failures else 0

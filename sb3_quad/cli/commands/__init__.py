@@ -1,0 +1,1 @@
+"""What each command does, a module each; only the one that was called is imported."""

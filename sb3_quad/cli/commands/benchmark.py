@@ -1,0 +1,44 @@
+"""``benchmark``: control steps per second, in a table and as JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import write_text
+from sb3_quad.cli.output import console
+from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.settings.config import SETTINGS, load_config
+from sb3_quad.training.benchmark import ENV_ID, Measurement, as_dict, single, training_loop, vectorised
+
+
+def run(options: argparse.Namespace) -> int:
+    """Measure, print, write. Returns the exit code."""
+    if min(options.sizes) < 1 or options.n_envs < 1 or options.seconds <= 0:
+        raise ConfigError("--sizes and --n-envs must be at least 1, --seconds above 0")
+    screen = console()
+    default = f"geometric/{options.algo}.yml"
+    conf_file = options.conf_file or (default if default in SETTINGS.names() else None)
+    config = load_config(options.algo, ENV_ID, conf_file) if options.training else None
+    measurements = []
+    with screen.status("one PyBullet environment"):
+        measurements.append(single(options.seconds))
+    kinds = [("dummy", options.n_envs), ("subproc", options.n_envs), *(("batch", size) for size in options.sizes)]
+    for kind, n_envs in kinds:
+        with screen.status(f"{kind}, {n_envs}"):
+            measurements.append(vectorised(kind, n_envs, options.seconds))
+    if config is not None:
+        with screen.status(f"training loop of {config.algo}"):
+            measurements.extend(training_loop(config))
+    screen.print(_table(measurements))
+    if options.output is not None:
+        write_text(options.output, json.dumps(as_dict(measurements), indent=2) + "\n")
+        print(f"written to {options.output}")
+    return 0
+
+
+def _table(measurements: list[Measurement]) -> Table:
+    first = measurements[0].rate
+    rows = ((each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements)
+    return text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows)
