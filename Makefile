@@ -13,13 +13,13 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-zoo lint format type commit-checks clean
+.PHONY: help install train test test-zoo lint format type links commit-checks clean
 
 help:
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests"
 	@echo "make test-zoo       run the tests that need rl_zoo3, in an environment of its own"
-	@echo "make lint           check code style"
+	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
 	@echo "make type           check types"
 	@echo "make commit-checks  format, type and lint"
@@ -36,19 +36,22 @@ test: $(INSTALLED)
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py $(ARGS)
 
-lint: $(INSTALLED)
+lint: $(INSTALLED) links
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
+	cd build/type && $(abspath $(VENV))/bin/lint-imports --no-cache --config ../../setup.cfg
 
 format: $(INSTALLED)
 	$(PY) -m ruff check --fix --exit-zero --quiet .
 	$(PY) -m ruff format .
 
-# mypy does not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: it sees links instead.
-type: $(INSTALLED)
+type: $(INSTALLED) links
+	$(PY) -m mypy
+
+# mypy and import-linter do not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: links do.
+links:
 	@rm -rf $(LINKS) && mkdir -p $(LINKS)
 	@for path in sb3_quad/* envs callbacks zoo_configs; do ln -s "$(CURDIR)/$$path" $(LINKS); done
-	$(PY) -m mypy
 
 commit-checks: format type lint
 
@@ -63,11 +66,16 @@ $(PY):
 		echo "$(PYTHON) cannot make virtual environments; its venv package is missing (Debian: python3-venv)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
+# An environment that another checkout has installed itself into is used as it is: it would point here from then on.
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
-	@echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."
-	@$(INSTALL) setuptools
-	@$(INSTALL) --no-build-isolation --editable '.[dev]'
-	@touch $@
+	@owner=$$(cat $@ 2>/dev/null || true); \
+	[ -n "$$owner" ] || [ ! -e $@ ] || owner=$(dir $(abspath $(VENV))).; \
+	if [ -e "$$owner/setup.cfg" ] && ! [ "$$owner" -ef . ]; then \
+		echo "$(VENV) is that of $$owner, and is used as it is"; \
+	else \
+		echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."; \
+		$(INSTALL) setuptools && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
+	fi
 
 # rl_zoo3 needs older versions of some packages than ours: they come first in an environment that borrows all others.
 $(ZOO_INSTALLED): constraints-zoo.txt $(INSTALLED)

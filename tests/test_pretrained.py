@@ -134,7 +134,8 @@ def run_folder(tmp_path_factory):
 
 def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folder, tmp_path, capsys, observations):
     source = run_folder / "QuadStateRecovery-v0.zip"
-    command = ["publish", str(source), "--name", "mine", "--command", "typed so", "-o", str(tmp_path), "--episodes", "4"]
+    (run_folder / "QuadStateRecovery-v0" / "command.txt").write_text("typed so\n")
+    command = ["publish", str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
     assert main(command) == 0
     card = (tmp_path / "mine.md").read_text(encoding="utf-8")
     for part in (

@@ -59,10 +59,12 @@ def test_a_folder_that_cannot_be_written_is_named(tmp_path):
         claim_run(tmp_path / "file", "dagger", ENV)
 
 
-def test_settings_and_arguments_come_back(tmp_path):
+def test_settings_arguments_and_the_command_come_back(tmp_path, monkeypatch):
     run = claim_run(tmp_path, "dagger", ENV)
+    monkeypatch.setattr("sys.argv", ["/somewhere/bin/sb3-quad", "train", "--expert", "my file.zip"])
     run.write_yaml({"n_envs": 3}, {"seed": 7, "trained_agent": None})
-    assert open_run(run.path) == run
+    assert run.command.read_text() == "sb3-quad train --expert 'my file.zip'\n"
+    assert vars(open_run(run.path)) == vars(run)
     assert run.read_yaml() == ({"n_envs": 3}, {"seed": 7, "trained_agent": None})
     run.arguments.write_text("- no mapping")
     with pytest.raises(ConfigError, match=r"args\.yml"):

@@ -11,6 +11,7 @@ evaluations.npz             every evaluation, as SB3's EvalCallback writes it
 0.monitor.csv               every training episode, as SB3's Monitor writes it
 <Env>/config.yml            the settings
 <Env>/args.yml              the command line's arguments; as env_kwargs what the agent is judged with, for rl_zoo3's enjoy
+<Env>/command.txt           what was typed
 resume.npz, dataset.npz     an interrupted run's random numbers, environments and dataset (``--resume``)
 ==========================  =========================================================================
 """
@@ -18,6 +19,8 @@ resume.npz, dataset.npz     an interrupted run's random numbers, environments an
 from __future__ import annotations
 
 import os
+import shlex
+import sys
 import uuid
 from pathlib import Path
 from typing import Any
@@ -49,6 +52,7 @@ class RunFolder:
         self.resume_state = path / "resume.npz"
         self.config = path / name / "config.yml"
         self.arguments = path / name / "args.yml"
+        self.command = path / name / "command.txt"
 
     @property
     def result(self) -> Path:
@@ -70,10 +74,13 @@ class RunFolder:
         return self.checkpoint(max(int(step) for step in steps if step.isdigit()))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
-        """Write config.yml and args.yml."""
+        """Write config.yml, args.yml and command.txt."""
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
         write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
+        program = Path(sys.argv[0]).name
+        start = ["sb3-quad"] if program in ("sb3-quad", "__main__.py") else ["python", program]
+        write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
 
     def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """config.yml and args.yml, also of a run of rl_zoo3's.

@@ -9,7 +9,7 @@ EXAMPLES = """The zip holds the weights and plain numbers only, so that other ve
 the card it is flown over fresh episodes: 3,840 recoveries, 960 targets at each of 10, 15 and 20 m.
 
 examples:
-  sb3-quad publish logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent --command "sb3-quad train --seed 0"
+  sb3-quad publish logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent
   sb3-quad publish logs/ppo/QuadStateRecovery-v0_2/best_model.zip --name other --command "python my.py" -o published
 
 The zip must lie in its run folder, which says how it was trained.
@@ -22,6 +22,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("model", metavar="MODEL.zip", help="an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy")
     add("--name", required=True, metavar="NAME", help="the files are called NAME.zip and NAME.md")
     add("-o", metavar="FOLDER", dest="folder", default=".", help="where they go (here)")
-    add("--command", metavar="TEXT", dest="made_by", required=True, help="what trained it, as typed; the card repeats it")
+    add("--command", metavar="TEXT", dest="made_by", help="what trained it, as typed (that of the run folder)")
     add("--episodes", type=int, default=960, metavar="N", help="flown of each task (960; of recoveries four times as many)")
     add("--overwrite", action="store_true", help="replace the files if they are there")

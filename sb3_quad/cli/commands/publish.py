@@ -12,12 +12,12 @@ import torch
 
 import sb3_quad
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import refuse_existing, write_bytes, write_text
+from sb3_quad.base.files import read_text, refuse_existing, write_bytes, write_text
 from sb3_quad.experts.models import load_model
 from sb3_quad.export.slim import slim_bytes
 from sb3_quad.report.card import measure, write_card
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.training.runs import open_run
+from sb3_quad.training.runs import RunFolder, open_run
 
 
 def run(options: argparse.Namespace) -> int:
@@ -29,10 +29,12 @@ def run(options: argparse.Namespace) -> int:
     zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
-    content, facts, settings = slim_bytes(options.model), _facts(options.model), _settings(options.model)
+    run = open_run(Path(options.model).parent)
+    command = options.made_by or _command(run)
+    content, facts, settings = slim_bytes(options.model), _facts(run), _settings(options.model)
     write_bytes(zip_file, content)
     rows = measure(load_model(zip_file), options.episodes, **settings)
-    card = write_card(options.name, rows, options.made_by, facts, settings)
+    card = write_card(options.name, rows, command, facts, settings)
     write_text(card_file, card)
     print(card)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
@@ -47,9 +49,15 @@ def _settings(model: str) -> dict[str, Any]:
     return {"vehicle": found.vehicle, "noise": 0.05}
 
 
-def _facts(model: str) -> dict[str, str]:
+def _command(run: RunFolder) -> str:
+    if not run.command.is_file():
+        raise ConfigError(f"{run.command}: no such file; give what trained the agent by --command")
+    return read_text(run.command).strip()
+
+
+def _facts(run: RunFolder) -> dict[str, str]:
     """What the run folder and the checkout know."""
-    settings, arguments = open_run(Path(model).parent).read_yaml()
+    settings, arguments = run.read_yaml()
     return {
         "algorithm": f"`{arguments.get('algo')}`, {int(settings['n_timesteps']):,} timesteps"
         + (" after the agent of the stage before" if arguments.get("trained_agent") else ""),
