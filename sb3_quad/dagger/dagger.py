@@ -54,7 +54,7 @@ class DAgger(OnPolicyAlgorithm):
     https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
 
     A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from generators that are seeded by
-    it and by the updates made so far, so a resumed run goes on exactly as the uninterrupted one would have.
+    it and by the updates made so far, so a resumed run continues exactly as the uninterrupted one would have.
 
     Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`. ``learning_rate`` and
     ``clip_range_vf`` can be functions of the remaining progress (from 1 to 0).
@@ -64,7 +64,7 @@ class DAgger(OnPolicyAlgorithm):
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3
         model, or a function from observations to actions; :class:`~sb3_quad.experts.controller.ExpertLabeller` says what
-        each is shown. Never saved: give it again to ``load``, or call :meth:`set_expert`, before learning goes on
+        each is shown. It is never saved: give it to ``load`` again, or call :meth:`set_expert`, before learning continues
     :param batch_size: Minibatch size, in pairs of the dataset
     :param n_epochs: Passes of the critic over each rollout; and of the actor, over as many pairs as a rollout holds,
         unless ``gradient_steps`` says otherwise

@@ -35,13 +35,13 @@ class PPOBC(PPO):
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
     The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H · entropy + c_BC · L_BC.
-    Errata of the thesis, followed in their meant sense: Eq. 3.5 prints the probability ratio as a difference of logs (the
-    ratio is its exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
+    The thesis has three errata here, followed as they are meant: Eq. 3.5 prints the probability ratio as a difference of logs
+    (the ratio is its exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
 
     All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. An update that adds nothing (a cloning
     weight and an ``l2_coef`` of 0, no ``critic_warmup``, and either no ``clip_range_vf`` or ``max_clipped_value=False``) is
     PPO's, bit for bit; any other is equal to PPO's to rounding, plus what is added, and takes two thirds of the time. A saved
-    model loads with ``PPO.load``, also where this package is not installed.
+    model loads with ``PPO.load``, even where this package is not installed.
 
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
         an SB3 model, or a callable from observations to actions. Needed when learning starts with a cloning weight.
@@ -57,8 +57,8 @@ class PPOBC(PPO):
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std`` are left out.
     :param max_clipped_value: the value loss of Eq. 3.8, the larger of the clipped and the unclipped error, where
         ``clip_range_vf`` is given; False for stock PPO's clipped error.
-    :param critic_warmup: for this many rollouts only the critic learns: a critic that comes from another task, or from
-        another policy, would else spoil the actor with its first advantages.
+    :param critic_warmup: for this many rollouts only the critic learns. A critic that comes from another task, or from another
+        policy, would otherwise spoil the actor with its first advantages.
     :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
     :raises ExpertError: when learning starts, or at the latest with the first rollout that is to be cloned: no expert, or
         one whose labels do not fit.

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     import numpy.typing as npt
     from stable_baselines3.common.vec_env import VecEnv
 
-# Of QuadcopterVecEnv.batch: all that its future flight depends on.
-_BATCH_STATE = ("state", "queue", "wrench", "streams", "task_index", "returns")
-
 
 def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:
     """``n_envs`` environments as the settings describe them; number i is seeded with ``seed + i``.
@@ -79,14 +76,8 @@ def _make_in_worker(
     return _make_one(env_id, kwargs, wrappers)
 
 
-def environment_state(env: VecEnv) -> dict[str, npt.NDArray[np.generic]]:
-    """Copies of all that the environments' future depends on; empty where that cannot be had (dummy, subproc)."""
-    batch = getattr(env.unwrapped, "batch", None)
-    return {} if batch is None else {name: getattr(batch, name).copy() for name in _BATCH_STATE}
-
-
 def set_environment_state(env: VecEnv, state: dict[str, npt.NDArray[np.generic]]) -> None:
-    """Undo what has happened since :func:`environment_state`.
+    """Undo what has happened since the state was taken (:mod:`sb3_quad.callbacks.last_good`).
 
     :raises ConfigError: a state of other environments.
     """

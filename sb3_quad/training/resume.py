@@ -15,9 +15,9 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
+from sb3_quad.callbacks.last_good import ENVIRONMENT, Snapshot, set_random_state
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.training.environments import set_environment_state
-from sb3_quad.training.last_good import ENVIRONMENT, Snapshot, set_random_state
 from sb3_quad.training.runs import RunFolder
 
 if TYPE_CHECKING:

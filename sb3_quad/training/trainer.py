@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.vec_env import VecEnv
 
     from sb3_quad.callbacks.best_model import BestModel
-    from sb3_quad.training.last_good import LastGoodModel
+    from sb3_quad.callbacks.last_good import LastGoodModel
 
 EVALUATION_SEED = 2**18  # added to the seed for the evaluations along the way; beyond any training environment's
 FRESH_SEED = 2**19  # added to the seed for the figures at the end: episodes that nothing before has seen
@@ -231,11 +231,12 @@ def _callbacks(
     report: Report,
     goes_on: GoesOn,
 ) -> tuple[list[BaseCallback], LastGoodModel, BestModel | None]:
+    from stable_baselines3.common.callbacks import ConvertCallback
+
     from sb3_quad.callbacks.best_model import BestModel
-    from sb3_quad.callbacks.checkpoint import Checkpoint
     from sb3_quad.callbacks.episode_log import EpisodeLog
-    from sb3_quad.callbacks.stop import StopWhen
-    from sb3_quad.training.last_good import LastGoodModel
+    from sb3_quad.callbacks.every import Checkpoint
+    from sb3_quad.callbacks.last_good import LastGoodModel
 
     last_good = LastGoodModel()
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
@@ -252,5 +253,5 @@ def _callbacks(
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
     for path, kwargs in job.config.callback:
         callbacks.append(import_class(path, "callback")(**kwargs))
-    callbacks.append(StopWhen(lambda: signals.received is not None))
+    callbacks.append(ConvertCallback(lambda *_: signals.received is None))
     return callbacks, last_good, best
