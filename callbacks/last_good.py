@@ -57,7 +57,7 @@ class LastGoodModel(BaseCallback):
 
 
 def _environment_state(env: VecEnv) -> Arrays:
-    """Copies of everything the environments' future depends on; empty for environments that do not offer it (dummy, subproc)."""
+    """Copies of everything the environments' future depends on; empty where it cannot be had (dummy, subproc)."""
     batch = getattr(env.unwrapped, "batch", None)
     return {} if batch is None else {f"{ENVIRONMENT}{name}": getattr(batch, name).copy() for name in _BATCH_STATE}
 
