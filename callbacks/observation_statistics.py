@@ -154,10 +154,8 @@ def _read(path: Path, moments: RunningMeanStd) -> None:
     try:
         content = read_arrays(path) if path.suffix == ".npz" else parse_mapping_file(path)
         mean, std = (np.array(content[f"observation_{name}"], dtype=np.float64) for name in ("mean", "std"))
-        count = float(content["count"])
+        if not mean.shape == std.shape == moments.mean.shape:
+            raise ValueError(f"it is of {mean.size} features, these observations have {moments.mean.size}")
+        moments.mean, moments.var, moments.count = mean, np.square(std), float(content["count"])
     except (KeyError, TypeError, ValueError) as error:
-        raise ConfigError(f"{path}: holds no observation statistics ({one_line(error)}); move it away") from None
-    size = moments.mean.shape
-    if not mean.shape == std.shape == size:
-        raise ConfigError(f"{path}: is of {mean.size} features, these observations have {size[0]}; name another file")
-    moments.mean, moments.var, moments.count = mean, np.square(std), count
+        raise ConfigError(f"{path}: holds no observation statistics ({one_line(error)}); name another file") from None

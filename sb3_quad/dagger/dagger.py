@@ -382,7 +382,9 @@ class DAgger(OnPolicyAlgorithm):
         self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+        )
 
     def save_dataset(self, path: str | Path) -> None:
         """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""

@@ -55,10 +55,7 @@ class AggregatedDataset:
         self._oldest = (self._oldest + overwritten) % self.capacity
 
     def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Observations (b, ...) and expert actions (b, action_dim) of rows (b,) counted from the oldest.
-
-        Where the ring begins thus makes no difference to a sample.
-        """
+        """Observations (b, ...) and expert actions (b, action_dim) of rows (b,), counted from the oldest."""
         if self._oldest:
             rows = (rows + self._oldest) % self.capacity
         return self._observations.index_select(0, rows), self._actions.index_select(0, rows)

@@ -335,7 +335,9 @@ class PPOBC(PPO):
         progress_bar: bool = False,
     ) -> Self:
         """As ``PPO.learn``; see the class for what it raises."""
-        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+        return super().learn(
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+        )
 
 
 def _gradient_norms(terms: Mapping[str, th.Tensor], parameters: list[th.nn.Parameter]) -> dict[str, float]:
