@@ -1,4 +1,4 @@
-"""Callbacks for any Stable-Baselines3 algorithm, one idea per file; docs/callbacks.md lists them."""
+"""Callbacks for any Stable-Baselines3 algorithm; docs/callbacks.md lists them."""
 
 from __future__ import annotations
 
@@ -7,40 +7,28 @@ from typing import TYPE_CHECKING
 from sb3_quad.base.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from sb3_quad.callbacks.best_model import BestModel
-    from sb3_quad.callbacks.checkpoint import Checkpoint
-    from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule
-    from sb3_quad.callbacks.episode_log import EpisodeLog
-    from sb3_quad.callbacks.flight_metrics import FlightMetrics
-    from sb3_quad.callbacks.observation_statistics import ObservationStatistics
-    from sb3_quad.callbacks.stop import StopOnSignal, StopWhen
-    from sb3_quad.callbacks.trajectory_figures import TrajectoryFigures
-    from sb3_quad.training.last_good import LastGoodModel
-
-__all__ = [
-    "BestModel",
-    "Checkpoint",
-    "CoefficientSchedule",
-    "EpisodeLog",
-    "FlightMetrics",
-    "LastGoodModel",
-    "ObservationStatistics",
-    "StopOnSignal",
-    "StopWhen",
-    "TrajectoryFigures",
-]
+    from sb3_quad.callbacks.best_model import BestModel as BestModel
+    from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule as CoefficientSchedule
+    from sb3_quad.callbacks.episode_log import EpisodeLog as EpisodeLog
+    from sb3_quad.callbacks.every import Checkpoint as Checkpoint
+    from sb3_quad.callbacks.flight_metrics import FlightMetrics as FlightMetrics
+    from sb3_quad.callbacks.last_good import LastGoodModel as LastGoodModel
+    from sb3_quad.callbacks.observation_statistics import ObservationStatistics as ObservationStatistics
+    from sb3_quad.callbacks.stop import StopOnSignal as StopOnSignal
+    from sb3_quad.callbacks.trajectory_plots import TrajectoryPlots as TrajectoryPlots
 
 _LAZY = {  # imported on first use: naming one waits for none of the others
     "BestModel": "sb3_quad.callbacks.best_model",
-    "Checkpoint": "sb3_quad.callbacks.checkpoint",
+    "Checkpoint": "sb3_quad.callbacks.every",
     "CoefficientSchedule": "sb3_quad.callbacks.coefficient_schedule",
     "EpisodeLog": "sb3_quad.callbacks.episode_log",
     "FlightMetrics": "sb3_quad.callbacks.flight_metrics",
-    "LastGoodModel": "sb3_quad.training.last_good",
+    "LastGoodModel": "sb3_quad.callbacks.last_good",
     "ObservationStatistics": "sb3_quad.callbacks.observation_statistics",
     "StopOnSignal": "sb3_quad.callbacks.stop",
-    "StopWhen": "sb3_quad.callbacks.stop",
-    "TrajectoryFigures": "sb3_quad.callbacks.trajectory_figures",
+    "TrajectoryPlots": "sb3_quad.callbacks.trajectory_plots",
 }
+__all__ = list(_LAZY)
 
+_LAZY["TrajectoryFigures"] = "sb3_quad.callbacks.trajectory_plots"  # a former name
 __getattr__, __dir__ = lazy_names(__name__, _LAZY)

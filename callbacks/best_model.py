@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
-import io
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import save_model, write_bytes
-from sb3_quad.experts.controller import ExpertLabeller
+from sb3_quad.base.files import read_arrays, save_model, write_arrays
+from sb3_quad.callbacks.every import EveryTimesteps
+from sb3_quad.experts.controller import Controller
 
-GoesOn = Callable[[float, float], bool]
+KEYS = ("timesteps", "results", "ep_lengths", "successes", "seconds")  # of the file
+Score = tuple[float, float]  # success rate, mean reward
 
 
-class BestModel(BaseCallback):
-    """Evaluates the deterministic policy every ``every`` transitions, and whenever :meth:`evaluate` is called.
+class BestModel(EveryTimesteps):
+    """Evaluates the deterministic policy every ``every`` timesteps, and whenever :meth:`evaluate` is called.
 
-    The same episodes each time (the environments are seeded anew), so that models are compared and not their luck.
-    Unlike SB3's EvalCallback, which keeps the highest mean reward, a model that succeeds more often is better; reward
-    decides between equals. ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training besides. Logged are
-    ``eval/success_rate``, ``eval/mean_reward``, ``eval/mean_ep_length``; of others, the same with ``eval_<name>/``.
+    Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's EvalCallback keeps the
+    model of the highest mean reward; here a model that succeeds more often is better, and reward decides between equals.
+    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training besides. It logs ``eval/success_rate``,
+    ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad import PIDExpert
@@ -42,20 +41,20 @@ class BestModel(BaseCallback):
     >>> PPO.load("best_model.zip", device="cpu").num_timesteps in (800, 1600)
     True
 
-    :param env: the environments to evaluate in, not those of the training; closed by whoever made them.
-    :param every: transitions between evaluations.
+    :param env: the environments to evaluate in, not those of the training; whoever made them closes them.
+    :param every: timesteps between evaluations.
     :param n_episodes: episodes in each.
     :param seed: of the evaluation's episodes.
-    :param best_model: where the best model goes; a file there is replaced, but by none that is worse than those in
+    :param best_model: where the best model goes; an existing file is replaced by a model that is better than all in
         ``evaluations``.
-    :param evaluations: where the figures go; a file that is there already is continued.
-    :param report: told of each evaluation in one line.
-    :param goes_on: asked after each evaluation, with its success rate and mean reward, whether the training goes on.
-    :param others: by name: further environments, such as those of another task, to evaluate in at the same times. They have no
-        say in which model is best; their figures go to ``evaluations_<name>.npz`` beside ``evaluations``.
-    :param expert: as DAgger takes it; flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
-        then tells how much mean reward the model has more than the expert.
-    :raises ConfigError: ``every`` or ``n_episodes`` below 1.
+    :param evaluations: where the results go; an existing file is continued.
+    :param report: is told of each evaluation in one line.
+    :param others: further environments by name, such as those of another task, which are evaluated at the same times. They do
+        not decide which model is best; their results go to ``evaluations_<name>.npz`` beside ``evaluations``.
+    :param expert: as DAgger takes it; it flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
+        is then the model's mean reward minus the expert's.
+    :param should_continue: is asked after each evaluation, with its success rate and mean reward; False ends the training.
+    :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read.
     :raises ExpertError: at the first evaluation, an expert that does not fit the environment.
     """
 
@@ -70,127 +69,81 @@ class BestModel(BaseCallback):
         report: Callable[[str], None] = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
         expert: Any = None,
-        goes_on: GoesOn = lambda success, reward: True,
+        should_continue: Callable[[float, float], bool] = lambda success, reward: True,
         verbose: int = 0,
     ) -> None:
-        super().__init__(verbose)
-        for name, value in (("every", every), ("n_episodes", n_episodes)):
-            if value < 1:
-                raise ConfigError(f"BestModel: {name} is {value}, must be at least 1")
-        best_model, evaluations = Path(best_model), Path(evaluations)
-        self._env = env
-        self._every, self._next = every, every
-        self._n_episodes, self._seed = n_episodes, seed
-        self._best_model = best_model
-        self._report = report
-        self._goes_on = goes_on
-        self.stopped = False  # by ``goes_on``
+        super().__init__(every, verbose, n_episodes=n_episodes)
+        self._n_episodes, self._seed, self._expert = n_episodes, seed, expert
+        self._best_model, self._report, self._should_continue = best_model, report, should_continue
+        path, others = Path(evaluations), others or {}
+        # By the group of the log: the environments, the file, its rows and the expert's mean reward; the first group decides.
+        self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
+        self._paths = {"eval": path} | {f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others}
+        self._rows: dict[str, dict[str, list[Any]]] = {group: {key: [] for key in KEYS} for group in self._envs}
+        self._expert_rewards: dict[str, float] = {}
         self._start = 0.0
-        self._figures = _Figures(evaluations)
-        self._others = {
-            name: (other, _Figures(evaluations.with_name(f"{evaluations.stem}_{name}.npz")))
-            for name, other in (others or {}).items()
-        }
-        self._expert = expert
-        self._expert_rewards: dict[str, float] = {}  # mean, by group of the log
-        self.best: tuple[float, float] = (-np.inf, -np.inf)  # success rate, mean reward
+        self.stopped = False  # by ``should_continue``
+        self.best: Score = (-np.inf, -np.inf)
 
     def _on_training_start(self) -> None:
-        self._start = time.perf_counter()
-        self._next = (self.num_timesteps // self._every + 1) * self._every
-        for figures in (self._figures, *(figures for _, figures in self._others.values())):
-            figures.go_on()
-        self.best = max(self._figures.scores(), default=self.best)
+        super()._on_training_start()
+        for group, path in self._paths.items():
+            if path.is_file():
+                arrays = read_arrays(path)
+                self._rows[group] = {key: list(arrays[key]) for key in KEYS}
+        rows = self._rows["eval"]
+        self._start = time.perf_counter() - (rows["seconds"] or [0.0])[-1]
+        self.best = max(map(_score, rows["successes"], rows["results"]), default=self.best)
 
-    def _on_step(self) -> bool:
-        if self.num_timesteps >= self._next:
-            self._next += self._every
-            self.evaluate()
+    def _on_event(self) -> bool:
+        self.evaluate()
         return not self.stopped
 
     def evaluate(self) -> None:
-        """Evaluate the model as it is now, note the figures, and keep it if it is the best so far."""
-        seconds = self._figures.seconds_before + time.perf_counter() - self._start
-        score = self._fly(self._env, self._figures, seconds, "eval")
-        line = f"{self.num_timesteps:>12,} transitions, {seconds:6.1f} s: {_in_words(score)}"
-        for name, (env, figures) in self._others.items():
-            line += f"; {name}: {_in_words(self._fly(env, figures, seconds, f'eval_{name}'))}"
-        better = score > self.best
-        if better:
+        """Evaluate the model as it is now, note the results, and keep it if it is the best so far."""
+        seconds = time.perf_counter() - self._start
+        scores = {group: self._fly(group, seconds) for group in self._envs}
+        words = [
+            f"{group.removeprefix('eval_')}: success {100 * success:.1f} %, mean reward {reward:.2f}"
+            for group, (success, reward) in scores.items()
+        ]
+        line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: " + "; ".join(words).removeprefix("eval: ")
+        score = scores["eval"]
+        if score > self.best:
             self.best = score
             save_model(self.model, self._best_model)
-        self._report(line + (" (best so far)" if better else ""))
-        self.stopped = not self._goes_on(*score)
+            line += " (best so far)"
+        self._report(line)
+        self.stopped = not self._should_continue(*score)
 
-    def _fly(self, env: VecEnv, figures: _Figures, seconds: float, group: str) -> tuple[float, float]:
-        successes: list[float] = []
+    def _fly(self, group: str, seconds: float) -> Score:
+        env, rows, successes = self._envs[group], self._rows[group], []
 
         def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
             if local_variables["done"]:  # an environment that knows no success counts as failing: reward decides
                 successes.append(float(local_variables["info"].get("is_success", 0.0)))
 
-        env.seed(self._seed)
-        rewards, lengths = evaluate_policy(
-            self.model, env, self._n_episodes, deterministic=True, return_episode_rewards=True, callback=note, warn=False
-        )
-        figures.add(timesteps=self.num_timesteps, results=rewards, ep_lengths=lengths, successes=successes, seconds=seconds)
-        score = (float(np.mean(successes)), float(np.mean(rewards)))
-        self.logger.record(f"{group}/success_rate", score[0])
-        self.logger.record(f"{group}/mean_reward", score[1])
+        rewards, lengths = self._evaluate(self.model, env, note)
+        for key, value in zip(KEYS, (self.num_timesteps, rewards, lengths, successes, seconds), strict=True):
+            rows[key].append(value)
+        arrays: dict[str, Any] = {key: np.array(values) for key, values in rows.items()}
+        write_arrays(self._paths[group], **arrays)
+        success, reward = score = _score(successes, rewards)
+        self.logger.record(f"{group}/success_rate", success)
+        self.logger.record(f"{group}/mean_reward", reward)
         self.logger.record(f"{group}/mean_ep_length", float(np.mean(lengths)))
         if self._expert is not None:
-            self.logger.record(f"{group}/reward_against_expert", score[1] - self._expert_reward(env, group))
+            if group not in self._expert_rewards:
+                expert = Controller.for_env(self._expert, env)
+                self._expert_rewards[group] = float(np.mean(self._evaluate(expert, env)[0]))
+            self.logger.record(f"{group}/reward_against_expert", reward - self._expert_rewards[group])
         return score
 
-    def _expert_reward(self, env: VecEnv, group: str) -> float:
-        if group not in self._expert_rewards:
-            env.seed(self._seed)
-            expert: Any = _Predictor(ExpertLabeller(self._expert, env))
-            mean, _ = evaluate_policy(expert, env, self._n_episodes, deterministic=True, warn=False)
-            self._expert_rewards[group] = float(mean)  # type: ignore[arg-type]
-        return self._expert_rewards[group]
+    def _evaluate(self, model: Any, env: VecEnv, callback: Any = None) -> tuple[Any, Any]:
+        """Rewards and lengths of the same episodes each time, (n_episodes,) both."""
+        env.seed(self._seed)
+        return evaluate_policy(model, env, self._n_episodes, callback=callback, return_episode_rewards=True, warn=False)
 
 
-class _Predictor:
-    """An expert as ``evaluate_policy`` takes a model: asked with the environment's true state where that is what it needs."""
-
-    def __init__(self, labeller: ExpertLabeller) -> None:
-        self._labeller = labeller
-
-    def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[Any, None]:
-        return self._labeller.labels(observation), None
-
-
-def _in_words(score: tuple[float, float]) -> str:
-    return f"success {100 * score[0]:.1f} %, mean reward {score[1]:.2f}"
-
-
-class _Figures:
-    """The figures of a file such as EvalCallback's ``evaluations.npz``, a row more with each evaluation."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.records: dict[str, list[Any]] = {
-            key: [] for key in ("timesteps", "results", "ep_lengths", "successes", "seconds")
-        }
-        self.seconds_before = 0.0
-
-    def go_on(self) -> None:
-        """Take over what the file holds already."""
-        if self.path.is_file():
-            with np.load(self.path) as file:
-                self.records = {key: list(file[key]) for key in self.records}
-            self.seconds_before = float(self.records["seconds"][-1])
-
-    def scores(self) -> list[tuple[float, float]]:
-        """Success rate and mean reward of every evaluation."""
-        pairs = zip(self.records["successes"], self.records["results"], strict=True)
-        return [(float(np.mean(successes)), float(np.mean(results))) for successes, results in pairs]
-
-    def add(self, **row: Any) -> None:
-        """Add a row and write the file."""
-        for key, records in self.records.items():
-            records.append(row[key])
-        buffer = io.BytesIO()
-        np.savez(buffer, **{key: np.array(values) for key, values in self.records.items()})  # type: ignore[arg-type]
-        write_bytes(self.path, buffer.getvalue())
+def _score(successes: Any, rewards: Any) -> Score:
+    return float(np.mean(successes)), float(np.mean(rewards))

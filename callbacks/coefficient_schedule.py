@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -33,25 +33,19 @@ class CoefficientSchedule(BaseCallback):
     >>> model.current_beta
     0.0
 
-    In a configuration file::
+    It is set after a rollout, holds for the next one and is logged as ``schedule/<coefficient>``. A model's zip holds the
+    present number, nothing of this package; a training that continues from the zip continues from that number.
 
-        callback:
-          - sb3_quad.callbacks.CoefficientSchedule:
-              {coefficient: bc_coef, start: 1.0, final: 0.0, follow: eval/reward_against_expert, between: [-2.0, 0.0]}
-
-    It is set after a rollout and holds for the next one; logged as ``schedule/<coefficient>``. A model's zip holds the number
-    of the moment, nothing of this package; a training that goes on from it goes on from there.
-
-    :param coefficient: its name; ``set_<name>(value)`` of the model is called where there is one.
-    :param start: its value until the followed quantity is known and beyond ``between[0]``.
+    :param coefficient: its name. If the model has a method ``set_<name>(value)``, it is called.
+    :param start: its value until the followed quantity is known and has passed ``between[0]``.
     :param final: its value from ``between[1]`` on; in between, linear.
-    :param follow: ``progress``, the share of the transitions done; or the name of anything that is logged, such as
+    :param follow: ``progress``, the share of the timesteps done; or the name of anything that is logged, such as
         ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate`` (of :class:`~sb3_quad.callbacks.BestModel`
         or SB3's EvalCallback) or ``eval/reward_against_expert`` (of ``BestModel`` with an ``expert``).
     :param between: where it begins to move and where it ends; the second may be the smaller one, as for a loss.
-    :param one_way: never goes back when the followed quantity does.
-    :raises ConfigError: numbers that are not finite, or equal ends of ``between``; when training begins, a coefficient that
-        the algorithm does not have.
+    :param one_way: it never goes back when the followed quantity does.
+    :raises ConfigError: numbers that are not finite, equal ends of ``between``; when training begins, a coefficient that the
+        algorithm does not have.
     """
 
     def __init__(
@@ -73,30 +67,35 @@ class CoefficientSchedule(BaseCallback):
         self.coefficient, self.follow = coefficient, follow
         self._start, self._final, self._between = float(start), float(final), tuple(between)
         self._one_way = one_way
-        self._logged = _LastLogged()
-        self._value = self._start
 
     def value_at(self, measured: float) -> float:
-        """The coefficient where the followed quantity is ``measured``, whatever was before."""
+        """The coefficient that belongs to a value of the followed quantity, without regard to ``one_way``."""
         first, last = self._between
         share = min(max((measured - first) / (last - first), 0.0), 1.0)
         return self._start + share * (self._final - self._start)
 
     def _on_training_start(self) -> None:
-        check_coefficient(self.model, self.coefficient)
+        _check(self.model, self.coefficient)
         self._logged = _LastLogged()
         self.logger.output_formats.append(self._logged)
-        self._value = self._start if self.num_timesteps == 0 else read_coefficient(self.model, self.coefficient)
+        self._value = self._start if self.num_timesteps == 0 else _read(self.model, self.coefficient)
         for value in (self._final, self._start, self._value):  # one that is out of range is refused now, not at the end
-            set_coefficient(self.model, self.coefficient, value)
+            _set(self.model, self.coefficient, value)
         if self.follow == PROGRESS:
-            self._update()
+            self._on_rollout_end()
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_end(self) -> None:
-        self._update()
+        self._logged.write(self.logger.name_to_value)
+        done = self.num_timesteps / self.model._total_timesteps
+        measured = done if self.follow == PROGRESS else self._logged.values.get(self.follow, math.nan)
+        if math.isfinite(measured):
+            value, falls = self.value_at(measured), self._final < self._start
+            self._value = (min if falls else max)(value, self._value) if self._one_way else value
+        _set(self.model, self.coefficient, self._value)
+        self.logger.record(f"schedule/{self.coefficient}", self._value)
 
     def _on_training_end(self) -> None:
         self.logger.output_formats.remove(self._logged)
@@ -104,27 +103,8 @@ class CoefficientSchedule(BaseCallback):
             known = unknown("metric", self.follow, self._logged.values) if self._logged.values else "nothing was logged"
             warnings.warn(f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {known}", stacklevel=2)
 
-    def _update(self) -> None:
-        measured = self._measured()
-        if measured is not None:
-            value = self.value_at(measured)
-            if self._one_way:
-                nearest = min if self._final < self._start else max
-                value = nearest(value, self._value)
-            self._value = value
-        set_coefficient(self.model, self.coefficient, self._value)
-        self.logger.record(f"schedule/{self.coefficient}", self._value)
 
-    def _measured(self) -> float | None:
-        """The latest value of what is followed; None as long as there is none, and where it is not finite."""
-        if self.follow == PROGRESS:
-            return self.num_timesteps / self.model._total_timesteps
-        self._logged.read(self.logger.name_to_value)
-        value = self._logged.values.get(self.follow)
-        return value if value is not None and math.isfinite(value) else None
-
-
-def set_coefficient(model: BaseAlgorithm, name: str, value: float) -> None:
+def _set(model: BaseAlgorithm, name: str, value: float) -> None:
     """Give the algorithm another value of a coefficient: by its ``set_<name>``, else as its constructor would."""
     setter = getattr(model, f"set_{name}", None)
     if setter is not None:
@@ -135,21 +115,18 @@ def set_coefficient(model: BaseAlgorithm, name: str, value: float) -> None:
         setattr(model, name, FloatSchedule(value) if callable(getattr(model, name)) else value)
 
 
-def read_coefficient(model: BaseAlgorithm, name: str) -> float:
-    """The present value of a coefficient."""
+def _read(model: BaseAlgorithm, name: str) -> float:
     value: Any = getattr(model, f"current_{name}", getattr(model, name))
     return float(value(model._current_progress_remaining) if callable(value) else value)
 
 
-def check_coefficient(model: BaseAlgorithm, name: str) -> None:
+def _check(model: BaseAlgorithm, name: str) -> None:
     """:raises ConfigError: a name that is no coefficient of the algorithm, or one that is no float there."""
     public = {key: value for key, value in vars(model).items() if not key.startswith("_") and key != "lr_schedule"}
-    valid = [key for key, value in public.items() if isinstance(value, (float, FloatSchedule))]
-    if name in valid or (name == "learning_rate" and callable(public[name])):
-        return
-    if name not in public or callable(public[name]):
+    valid = [key for key, value in public.items() if isinstance(value, (float, FloatSchedule)) or key == "learning_rate"]
+    if name not in valid and not isinstance(public.get(name), int):
         raise ConfigError(unknown(f"coefficient of {type(model).__name__}", name, valid))
-    if not (isinstance(public[name], int) and hasattr(model, f"set_{name}")):
+    if name not in valid and not hasattr(model, f"set_{name}"):
         raise ConfigError(f"{name} of {type(model).__name__} is {public[name]!r}, which is no float; give it as one, as 0.0")
 
 
@@ -159,13 +136,10 @@ class _LastLogged(KVWriter):
     def __init__(self) -> None:
         self.values: dict[str, float] = {}
 
-    def read(self, values: dict[str, Any]) -> None:
-        for name, value in values.items():
+    def write(self, key_values: Mapping[str, Any], key_excluded: object = None, step: int = 0) -> None:
+        for name, value in key_values.items():
             if isinstance(value, (int, float)) or getattr(value, "shape", None) == ():
                 self.values[name] = float(value)
-
-    def write(self, key_values: dict[str, Any], key_excluded: dict[str, tuple[str, ...]], step: int = 0) -> None:
-        self.read(key_values)
 
     def close(self) -> None:
         """Nothing to close."""

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import time
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import ResultsWriter
 
 
 class EpisodeLog(BaseCallback):
     """Adds a line for each episode that ends: return, length, seconds since the start, success.
 
-    Reads ``info["episode"]``, so it costs nothing while episodes go on; ``load_results`` and rl-zoo's plots read the file.
-    A file that is there already is continued.
+    It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and rl-zoo's plots read the file.
+    An existing file is continued.
 
     >>> from stable_baselines3 import PPO
     >>> from stable_baselines3.common.results_plotter import load_results
@@ -26,7 +25,7 @@ class EpisodeLog(BaseCallback):
     >>> len(load_results("."))
     16
 
-    :param path: named ``<number>.monitor.csv``.
+    :param path: must be named ``<number>.monitor.csv``.
     :param env_id: noted in the file.
     """
 
@@ -34,33 +33,20 @@ class EpisodeLog(BaseCallback):
         super().__init__(verbose)
         self._path = Path(path)
         self._env_id = env_id
-        self._file: TextIO | None = None
-        self._start = 0.0
 
     def _on_training_start(self) -> None:
         self._start = time.time()
-        new = not self._path.exists()
-        self._file = self._path.open("a", encoding="utf-8")
-        if new:
-            self._file.write(f"#{json.dumps({'t_start': self._start, 'env_id': self._env_id})}\nr,l,t,is_success\n")
+        header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
+        self._writer = ResultsWriter(str(self._path), header, ("is_success",), override_existing=not self._path.exists())
 
     def _on_step(self) -> bool:
-        ended = np.flatnonzero(self.locals["dones"])
-        if self._file is not None and ended.size:
-            seconds = time.time() - self._start
-            infos = self.locals["infos"]
-            for i in ended:
-                episode = infos[i].get("episode")
-                if episode is not None:
-                    success = infos[i].get("is_success", "")
-                    self._file.write(f"{float(episode['r']):.6f},{int(episode['l'])},{seconds:.3f},{success}\n")
+        infos, seconds = self.locals["infos"], round(time.time() - self._start, 3)
+        for row in np.flatnonzero(self.locals["dones"]):
+            info = infos[row]
+            if "episode" in info:
+                values = {"r": round(float(info["episode"]["r"]), 6), "l": int(info["episode"]["l"]), "t": seconds}
+                self._writer.write_row({**values, "is_success": info.get("is_success", "")})
         return True
 
-    def _on_rollout_end(self) -> None:
-        if self._file is not None:
-            self._file.flush()
-
     def _on_training_end(self) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        self._writer.close()

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-
-FloatArray = npt.NDArray[np.float64]
-
-
-class _Flight(NamedTuple):
-    final_distance: float  # m
-    time_to: float  # s; NaN if it never arrived
-    collision: bool
-    out_of_range: bool
+from sb3_quad.experts.controller import true_state_of
 
 
 class FlightMetrics(BaseCallback):
-    """Logs distances and times of the latest training episodes; ``rollout/success_rate`` SB3 itself logs beside them.
+    """Logs distances and times of the latest training episodes, beside SB3's own ``rollout/success_rate``.
 
     ===========================  ======================================================================================
     name                         meaning
@@ -34,20 +25,20 @@ class FlightMetrics(BaseCallback):
     rollout/out_of_range_rate    share of those that got too far from the target
     ===========================  ======================================================================================
 
-    With any algorithm, on the quadcopter's environments, batched or not; of the true state, so without noise. The flights
-    are the training's own: by sampled actions, and under DAgger partly by the expert.
+    It works with any algorithm on the quadcopter's environments, batched or not, and measures the true state, without noise.
+    The flights are those of the training: with sampled actions, and under DAgger partly flown by the expert.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
     >>> env = QuadcopterVecEnv(8, task="state_recovery", max_episode_steps=50, seed=0)
     >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, n_epochs=1, seed=0, device="cpu")
-    >>> metrics = FlightMetrics(tolerance=1.0)
-    >>> _ = model.learn(800, callback=metrics)
-    >>> metrics.figures()["rollout/reached_1m"]
+    >>> callback = FlightMetrics(tolerance=1.0)
+    >>> _ = model.learn(800, callback=callback)
+    >>> callback.metrics()["rollout/reached_1m"]
     1.0
 
     :param tolerance: what counts as arrived, m. A flight that begins there arrives at 0 s, as every recovery does.
-    :param window: episodes that the figures are about, the latest; None for the algorithm's ``stats_window_size``.
+    :param window: episodes that the metrics are about, the latest; None for the algorithm's ``stats_window_size``.
     :raises ConfigError: a tolerance that is not positive; when training begins, an environment that is no quadcopter's.
     """
 
@@ -58,70 +49,54 @@ class FlightMetrics(BaseCallback):
         if window is not None and window < 1:
             raise ConfigError(f"FlightMetrics: window {window}: must be at least 1 episode")
         self._tolerance, self._window = tolerance, window
-        self._flights: deque[_Flight] = deque()
-        self._new = False
+        # By flight: final distance, m; time until it arrived, s, NaN if it never did; collision; out of range.
+        self._flights: deque[tuple[float, float, bool, bool]] = deque()
 
-    def figures(self) -> dict[str, float]:
-        """What is logged, by name; without what no flight has shown yet."""
+    def metrics(self) -> dict[str, float]:
+        """What is logged, by name; what no flight has shown yet is left out."""
         if not self._flights:
             return {}
-        final, time_to, collision, out_of_range = (np.array(column) for column in zip(*self._flights, strict=True))
-        arrived, kept = ~np.isnan(time_to), ~(collision | out_of_range)
-        figures = {
-            f"rollout/reached_{self._tolerance:g}m": float(arrived.mean()),
-            "rollout/collision_rate": float(collision.mean()),
-            "rollout/out_of_range_rate": float(out_of_range.mean()),
+        final, time_to, collision, out_of_range = np.array(self._flights, dtype=np.float64).T
+        arrived, kept = ~np.isnan(time_to), (collision + out_of_range) == 0.0
+        means = {
+            f"reached_{self._tolerance:g}m": arrived,
+            "collision_rate": collision,
+            "out_of_range_rate": out_of_range,
+            "final_distance": final[kept],
+            f"time_to_{self._tolerance:g}m": time_to[arrived],
         }
-        if kept.any():
-            figures["rollout/final_distance"] = float(final[kept].mean())
-        if arrived.any():
-            figures[f"rollout/time_to_{self._tolerance:g}m"] = float(time_to[arrived].mean())
-        return figures
+        return {f"rollout/{name}": float(values.mean()) for name, values in means.items() if values.size}
+
+    figures = metrics  # its former name
 
     def _on_training_start(self) -> None:
-        env = self.training_env
-        if not (env.has_attr("vehicle") and env.has_attr("true_state")):
-            raise ConfigError(f"FlightMetrics: {env} is no quadcopter environment of sb3_quad; leave this callback away")
-        n = env.num_envs
+        env, state = self.training_env, true_state_of(self.training_env)
+        if state is None or not env.has_attr("vehicle"):
+            raise ConfigError(f"FlightMetrics: {env} is no quadcopter environment of sb3_quad; leave this callback out")
+        self._state = state
         self._control_step = float(env.get_attr("vehicle", [0])[0].control_step)
         self._flights = deque(self._flights, maxlen=self._window or self.model._stats_window_size)
-        self._steps = np.zeros(n, dtype=np.int64)  # control steps of the episode so far
-        self._time_to: FloatArray = np.where(self._distance() <= self._tolerance, 0.0, np.nan)
-        self._from_its_start = np.full(n, self.num_timesteps == 0)  # an episode under way has flown unseen: it is left out
+        self._steps = np.zeros(env.num_envs, dtype=np.int64)  # control steps of the episode so far
+        self._time_to: FloatArray = np.where(state().distance <= self._tolerance, 0.0, np.nan)
+        # An episode that is already under way was not seen from its start: it is left out.
+        self._from_its_start = np.full(env.num_envs, self.num_timesteps == 0)
 
     def _on_step(self) -> bool:
-        dones, infos = self.locals["dones"], self.locals["infos"]
-        distance = self._distance()
-        ended = np.flatnonzero(dones)
-        for row in ended:  # it flies its next episode already
-            distance[row] = infos[row]["distance"]
+        infos, ended = self.locals["infos"], np.flatnonzero(self.locals["dones"])
+        now = self._state().distance
+        distance = now.copy()
+        distance[ended] = [infos[row]["distance"] for row in ended]  # it flies its next episode already
         self._steps += 1
         arrived = np.isnan(self._time_to) & (distance <= self._tolerance)
         self._time_to[arrived] = self._steps[arrived] * self._control_step
-        if ended.size:
-            self._note(ended, infos)
-        return True
-
-    def _note(self, ended: npt.NDArray[np.int64], infos: list[dict[str, Any]]) -> None:
-        for row in ended:
-            if self._from_its_start[row]:
-                info = infos[row]
-                times = float(info["distance"]), float(self._time_to[row])
-                self._flights.append(_Flight(*times, bool(info["collision"]), bool(info["out_of_range"])))
-                self._new = True
+        for row in ended[self._from_its_start[ended]]:
+            lost = infos[row]["collision"], infos[row]["out_of_range"]
+            self._flights.append((distance[row], self._time_to[row], *lost))
         self._from_its_start[ended] = True
         self._steps[ended] = 0
-        self._time_to[ended] = np.where(self._distance()[ended] <= self._tolerance, 0.0, np.nan)
+        self._time_to[ended] = np.where(now[ended] <= self._tolerance, 0.0, np.nan)
+        return True
 
     def _on_rollout_end(self) -> None:
-        if self._new:
-            self._new = False
-            for name, value in self.figures().items():
-                self.logger.record(name, value)
-
-    def _distance(self) -> FloatArray:
-        """|r - r_T| of every row now, (n,), m."""
-        env = self.training_env.unwrapped
-        if hasattr(env, "true_state"):
-            return np.asarray(env.true_state().distance)
-        return np.array([state.distance[0] for state in env.env_method("true_state")])
+        for name, value in self.metrics().items():
+            self.logger.record(name, value)

@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import yaml
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.running_mean_std import RunningMeanStd
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import refuse_existing, write_bytes, write_text
-from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE
+from sb3_quad.base.files import one_line, read_arrays, refuse_existing, write_arrays, write_text
+from sb3_quad.base.yaml_files import SUFFIXES, parse_mapping_file
+from sb3_quad.callbacks.every import EveryTimesteps
+from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
 
-FloatArray = npt.NDArray[np.float64]
-GROUPS = {"position": slice(0, 3), "rotation": slice(3, 12), "velocity": slice(12, 15), "body_rates": slice(15, 18)}
 UNITS = {"position": "m", "rotation": "-", "velocity": "m/s", "body_rates": "rad/s"}
 
 
-class ObservationStatistics(BaseCallback):
+class ObservationStatistics(EveryTimesteps):
     """Running mean μ and standard deviation σ of every observed feature, by the parallel algorithm.
 
-    Each control step is a set of observations, one of each environment; its mean and sum of squares are combined with those
-    of all before it (T. F. Chan, G. H. Golub, R. J. LeVeque, *Updating formulae and a pairwise algorithm for computing sample
-    variances*, Stanford 1979; the thesis's [ChanGolubLeVeque79]), so that μ and σ (Eq. 3.17) are those of all observations
-    together, whatever their number. Nothing is kept of them.
+    The mean and sum of squares of each control step's observations are combined with those of all before (T. F. Chan, G. H.
+    Golub, R. J. LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, Stanford 1979; the
+    thesis's [ChanGolubLeVeque79]): μ and σ (Eq. 3.17) are those of all observations together, none of which is kept.
 
     On the quadcopter's environments the scaling of Eq. 3.16 is undone first: μ and σ are in m, m/s and rad/s, with noise, and
-    the σ of the four groups are what Table A.2 rounds. With any other environment they are of the observations as they come
-    (before ``VecNormalize``, if there is one).
+    the σ of the four groups are what Table A.2 rounds. Elsewhere they are of the observations as they come (before
+    ``VecNormalize``, if there is one).
 
     >>> from sb3_quad import DAgger, PIDExpert
     >>> from sb3_quad.envs import QuadcopterVecEnv
@@ -50,29 +46,20 @@ class ObservationStatistics(BaseCallback):
     velocity   ...  5.000 m/s
     body_rates ...  5.000 rad/s
 
-    In a configuration file::
-
-        callback:
-          - sb3_quad.callbacks.ObservationStatistics: {path: sigma.yaml, every: 1000000}
-
-    Its ``observation_std`` is a list as ``env_kwargs`` takes it.
-
-    :param path: a ``.yaml`` or ``.npz`` file for what was found, written whole or not at all; None for none. A training that
-        goes on (``reset_num_timesteps=False``) goes on with it; else one that is there already is refused.
-    :param every: transitions between two logs (``observation/std_<group>``) and savings; there is one at the end, too.
+    :param path: a ``.yaml`` or ``.npz`` file for the results, written whole or not at all; None for no file. A training that
+        is continued (``reset_num_timesteps=False``) continues the file; any other refuses an existing one. Its
+        ``observation_std`` is a list as ``env_kwargs`` takes it.
+    :param every: timesteps after which they are logged (``observation/std_<group>``) and saved; also done at the end.
     :param verbose: 1: prints the table at the end.
     :raises ConfigError: another kind of file, ``every`` below 1; when training begins, a file that exists, or observations
         that are not one array of numbers.
     """
 
     def __init__(self, path: str | Path | None = None, every: int = 100_000, verbose: int = 0) -> None:
-        super().__init__(verbose)
+        super().__init__(every, verbose)
         self._path = None if path is None else Path(path)
-        if self._path is not None and self._path.suffix not in (".yaml", ".yml", ".npz"):
+        if self._path is not None and self._path.suffix not in (*SUFFIXES, ".npz"):
             raise ConfigError(f"ObservationStatistics: {path}: must be a .yaml or .npz file")
-        if every < 1:
-            raise ConfigError(f"ObservationStatistics: every is {every}, must be at least 1")
-        self._every, self._next = every, every
         self._moments = RunningMeanStd(epsilon=0.0)
         self._quadcopter = False
 
@@ -100,24 +87,24 @@ class ObservationStatistics(BaseCallback):
         """σ of each group, beside that of Table A.2 where there is one."""
         lines = [f"{'group':<10} {'sigma':>10}" + ("  Table A.2" if self._quadcopter else "")]
         for name, sigma in self.groups().items():
-            beside = f"  {DEFAULT_STD[GROUPS[name]][0]:9.3f} {UNITS[name]}" if self._quadcopter else ""
-            lines.append(f"{name:<10} {sigma:10.3f}{beside}")
+            printed = f"  {DEFAULT_STD[GROUPS[name]][0]:9.3f} {UNITS[name]}" if self._quadcopter else ""
+            lines.append(f"{name:<10} {sigma:10.3f}{printed}")
         return "\n".join(lines)
 
     def _on_training_start(self) -> None:
+        super()._on_training_start()
         env = self.training_env
         if not isinstance(env.observation_space, spaces.Box):
             raise ConfigError(f"ObservationStatistics: observation space {env.observation_space}: must be a Box")
         size = int(np.prod(env.observation_space.shape))
         self._quadcopter = size == OBSERVATION_SIZE and env.has_attr("observation_std") and env.has_attr("observation_mean")
-        going_on = self.num_timesteps > 0
-        if self._path is not None and not going_on:
+        resumed = self.num_timesteps > 0
+        if self._path is not None and not resumed:
             refuse_existing(self._path, overwrite=False)
-        if not going_on or self._moments.mean.shape != (size,):
+        if not resumed or self._moments.mean.shape != (size,):
             self._moments = RunningMeanStd(epsilon=0.0, shape=(size,))
             if self._path is not None and self._path.is_file():
-                self._moments = _read(self._path, size)
-        self._next = (self.num_timesteps // self._every + 1) * self._every
+                _read(self._path, self._moments)
 
     def _on_rollout_start(self) -> None:
         if self._quadcopter:
@@ -128,25 +115,21 @@ class ObservationStatistics(BaseCallback):
         normalised = self.model.get_vec_normalize_env()
         observations: Any = self.locals["new_obs"] if normalised is None else normalised.get_original_obs()
         features = np.asarray(observations, dtype=np.float64).reshape(self.training_env.num_envs, -1)
-        if self._quadcopter:
-            features = features * self._scale + self._offset
-        self._moments.update(features)
-        if self.num_timesteps >= self._next:
-            self._next = (self.num_timesteps // self._every + 1) * self._every
-            self._log()
-        return True
+        self._moments.update(features * self._scale + self._offset if self._quadcopter else features)
+        return super()._on_step()
 
-    def _on_training_end(self) -> None:
-        if self.count:
-            self._log()
-            if self.verbose:
-                print(self.table())
-
-    def _log(self) -> None:
+    def _on_event(self) -> bool:
         for name, sigma in self.groups().items():
             self.logger.record(f"observation/std_{name}", sigma)
         if self._path is not None:
             self.save(self._path)
+        return True
+
+    def _on_training_end(self) -> None:
+        if self.count:
+            self._on_event()
+            if self.verbose:
+                print(self.table())
 
     def save(self, path: str | Path) -> None:
         """Write count, μ, σ and the names of the features, as YAML or npz by the file's suffix.
@@ -154,35 +137,24 @@ class ObservationStatistics(BaseCallback):
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
         names = list(FEATURE_NAMES) if self._quadcopter else [str(number) for number in range(len(self.mean))]
+        moments = {"features": names, "observation_mean": self.mean.tolist(), "observation_std": self.std.tolist()}
         if Path(path).suffix == ".npz":
-            buffer = io.BytesIO()
-            arrays: dict[str, Any] = {"observation_mean": self.mean, "observation_std": self.std, "features": np.array(names)}
-            np.savez(buffer, count=np.array(self.count), **arrays)
-            write_bytes(path, buffer.getvalue())
-            return
-        content = {
-            "count": self.count,
-            "groups": self.groups(),
-            "features": names,
-            "observation_mean": self.mean.tolist(),
-            "observation_std": self.std.tolist(),
-        }
-        write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=127))
+            write_arrays(path, count=self.count, **moments)
+        else:
+            content = {"count": self.count, "groups": self.groups(), **moments}
+            write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=127))
 
 
-def _read(path: Path, size: int) -> RunningMeanStd:
-    """What :meth:`ObservationStatistics.save` wrote.
+def _read(path: Path, moments: RunningMeanStd) -> None:
+    """Take over what :meth:`ObservationStatistics.save` wrote.
 
     :raises ConfigError: a file that is damaged, or of another number of features.
     """
-    moments = RunningMeanStd(epsilon=0.0, shape=(size,))
     try:
-        content = np.load(path) if path.suffix == ".npz" else yaml.safe_load(path.read_text(encoding="utf-8"))
-        moments.mean = np.array(content["observation_mean"], dtype=np.float64)
-        moments.var = np.square(np.array(content["observation_std"], dtype=np.float64))
-        moments.count = float(content["count"])
-    except (OSError, KeyError, TypeError, ValueError, EOFError, yaml.YAMLError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"{path}: holds no observation statistics ({' '.join(str(error).split())}); move it away") from None
-    if moments.mean.shape != (size,) or moments.var.shape != (size,):
-        raise ConfigError(f"{path}: is of {moments.mean.size} features, these observations have {size}; name another file")
-    return moments
+        content = read_arrays(path) if path.suffix == ".npz" else parse_mapping_file(path)
+        mean, std = (np.array(content[f"observation_{name}"], dtype=np.float64) for name in ("mean", "std"))
+        if not mean.shape == std.shape == moments.mean.shape:
+            raise ValueError(f"it is of {mean.size} features, these observations have {moments.mean.size}")
+        moments.mean, moments.var, moments.count = mean, np.square(std), float(content["count"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ConfigError(f"{path}: holds no observation statistics ({one_line(error)}); name another file") from None

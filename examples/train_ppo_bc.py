@@ -11,7 +11,7 @@ import argparse
 from sb3_quad import PPOBC, GeometricExpert
 from sb3_quad.callbacks import BestModel, CoefficientSchedule, StopOnSignal
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.training.handover import hand_over
+from sb3_quad.training.handover import transfer_policy
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument(
@@ -37,7 +37,7 @@ model = PPOBC(
     device="cpu",
 )
 if arguments.agent:
-    hand_over(arguments.agent, model)
+    transfer_policy(arguments.agent, model)
 
 every = max(arguments.timesteps // 5, 60_000)  # a rollout, at least
 recovery, tracking = (QuadcopterVecEnv(48, task) for task in ("state_recovery", "target_tracking"))

@@ -8,17 +8,21 @@ import re
 from pathlib import Path
 
 import pytest
+from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad import callbacks
+from sb3_quad.callbacks.every import EveryTimesteps
 
 ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_every_callback_is_public():
-    modules = [path.stem for path in (ROOT / "callbacks").glob("*.py") if path.stem != "__init__"]
-    for module in modules:
-        text = (ROOT / "callbacks" / f"{module}.py").read_text(encoding="utf-8")
-        assert set(re.findall(r"^class (\w+)\(BaseCallback\)", text, flags=re.MULTILINE)) <= set(callbacks.__all__)
+    modules = [f"sb3_quad.callbacks.{path.stem}" for path in (ROOT / "callbacks").glob("*.py") if path.stem != "__init__"]
+    everything = [(name, each) for module in map(importlib.import_module, modules) for name, each in vars(module).items()]
+    own = {each for _, each in everything if isinstance(each, type) and each.__module__ in modules}
+    found = {each.__name__ for each in own if issubclass(each, BaseCallback) and each is not EveryTimesteps}
+    assert found == set(callbacks.__all__)
+    assert callbacks.TrajectoryFigures is callbacks.TrajectoryPlots  # a former name, as configuration files may have it
 
 
 @pytest.mark.parametrize("name", callbacks.__all__)

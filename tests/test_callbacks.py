@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import A2C, PPO, SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.results_plotter import load_results
@@ -18,10 +18,10 @@ from stable_baselines3.common.results_plotter import load_results
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.callbacks import best_model
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.checkpoint import Checkpoint
 from sb3_quad.callbacks.episode_log import EpisodeLog
-from sb3_quad.callbacks.stop import StopOnSignal, StopWhen
-from sb3_quad.training.last_good import LastGoodModel, random_state, set_random_state
+from sb3_quad.callbacks.every import Checkpoint
+from sb3_quad.callbacks.last_good import LastGoodModel, random_state, set_random_state
+from sb3_quad.callbacks.stop import StopOnSignal
 
 
 class Walk(gymnasium.Env):
@@ -117,6 +117,17 @@ def test_other_environments_are_evaluated_at_the_same_times_and_decide_nothing(t
         np.testing.assert_array_equal(own["results"], far["results"])  # here the same environment, so the same episodes
 
 
+def test_a_training_that_goes_on_keeps_to_the_multiples(tmp_path):
+    model = make_model()
+    model.learn(80)
+    best = make_best(tmp_path, every=60)
+    checkpoints = Checkpoint(60, str(tmp_path / "model_{steps}.zip"))
+    model.learn(80, callback=[best, checkpoints], reset_num_timesteps=False)
+    with np.load(tmp_path / "evaluations.npz") as file:
+        assert file["timesteps"].tolist() == [120]
+    assert [entry.name for entry in tmp_path.glob("model_*")] == ["model_120.zip"]
+
+
 def test_checkpoints_are_whole_models_at_their_number_of_steps(tmp_path):
     model = make_model()
     model.learn(160, callback=Checkpoint(50, lambda steps: tmp_path / f"rl_model_{steps}_steps.zip"))
@@ -136,7 +147,8 @@ def test_the_expert_flies_the_same_episodes_once(tmp_path):
     best = make_best(tmp_path, every=40, expert=expert, others={"far": make_vec_env(Walk, 2)})
     model = make_model()
     seen = []
-    model.learn(80, callback=[best, StopWhen(lambda: seen.append(dict(model.logger.name_to_value)) is not None)])
+    note = ConvertCallback(lambda *_: seen.append(dict(model.logger.name_to_value)) is None)
+    model.learn(80, callback=[best, note])
     (logged, *_) = [values for values in seen if "eval/mean_reward" in values]
     for group in ("eval", "eval_far"):
         assert logged[f"{group}/reward_against_expert"] == pytest.approx(logged[f"{group}/mean_reward"] - 5.0)
@@ -158,12 +170,6 @@ def test_the_episode_log_is_a_monitor_file(tmp_path):
     assert (results.l == 10).all()
     assert set(results.is_success) <= {True, False}
     assert (tmp_path / "0.monitor.csv").read_text().count("#") == 1
-
-
-def test_stopping_leaves_after_the_step():
-    model = make_model()
-    model.learn(1000, callback=StopWhen(lambda: model.num_timesteps >= 50))
-    assert model.num_timesteps == 50
 
 
 class Signal(BaseCallback):
@@ -191,7 +197,7 @@ def test_a_signal_ends_the_training_after_the_step_and_saves(tmp_path, capsys, a
     stop = StopOnSignal(tmp_path / "model.zip")
     model.learn(1000, callback=[Signal(number, 50), stop])
     assert model.num_timesteps == 50 and (stop.signal, stop.exit_code) == (signal.Signals(number).name, exit_code)
-    assert f"{stop.signal} after 50 transitions" in capsys.readouterr().out
+    assert f"{stop.signal} after 50 timesteps" in capsys.readouterr().out
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.zip"]
     saved = algorithm.load(tmp_path / "model.zip", device="cpu")
     assert saved.num_timesteps == 50
@@ -210,7 +216,7 @@ def test_without_a_signal_nothing_is_saved(tmp_path):
 
 def test_the_snapshot_is_of_the_last_rollout_start(tmp_path):
     model, last_good = make_model(), LastGoodModel()
-    model.learn(1000, callback=[last_good, StopWhen(lambda: model.num_timesteps >= 90)])
+    model.learn(1000, callback=[last_good, ConvertCallback(lambda *_: model.num_timesteps < 90)])
     assert last_good.snapshot.timesteps == 80
     (tmp_path / "model.zip").write_bytes(last_good.snapshot.model)
     saved = PPO.load(tmp_path / "model.zip")
@@ -238,12 +244,12 @@ def test_parameters_that_are_not_finite_end_the_training():
 
 
 def test_random_numbers_can_be_repeated():
-    def draw():
+    def sample():
         legacy = np.random.normal(size=3).tolist()  # noqa: NPY002
         return torch.rand(3).tolist(), legacy, [random.gauss(0, 1) for _ in range(3)]
 
-    draw()
+    sample()
     state = random_state()
-    first = draw()
+    first = sample()
     set_random_state(state)
-    assert draw() == first
+    assert sample() == first

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.common.forward import actor_mean
-from sb3_quad.common.losses import CLONING_LOSSES, gaussian_entropy, gaussian_nll, l2_loss, mean_errors, value_loss
+from sb3_quad.common.losses import CLONING_LOSSES, cloning_errors, gaussian_entropy, gaussian_nll, l2_loss, value_loss
 from sb3_quad.dagger import DAgger
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
@@ -109,7 +109,7 @@ def test_an_sb3_model_teaches(bc_loss):
 def test_how_errors_count(kind):
     """Zero where the actions agree, convex, as steep as promised: linear far out, and with a squared part steeper still."""
     error = th.linspace(-2.0, 2.0, 801, dtype=th.float64)
-    loss = mean_errors(kind, error[:, None].repeat(1, 3), th.zeros(801, 3, dtype=th.float64))
+    loss = cloning_errors(kind, error[:, None].repeat(1, 3), th.zeros(3), th.zeros(801, 3, dtype=th.float64))
     assert loss.argmin() == 400 and loss.min() < 1e-12
     th.testing.assert_close(loss, loss.flip(0))
     slope = loss.diff() / error.diff()

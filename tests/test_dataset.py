@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.dagger.dataset import AggregatedDataset, draw_rows
+from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 
 
 def pairs(first, n):
@@ -44,14 +44,14 @@ def test_it_holds_the_last_pairs_in_order(capacity, sizes):
 
 
 @pytest.mark.parametrize("count", [3, 10, 25])
-def test_rows_are_drawn_in_whole_passes(count):
-    rows = draw_rows(10, count, np.random.default_rng(0))
+def test_rows_are_sampled_in_whole_passes(count):
+    rows = sample_rows(10, count, np.random.default_rng(0))
     assert len(rows) == count
     for start in range(0, count - count % 10, 10):
         assert sorted(rows[start : start + 10]) == list(range(10))
 
 
-def test_what_is_drawn_does_not_depend_on_where_the_ring_begins(tmp_path):
+def test_pairs_do_not_depend_on_where_the_ring_begins(tmp_path):
     dataset = filled(8, 5, 6)
     dataset.save(tmp_path / "d.npz")
     other = AggregatedDataset(8, (2,), 1)

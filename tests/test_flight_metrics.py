@@ -1,4 +1,4 @@
-"""FlightMetrics: the figures that evaluation measures, of the training's own flights."""
+"""FlightMetrics: the metrics that evaluation measures, of the training's own flights."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_flights_of_the_expert_are_measured_as_evaluation_does():
     metrics = FlightMetrics(tolerance=0.5)
     model.learn(1800, callback=metrics)
     flights = fly(GeometricExpert(), "target_tracking", 6, 0, max_steps=300)  # the model seeds its environments, from 0
-    assert metrics.figures() == {
+    assert metrics.metrics() == {
         "rollout/reached_0.5m": 1.0,
         "rollout/collision_rate": 0.0,
         "rollout/out_of_range_rate": 0.0,
@@ -54,7 +54,7 @@ def test_single_environments_and_lost_flights(algorithm, tmp_path):
     model = algorithm("MlpPolicy", env, **size, **small())
     metrics = FlightMetrics()
     model.learn(600, callback=metrics)
-    assert metrics.figures() == {
+    assert metrics.metrics() == {
         "rollout/reached_0.1m": 0.0,
         "rollout/collision_rate": 1.0,
         "rollout/out_of_range_rate": 0.0,
@@ -68,9 +68,9 @@ def test_an_episode_that_began_unseen_is_left_out():
     model.learn(40)
     metrics = FlightMetrics()
     model.learn(40, callback=metrics, reset_num_timesteps=False)
-    assert metrics.figures() == {}
+    assert metrics.metrics() == {}
     model.learn(160, callback=metrics, reset_num_timesteps=False)
-    assert metrics.figures()["rollout/time_to_0.1m"] == 0.0  # a recovery begins at its target
+    assert metrics.metrics()["rollout/time_to_0.1m"] == 0.0  # a recovery begins at its target
 
 
 def test_other_environments_and_numbers_are_refused():

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import csv
+import inspect
+
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.common.forward import evaluate_actions
 from sb3_quad.common.losses import CLONING_LOSSES
 from sb3_quad.ppo_bc import PPOBC
-from sb3_quad.ppo_bc.forward import evaluate
+from sb3_quad.ppo_bc.buffer import ExpertRolloutBufferSamples
+from sb3_quad.settings.algorithms import constructor_parameters
 
 SMALL = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 3, "device": "cpu"}
 
@@ -31,13 +37,29 @@ def part(model, name):
     return {key: p.detach().clone() for key, p in model.policy.named_parameters() if name in key}
 
 
-@pytest.mark.parametrize("clip_range_vf", [None, 0.2])
-def test_without_additions_it_is_ppo_bit_for_bit(clip_range_vf):
-    stock = PPO("MlpPolicy", "Pendulum-v1", clip_range_vf=clip_range_vf, ent_coef=0.01, **SMALL).learn(256)
-    ours = PPOBC(
-        "MlpPolicy", "Pendulum-v1", clip_range_vf=clip_range_vf, ent_coef=0.01, bc_coef=0.0, max_clipped_value=False, **SMALL
-    ).learn(256)
+@pytest.mark.parametrize(
+    ("env", "settings"),
+    [
+        ("Pendulum-v1", {}),
+        ("Pendulum-v1", {"clip_range_vf": 0.2, "ent_coef": 0.01, "normalize_advantage": False}),
+        ("Pendulum-v1", {"target_kl": 1e-3, "batch_size": 48}),  # stops early; the last mini-batch is a smaller one
+        ("Pendulum-v1", {"use_sde": True}),
+        ("CartPole-v1", {"ent_coef": 0.01}),
+    ],
+)
+@pytest.mark.filterwarnings("ignore:You have specified a mini-batch size")
+def test_without_additions_it_is_ppo_bit_for_bit(monkeypatch, env, settings):
+    """By our own loop: stock PPO's is out of reach while ours learns."""
+    settings = {**SMALL, **settings}
+    stock = PPO("MlpPolicy", env, **settings).learn(256)
+    ours = PPOBC("MlpPolicy", env, bc_coef=0.0, max_clipped_value=False, **settings)
+    monkeypatch.delattr(PPO, "train")
+    ours.learn(256)
     assert th.equal(parameters(stock), parameters(ours))
+    assert ours._n_updates == stock._n_updates
+    for name, value in stock.logger.name_to_value.items():
+        if name.startswith("train/"):
+            assert ours.logger.name_to_value[name] == pytest.approx(value, rel=1e-5, abs=1e-6), name
 
 
 @pytest.mark.parametrize("settings", [{}, {"clip_range_vf": 0.2, "max_clipped_value": False}, {"target_kl": 1e-3}])
@@ -67,12 +89,10 @@ def test_the_forward_pass_is_the_policys_own(env, policy_kwargs, settings):
     with th.no_grad():
         actions = model.policy(observations)[0]
     values, log_prob, entropy = model.policy.evaluate_actions(observations, actions)
-    ours = evaluate(model.policy, observations, actions)
-    close = {"rtol": 1e-4, "atol": 1e-5}
-    th.testing.assert_close(ours.values, values.flatten(), **close)
-    th.testing.assert_close(ours.log_prob, log_prob, **close)
-    th.testing.assert_close(ours.entropy.expand_as(entropy), entropy, **close)
-    th.testing.assert_close(ours.mean, model.policy.get_distribution(observations).mode(), **close)
+    ours = evaluate_actions(model.policy, observations, actions)
+    stock = values.flatten(), log_prob, entropy, model.policy.get_distribution(observations).mode()
+    for mine, theirs in zip(ours, stock, strict=True):
+        th.testing.assert_close(mine.expand_as(theirs), theirs, rtol=1e-4, atol=1e-5)
 
 
 def test_labelling_alone_changes_nothing():
@@ -82,17 +102,29 @@ def test_labelling_alone_changes_nothing():
     assert th.equal(parameters(stock), parameters(ours))
 
 
-@pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
-def test_cloning_pulls_towards_the_expert(bc_loss):
-    def error(model):
-        observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
-        return np.square(model.predict(observations, deterministic=True)[0] - np.clip(swing_back(observations), -2, 2)).mean()
+def error(**settings):
+    """Mean squared difference of actions from the expert's, after a short training."""
+    model = PPOBC("MlpPolicy", "Pendulum-v1", learning_rate=3e-3, **settings, **SMALL).learn(512)
+    observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
+    return np.square(model.predict(observations, deterministic=True)[0] - np.clip(swing_back(observations), -2, 2)).mean()
 
-    free = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, learning_rate=3e-3, **SMALL).learn(1024)
-    cloned = PPOBC(
-        "MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=5.0, bc_loss=bc_loss, learning_rate=3e-3, **SMALL
-    ).learn(1024)
-    assert error(cloned) < 0.5 * error(free)
+
+@pytest.fixture(scope="module")
+def error_without_cloning():
+    return error(bc_coef=0.0)
+
+
+@pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
+def test_cloning_pulls_towards_the_expert(bc_loss, error_without_cloning):
+    assert error(expert=swing_back, bc_coef=5.0, bc_loss=bc_loss) < 0.5 * error_without_cloning
+
+
+@pytest.mark.parametrize(("bc_filter", "rows"), [("none", [0, 1, 2]), ("negative_advantage", [1]), ("agreement", [0, 1])])
+def test_rows_that_are_filtered_out_count_as_zero(bc_filter, rows):
+    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, bc_loss="mse", bc_filter=bc_filter, **SMALL)
+    errors, advantages = th.tensor([[0.1], [-0.2], [0.4]]), th.tensor([1.0, -1.0, 0.0])
+    samples = ExpertRolloutBufferSamples(*[errors] * 4, advantages, errors, expert_actions=errors)
+    assert model._bc_loss(th.zeros(3, 1), samples).item() == pytest.approx(errors[rows].square().sum().item() / 3)
 
 
 def test_labels_belong_to_the_state_before_the_step():
@@ -132,16 +164,58 @@ def test_l2_shrinks_the_weights():
 
 
 def test_schedule_of_the_cloning_weight_follows_progress(tmp_path):
-    from stable_baselines3.common.logger import configure
-
     model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=LinearSchedule(0.4, 0.0, 0.5), **SMALL)
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(256)
-    import csv
-
     with open(tmp_path / "progress.csv", encoding="utf-8") as file:
         weights = [float(row["train/bc_coef"]) for row in csv.DictReader(file) if row["train/bc_coef"]]
     assert weights[0] == pytest.approx(0.2) and weights[-1] == 0.0  # a quarter of the way, and the end
+
+
+def in_the_middle(progress):
+    """A schedule with a weight in the second quarter of the training alone, where no coarse sample of it looks."""
+    return 1.0 if 0.52 < progress < 0.74 else 0.0
+
+
+@pytest.mark.parametrize(("start", "weight"), [(0.0, 1.0), (1.0, 0.0)])
+def test_a_rollout_is_labelled_exactly_if_its_update_clones(start, weight):
+    """Also where a schedule changes between the rollout's begin and its end, when the update comes."""
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=lambda p: start if p > 0.75 else weight, **SMALL)
+    seen = []
+    original = model.train
+
+    def train():
+        seen.append(bool(model.rollout_buffer.expert_actions.any()))
+        original()
+        assert seen[-1] == (model.logger.name_to_value["train/bc_coef"] > 0.0)
+
+    model.train = train
+    model.learn(4 * 64)
+    assert seen == [weight > 0.0] * 4
+
+
+def test_a_schedule_with_a_weight_in_the_middle_alone_clones_there():
+    weights = []
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=in_the_middle, **SMALL)
+    original = model.train
+
+    def train():
+        original()
+        weights.append(model.logger.name_to_value["train/bc_coef"])
+        assert model.rollout_buffer.expert_actions.any() == (weights[-1] > 0.0)
+
+    model.train = train
+    model.learn(512)
+    assert weights == [0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    with pytest.raises(ExpertError, match="set_expert"):
+        PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=in_the_middle, **SMALL).learn(512)
+
+
+def test_a_missing_expert_is_noticed_at_the_latest_when_it_is_to_be_cloned():
+    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=lambda progress: float(progress == 1.0 - 3 / 7), **SMALL)
+    with pytest.raises(ExpertError, match="set_expert"):
+        model.learn(64 * 7)
+    assert model.num_timesteps == 64 * 2
 
 
 def test_an_expert_is_asked_for_when_learning_starts(tmp_path):
@@ -173,13 +247,14 @@ def test_labels_that_do_not_fit_stop_training(expert, message):
 
 
 @pytest.mark.parametrize("l2_coef", [0.0, 1e-3])
-def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_coef):
+@pytest.mark.parametrize("spoilt", ["advantages", "returns"])
+def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_coef, spoilt):
     model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, l2_coef=l2_coef, **SMALL)
     before = parameters(model)
     original = model.train
 
     def train():
-        model.rollout_buffer.advantages[:] = np.nan
+        getattr(model.rollout_buffer, spoilt)[:] = np.nan
         original()
 
     model.train = train
@@ -188,12 +263,31 @@ def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_co
     assert th.equal(before, parameters(model))
 
 
+@pytest.mark.parametrize("l2_coef", [0.0, 1e-3])
+@pytest.mark.parametrize("activation_fn", [th.nn.Tanh, th.nn.ReLU])
+def test_steps_that_are_far_too_large_stop_training(l2_coef, activation_fn):
+    policy_kwargs = {"activation_fn": activation_fn}
+    settings = {"bc_coef": 0.0, "l2_coef": l2_coef, "learning_rate": 1e30, "policy_kwargs": policy_kwargs, **SMALL}
+    model = PPOBC("MlpPolicy", "Pendulum-v1", **settings)
+    with pytest.raises(TrainingError, match="learning_rate"):
+        model.learn(64)
+    assert th.isfinite(parameters(model)).all()
+
+
 @pytest.mark.parametrize(
     "arguments", [{"bc_loss": "mle"}, {"bc_filter": "advantage"}, {"l2_coef": -1.0}, {"critic_warmup": -1}]
 )
 def test_bad_arguments_are_named(arguments):
     with pytest.raises(ConfigError, match=next(iter(arguments))):
         PPOBC("MlpPolicy", "Pendulum-v1", **arguments, **SMALL)
+
+
+def test_the_signature_is_ppos_and_what_is_added():
+    stock, ours = (inspect.signature(algorithm).parameters for algorithm in (PPO, PPOBC))
+    added = ["expert", "bc_coef", "bc_loss", "bc_filter", "l2_coef", "max_clipped_value", "critic_warmup"]
+    assert [*ours] == [*(name for name in stock if name != "_init_setup_model"), *added, "_init_setup_model"]
+    assert all(ours[name].default == stock[name].default for name in stock)
+    assert {*added, "learning_rate"} - {"expert"} <= constructor_parameters(PPOBC).keys()
 
 
 def test_state_dependent_exploration_clones_by_the_mean_only():

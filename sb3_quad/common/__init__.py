@@ -1,1 +1,1 @@
-"""What the algorithms share: expert labels, loss terms and files that are written whole or not at all."""
+"""What the two algorithms share: forward passes and loss terms."""

@@ -1,45 +1,61 @@
-"""Forward passes through a policy's parts, without what a training step does not need."""
+"""Forward passes through a policy's parts, without what a training step does not need.
+
+``B`` is the mini-batch. What is computed agrees with the policy's own methods to rounding.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
 import torch as th
+from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
-from torch import nn
+
+from sb3_quad.common.losses import gaussian_entropy, gaussian_nll
 
 
 def actor_mean(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
-    """Mean of the policy's Gaussian, (b, action_dim), by the actor alone; ``evaluate_actions`` would run the critic too."""
+    """Mean of the policy's Gaussian, (B, action_dim), by the actor alone; ``evaluate_actions`` would run the critic too."""
     features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
-    mean: th.Tensor = policy.action_net(actor_latent(policy, features))
+    mean: th.Tensor = policy.action_net(_latent(policy, "actor", features))
     return mean
 
 
 def critic_values(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
-    """``policy.predict_values`` to rounding, (b,)."""
+    """``policy.predict_values``, (B,)."""
     features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
-    values: th.Tensor = policy.value_net(critic_latent(policy, features))
+    values: th.Tensor = policy.value_net(_latent(policy, "critic", features))
     return values.flatten()
 
 
-def actor_latent(policy: ActorCriticPolicy, features: th.Tensor) -> th.Tensor:
-    """Input of the actor's last layer, (b, latent_dim_pi)."""
-    extractor: Any = policy.mlp_extractor
-    if type(extractor) is MlpExtractor:
-        return _run(extractor.policy_net, features)
-    latent: th.Tensor = extractor.forward_actor(features)
-    return latent
+def evaluate_actions(
+    policy: ActorCriticPolicy, observations: th.Tensor, actions: th.Tensor
+) -> tuple[th.Tensor, th.Tensor, th.Tensor | None, th.Tensor]:
+    """``policy.evaluate_actions`` in less time, and the mode of the action distribution.
+
+    :return: values (B,); log-probabilities of ``actions`` (B,); entropy, (B,), or a scalar where it is the same for all, or
+        None without a closed form; modes (B, action_dim).
+    """
+    features: Any = policy.extract_features(observations)
+    for_actor, for_critic = (features, features) if policy.share_features_extractor else features
+    latent_pi, latent_vf = _latent(policy, "actor", for_actor), _latent(policy, "critic", for_critic)
+    values = policy.value_net(latent_vf).flatten()
+    if type(policy.action_dist) is DiagGaussianDistribution:
+        mean, log_std = policy.action_net(latent_pi), policy.log_std
+        return values, -gaussian_nll(mean, log_std, actions), gaussian_entropy(log_std), mean
+    distribution = policy._get_action_dist_from_latent(latent_pi)
+    return values, distribution.log_prob(actions), distribution.entropy(), distribution.mode()
 
 
-def critic_latent(policy: ActorCriticPolicy, features: th.Tensor) -> th.Tensor:
-    """Input of the critic's last layer, (b, latent_dim_vf)."""
+def _latent(policy: ActorCriticPolicy, part: str, features: th.Tensor) -> th.Tensor:
+    """Input of the last layer of the ``actor`` or the ``critic``, (B, latent_dim)."""
     extractor: Any = policy.mlp_extractor
-    if type(extractor) is MlpExtractor:
-        return _run(extractor.value_net, features)
-    latent: th.Tensor = extractor.forward_critic(features)
-    return latent
+    if type(extractor) is not MlpExtractor:
+        return extractor.forward_actor(features) if part == "actor" else extractor.forward_critic(features)  # type: ignore[no-any-return]
+    for layer in extractor.policy_net if part == "actor" else extractor.value_net:
+        features = _Tanh.apply(features) if type(layer) is th.nn.Tanh else layer(features)  # type: ignore[no-untyped-call]
+    return features
 
 
 class _Tanh(th.autograd.Function):
@@ -56,9 +72,3 @@ class _Tanh(th.autograd.Function):
         (y,) = ctx.saved_tensors
         result: th.Tensor = th.ops.aten.tanh_backward(gradients[0], y)
         return result
-
-
-def _run(network: nn.Sequential, x: th.Tensor) -> th.Tensor:
-    for layer in network:
-        x = _Tanh.apply(x) if type(layer) is nn.Tanh else layer(x)  # type: ignore[no-untyped-call]
-    return x

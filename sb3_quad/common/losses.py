@@ -29,26 +29,18 @@ def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
     return (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
 
 
-def cloning_loss(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """L_BC: how far the policy is from the expert's ``actions`` (b, a), a scalar.
+def cloning_errors(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """How far the policy is from the expert's ``actions`` (b, a), by row, (b,); L_BC is the mean over the rows.
 
-    ``"nll"`` is Eq. 3.12, the negative log-likelihood, which also shrinks the standard deviation towards the error that
-    is left. ``"mse"`` is the mean squared error of the mean over rows and dimensions, and leaves it alone; so do
-    ``"huber"`` and ``"huber_mse"``, see :func:`mean_errors`.
+    ``"nll"``: Eq. 3.12, the negative log-likelihood, a sum over the action's dimensions; it also shrinks the standard
+    deviation towards the error that is left. The others are means over the dimensions and leave the deviation alone.
+    ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. In a tumble, the
+    expert's action cannot be told from a noisy observation: squared errors are large there and take most of the gradient,
+    though nothing can be learnt. Linear ones leave more of it to the approach and the hover, where a hundredth is
+    centimetres. ``"huber_mse"``: that and three times the squared error, for policies that must do both.
     """
     if kind == "nll":
-        return gaussian_nll(mean, log_std, actions).mean()
-    return mean_errors(kind, mean, actions).mean()
-
-
-def mean_errors(kind: CloningLoss, mean: th.Tensor, actions: th.Tensor) -> th.Tensor:
-    """Error of the policy's mean action by row, (b,), a mean over the action's dimensions.
-
-    ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. Where the expert's
-    action cannot be told from a noisy observation, in a tumble, squared errors are large and have most of the gradient, though
-    nothing can be learnt there; linear ones leave more of it to the approach and the hover, where a hundredth is centimetres.
-    ``"huber_mse"``: the former and three times the squared error, for policies that must do both.
-    """
+        return gaussian_nll(mean, log_std, actions)
     squared = (mean - actions).square().mean(dim=1)
     if kind == "mse":
         return squared
@@ -76,13 +68,3 @@ def value_loss(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, cli
 def l2_loss(policy: ActorCriticPolicy) -> th.Tensor:
     """½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar; biases and log_std are left out."""
     return 0.5 * th.stack([weights.square().sum() for weights in policy.parameters() if weights.ndim > 1]).sum()
-
-
-def split_parameters(policy: ActorCriticPolicy) -> tuple[list[th.nn.Parameter], list[th.nn.Parameter]]:
-    """The parameters of the actor (with whatever both share) and those of the critic alone."""
-    modules = [policy.mlp_extractor.value_net, policy.value_net]
-    if not policy.share_features_extractor:
-        modules.append(policy.vf_features_extractor)
-    critic = [parameter for module in modules for parameter in module.parameters()]
-    own = {id(parameter) for parameter in critic}
-    return [parameter for parameter in policy.parameters() if id(parameter) not in own], critic

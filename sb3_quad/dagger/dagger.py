@@ -4,51 +4,47 @@ from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import PPO
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
-from stable_baselines3.common.policies import ActorCriticCnnPolicy, ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.arrays import Float32Array
+from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.common.forward import actor_mean, critic_values
-from sb3_quad.common.losses import (
-    CloningLoss,
-    cloning_loss,
-    gaussian_entropy,
-    l2_loss,
-    split_parameters,
-    value_loss,
-)
-from sb3_quad.dagger.checks import check_arguments, check_spaces
-from sb3_quad.dagger.dataset import AggregatedDataset, draw_rows
-from sb3_quad.experts.controller import ExpertLabeller
+from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss, cloning_errors, gaussian_entropy, l2_loss, value_loss
+from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
+from sb3_quad.experts.controller import Controller
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
+_LEAST = {"n_steps": 1, "batch_size": 1, "n_epochs": 1, "gradient_steps": 1, "beta_decay": 0, "beta_final": 0}
+_CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # names of the critic's own parameters
+
 
 class DAgger(OnPolicyAlgorithm):
-    """
-    Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
+    """Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
 
-    In every control step and every environment, independently, the expert's action flies with probability β, else the
-    agent's sampled action. Each visited observation joins a bounded dataset together with the expert's action for the
-    state *before* the step. The actor learns from mini-batches of the dataset, the critic from the GAE returns of the
-    rollout just flown. The loss is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss
-    that is minimised; entropy is to be encouraged)::
+    In every control step and every environment, independently, the expert's action flies with probability β, else the agent's
+    sampled action. Each visited observation joins a bounded dataset together with the expert's action for the state *before*
+    the step. The actor learns from mini-batches of the dataset, the critic from the GAE returns of the rollout just flown. The
+    loss is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss that is minimised; entropy is to
+    be encouraged)::
 
         L_BC + l2_coef * 1/2 Σw² - ent_coef * H + vf_coef * value loss (Eq. 3.8)
 
@@ -57,32 +53,27 @@ class DAgger(OnPolicyAlgorithm):
     For any environment with a Box action space and observations that are not a Dict. Papers:
     https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
 
-    A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from generators that are
-    seeded by it and by the updates made so far, so a resumed run draws what the uninterrupted one would have drawn.
+    A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from generators that are seeded by
+    it and by the updates made so far, so a resumed run continues exactly as the uninterrupted one would have.
 
-    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds
-        ``log_std_init``, it begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
+    Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`. ``learning_rate`` and
+    ``clip_range_vf`` can be functions of the remaining progress (from 1 to 0).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds ``log_std_init``, it
+        begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3
-        model, or a function from observations to actions; :class:`~sb3_quad.experts.controller.ExpertLabeller` says what
-        each is shown. Never saved: give it again to ``load``, or call :meth:`set_expert`, before learning goes on
-    :param learning_rate: The learning rate, it can be a function
-        of the current progress remaining (from 1 to 0)
-    :param n_steps: The number of steps to run for each environment per update
+        model, or a function from observations to actions; :class:`~sb3_quad.experts.controller.Controller` says what
+        each is shown. It is never saved: give it to ``load`` again, or call :meth:`set_expert`, before learning continues
     :param batch_size: Minibatch size, in pairs of the dataset
     :param n_epochs: Passes of the critic over each rollout; and of the actor, over as many pairs as a rollout holds,
         unless ``gradient_steps`` says otherwise
-    :param gamma: Discount factor
-    :param gae_lambda: Factor for trade-off of bias vs variance for Generalized Advantage Estimator
-    :param clip_range_vf: ε of the clipped value loss (Eq. 3.8), it can be a function of the current progress
-        remaining (from 1 to 0). None: plain mean squared error
+    :param clip_range_vf: ε of the clipped value loss (Eq. 3.8). None: plain mean squared error
     :param ent_coef: Entropy coefficient c_H
-    :param vf_coef: Value function coefficient
     :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a
         large error of the critic does not hold up the actor. None: no clipping
-    :param gradient_steps: Optimiser steps after each rollout. Each takes ``batch_size`` pairs of the dataset and an
-        equal share of the critic's ``n_epochs`` passes. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in
-        PPO
+    :param gradient_steps: Optimiser steps after each rollout. Each takes ``batch_size`` pairs of the dataset and an equal
+        share of the critic's ``n_epochs`` passes. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO
     :param beta: β of the first rollout, from 0 to 1
     :param beta_decay: What β loses with every rollout
     :param beta_final: Where β stops falling
@@ -92,24 +83,11 @@ class DAgger(OnPolicyAlgorithm):
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
-    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average
-        the reported success rate, mean episode length, and mean reward over
-    :param tensorboard_log: the log location for tensorboard (if None, no logging)
-    :param policy_kwargs: additional arguments to be passed to the policy on creation
-    :param verbose: Verbosity level: 0 for no output, 1 for info messages, 2 for debug messages
-    :param seed: Seed for the pseudo random generators
-    :param device: Device (cpu, cuda, ...) on which the code should be run
-    :param _init_setup_model: Whether or not to build the network at the creation of the instance
     :raises ConfigError: an argument out of range, or a space that is not supported
     :raises ExpertError: an expert that does not fit the environment
     """
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": ActorCriticPolicy,
-        "CnnPolicy": ActorCriticCnnPolicy,
-    }
-
-    dataset: AggregatedDataset
+    policy_aliases = PPO.policy_aliases
 
     def __init__(
         self,
@@ -144,7 +122,13 @@ class DAgger(OnPolicyAlgorithm):
     ):
         if env is not None:
             env = maybe_make_env(env, verbose)
-            check_spaces(env.observation_space, env.action_space)
+            if isinstance(env.observation_space, spaces.Dict):
+                raise ConfigError(
+                    f"observation space {env.observation_space}: DAgger does not support Dict; wrap the environment in "
+                    "gymnasium.wrappers.FlattenObservation"
+                )
+            if not isinstance(env.action_space, spaces.Box):
+                raise ConfigError(f"action space {env.action_space}: DAgger supports Box only")
         super().__init__(
             policy,
             env,
@@ -178,7 +162,7 @@ class DAgger(OnPolicyAlgorithm):
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
         self.expert: Any = None
-        self._labeller: ExpertLabeller | None = None
+        self._labeller: Controller | None = None
         self._n_rollouts = 0
         self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
 
@@ -188,10 +172,10 @@ class DAgger(OnPolicyAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        check_arguments(self)
+        self._check_arguments()
         super()._setup_model()
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
-            raise ConfigError(f"policy_kwargs {self.policy_kwargs}: DAgger needs a diagonal Gaussian policy (no use_sde)")
+            raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.observation_space.dtype
@@ -202,13 +186,31 @@ class DAgger(OnPolicyAlgorithm):
             np.float32 if dtype is None or np.issubdtype(dtype, np.floating) else dtype,
         )
 
+    def _check_arguments(self) -> None:
+        """:raises ConfigError: an argument that does not fit; one line says which and what is allowed."""
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ConfigError(f"{name} {value}: must be at least {least}")
+        if not self.beta_final <= self.beta <= 1.0:
+            raise ConfigError(f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1")
+        if isinstance(self.clip_range_vf, (float, int)) and self.clip_range_vf <= 0:
+            raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
+        if (self.policy_kwargs or {}).get("use_sde"):
+            raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
+        if self.bc_loss not in CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        rollout = self.n_steps * self.n_envs
+        if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
+            raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
+
     def set_expert(self, expert: Any) -> None:
         """Learn from ``expert`` from now on.
 
         :raises ExpertError: an expert that does not fit the environment
         """
         if self.env is not None:
-            self._labeller = ExpertLabeller(expert, self.env)
+            self._labeller = Controller.for_env(expert, self.env)
         self.expert = expert
 
     @property
@@ -219,7 +221,7 @@ class DAgger(OnPolicyAlgorithm):
     def set_beta(self, beta: float) -> None:
         """Let the expert fly with probability ``beta`` from the next rollout on, whatever ``beta_decay`` says.
 
-        :raises ConfigError: no probability
+        :raises ConfigError: a number below 0 or above 1
         """
         if not 0.0 <= beta <= 1.0:
             raise ConfigError(f"beta {beta}: a probability, from 0 to 1")
@@ -230,19 +232,14 @@ class DAgger(OnPolicyAlgorithm):
         return np.random.default_rng([self._entropy if self.seed is None else self.seed, purpose, self._n_updates])
 
     def collect_rollouts(
-        self,
-        env: VecEnv,
-        callback: BaseCallback,
-        rollout_buffer: RolloutBuffer,
-        n_rollout_steps: int,
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
         """Fly ``n_rollout_steps`` steps by the mixture of expert and agent, and add what was seen to the dataset.
 
         Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The critic evaluates the
         whole rollout at the end, since it does not change before.
         """
-        assert self._labeller is not None
-        assert self._last_obs is not None
+        assert self._labeller is not None and self._last_obs is not None
         self.policy.set_training_mode(False)
         rng = self._generator(0)
         beta = self.current_beta
@@ -251,22 +248,21 @@ class DAgger(OnPolicyAlgorithm):
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)
         not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
-        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
         timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, terminal observation
-        n_by_expert = n_steps = 0
+        n_by_expert = 0
 
         rollout_buffer.reset()
         callback.on_rollout_start()
 
-        while n_steps < n_rollout_steps:
+        for step in range(n_rollout_steps):
             observations: Any = self._last_obs
-            labels[n_steps] = self._labeller.labels(observations)  # of the state before the step
+            labels[step] = self._labeller.labels(observations)  # of the state before the step
             with th.no_grad():
-                means = actor_mean(self.policy, self._tensor(observations)).cpu().numpy()
+                means = actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta
-            actions = np.where(by_expert[:, None], labels[n_steps], sampled)
-            clipped_actions = np.clip(actions, low, high).reshape(shape)
+            actions = np.where(by_expert[:, None], labels[step], sampled)
+            clipped_actions = np.clip(actions, low, high).reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
 
             new_obs, rewards, dones, infos = env.step(clipped_actions)
 
@@ -276,15 +272,13 @@ class DAgger(OnPolicyAlgorithm):
             if not callback.on_step():
                 return False
 
-            if dones.any():
-                ended = np.flatnonzero(dones)
-                self._update_info_buffer([infos[row] for row in ended], dones[ended])
-                for row in ended:
-                    if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
-                        timeouts.append((n_steps, int(row), infos[row]["terminal_observation"]))
+            ended = np.flatnonzero(dones)
+            self._update_info_buffer([infos[row] for row in ended], dones[ended])
+            for row in ended:
+                if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
+                    timeouts.append((step, int(row), infos[row]["terminal_observation"]))
 
             rollout_buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)  # type: ignore[arg-type]
-            n_steps += 1
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
 
@@ -307,17 +301,11 @@ class DAgger(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _tensor(self, observations: npt.NDArray[Any]) -> th.Tensor:
-        return th.as_tensor(observations, device=self.device)
-
-    def _values(self, observations: Any) -> npt.NDArray[np.float32]:
+    def _values(self, observations: Any) -> Float32Array:
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
         with th.no_grad():
-            chunks = [
-                critic_values(self.policy, self._tensor(observations[i : i + _VALUE_CHUNK]))
-                for i in range(0, len(observations), _VALUE_CHUNK)
-            ]
-        return np.asarray(th.cat(chunks).cpu().numpy(), dtype=np.float32)
+            chunks = th.split(th.as_tensor(observations, device=self.device), _VALUE_CHUNK)
+            return np.asarray(th.cat([critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
@@ -327,25 +315,27 @@ class DAgger(OnPolicyAlgorithm):
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         clip_range_vf = self.clip_range_vf(self._current_progress_remaining) if callable(self.clip_range_vf) else None
-        actor_parameters, critic_parameters = split_parameters(self.policy)
+        # The actor, with whatever both share, and the critic.
+        groups: dict[bool, list[th.nn.Parameter]] = {False: [], True: []}
+        for name, parameter in self.policy.named_parameters():
+            groups[name.startswith(_CRITIC)].append(parameter)
         rng = self._generator(1)
         buffer = self.rollout_buffer
         n_rows = buffer.buffer_size * buffer.n_envs
         n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
-        actor_batches = self.dataset.draw(self.batch_size, n_batches, rng)
-        critic_batches = np.array_split(draw_rows(n_rows, self.n_epochs * n_rows, rng), n_batches)
+        actor_batches = th.from_numpy(sample_rows(len(self.dataset), n_batches * self.batch_size, rng)).view(n_batches, -1)
+        critic_batches = th.from_numpy(sample_rows(n_rows, self.n_epochs * n_rows, rng)).tensor_split(n_batches)
         flown = th.from_numpy(buffer.observations.reshape(n_rows, *buffer.obs_shape))
         old_values, returns = th.from_numpy(buffer.values.reshape(-1)), th.from_numpy(buffer.returns.reshape(-1))
-        terms = np.empty((n_batches, 5))  # loss, bc, value, entropy, l2
+        terms = np.empty((n_batches, 5))  # loss and its four terms
 
-        for i, rows in enumerate(critic_batches):
+        for i, index in enumerate(critic_batches):
             observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
             mean, log_std = actor_mean(self.policy, observations), self.policy.log_std
-            bc = cloning_loss(self.bc_loss, mean, log_std, expert_actions)
+            bc = cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
             entropy_loss = -gaussian_entropy(log_std)
             l2 = l2_loss(self.policy)
 
-            index = th.from_numpy(rows)
             values = critic_values(self.policy, flown[index].to(self.device))
             v_loss = value_loss(values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf)
 
@@ -354,25 +344,20 @@ class DAgger(OnPolicyAlgorithm):
             self.policy.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
-            norms = [th.nn.utils.clip_grad_norm_(group, limit) for group in (actor_parameters, critic_parameters)]
+            norms = [th.nn.utils.clip_grad_norm_(group, limit) for group in groups.values()]
             if not np.isfinite(terms[i]).all() or not all(th.isfinite(norm) for norm in norms):
                 self.policy.optimizer.zero_grad()
                 raise TrainingError(
                     f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms[i, 1]:.3g}, value loss "
-                    f"{terms[i, 2]:.3g}): the model keeps its last good parameters; lower learning_rate, or look for "
-                    "rewards and observations that are not finite"
+                    f"{terms[i, 2]:.3g}); lower learning_rate, or look for rewards and observations that are not finite"
                 )
             self.policy.optimizer.step()
-            with th.no_grad():
-                log_std.clamp_(min=self.log_std_min)
+            log_std.data.clamp_(min=self.log_std_min)
             self._n_updates += 1
 
-        averages = terms.mean(axis=0)
-        self.logger.record("train/loss", float(averages[0]))
-        self.logger.record("train/bc_loss", float(averages[1]))
-        self.logger.record("train/value_loss", float(averages[2]))
-        self.logger.record("train/entropy_loss", float(averages[3]))
-        self.logger.record("train/l2_loss", float(averages[4]))
+        names = ("loss", "bc_loss", "value_loss", "entropy_loss", "l2_loss")
+        for name, average in zip(names, terms.mean(axis=0), strict=True):
+            self.logger.record(f"train/{name}", float(average))
         self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         self.logger.record("train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -396,36 +381,17 @@ class DAgger(OnPolicyAlgorithm):
         if reset_num_timesteps:
             self._n_rollouts = 0
         return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
         )
 
     def save_dataset(self, path: str | Path) -> None:
-        """Save the dataset as an .npz file (``.npz`` is added to a name without a suffix).
-
-        :raises ConfigError: a place that cannot be written to
-        """
-        try:
-            self.dataset.save(_with_suffix(path))
-        except OSError as error:
-            raise ConfigError(f"dataset {path}: cannot be written ({error.strerror or error})") from None
+        """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""
+        self.dataset.save(path)
 
     def load_dataset(self, path: str | Path) -> None:
-        """Replace the dataset by a saved one.
-
-        :raises ConfigError: a file that is missing, damaged, or of other observations or actions
-        """
-        self.dataset.load(_with_suffix(path))
+        """Replace the dataset by a saved one, as :meth:`AggregatedDataset.load` does."""
+        self.dataset.load(path)
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         return [*super()._excluded_save_params(), "expert", "_labeller", "dataset"]
-
-
-def _with_suffix(path: str | Path) -> Path:
-    path = Path(path)
-    return path if path.suffix else path.with_name(path.name + ".npz")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch as th
 
+from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import atomic_write
+from sb3_quad.base.files import read_arrays, write_arrays
 
 
 class AggregatedDataset:
@@ -39,7 +40,7 @@ class AggregatedDataset:
         """Forget every pair."""
         self._size = self._oldest = 0
 
-    def add(self, observations: npt.NDArray[np.generic], actions: npt.NDArray[np.float32]) -> None:
+    def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
         observations, actions = observations[-self.capacity :], actions[-self.capacity :]
         n = len(observations)
@@ -53,49 +54,41 @@ class AggregatedDataset:
         self._size = self._size + n - overwritten
         self._oldest = (self._oldest + overwritten) % self.capacity
 
-    def draw(self, batch_size: int, n_batches: int, rng: np.random.Generator) -> th.Tensor:
-        """Row numbers of ``n_batches`` mini-batches for :meth:`pairs`, shape (n_batches, batch_size).
-
-        Counted from the oldest pair, so that what is drawn does not depend on where the ring begins.
-        """
-        return th.from_numpy(draw_rows(self._size, n_batches * batch_size, rng)).view(n_batches, batch_size)
-
     def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Observations (b, ...) and expert actions (b, action_dim) of rows (b,) counted from the oldest."""
+        """Observations (b, ...) and expert actions (b, action_dim) of rows (b,), counted from the oldest."""
         if self._oldest:
             rows = (rows + self._oldest) % self.capacity
         return self._observations.index_select(0, rows), self._actions.index_select(0, rows)
 
-    def save(self, path: Path) -> None:
-        """Write every pair, oldest first, to an .npz file; the file appears whole or not at all."""
-        observations, actions = self.pairs(th.arange(self._size))
-        with atomic_write(path) as file:
-            np.savez(file, observations=observations.numpy(), actions=actions.numpy())
+    def save(self, path: str | Path) -> None:
+        """Write every pair, oldest first, to an .npz file, whole or not at all; ``.npz`` is added to a name without a suffix.
 
-    def load(self, path: Path) -> None:
-        """Replace the pairs by those of a file that :meth:`save` wrote; the last ``capacity`` of them.
+        :raises ConfigError: a place that cannot be written to
+        """
+        observations, actions = self.pairs(th.arange(self._size))
+        write_arrays(_npz(path), observations=observations.numpy(), actions=actions.numpy())
+
+    def load(self, path: str | Path) -> None:
+        """Replace the pairs by the last ``capacity`` of those in a file that :meth:`save` wrote.
 
         :raises ConfigError: a file that is missing, damaged, or of other observations or actions
         """
-        try:
-            with np.load(path, allow_pickle=False) as file:
-                observations, actions = file["observations"], file["actions"]
-        except (OSError, KeyError, ValueError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise ConfigError(f"dataset {path}: cannot be read ({reason}); it must come from save_dataset") from None
-        for name, rows, store in (
-            ("observations", observations, self._observations),
-            ("actions", actions, self._actions),
-        ):
-            if rows.shape[1:] != tuple(store.shape[1:]) or len(rows) != len(actions):
-                expected = f"({len(actions)}, {', '.join(map(str, store.shape[1:]))})"
-                raise ConfigError(f"dataset {path}: {name} of shape {rows.shape}, this model needs {expected}")
+        arrays = read_arrays(_npz(path))
+        n, stores = len(arrays.get("actions", ())), {"observations": self._observations, "actions": self._actions}
+        given = {name: arrays[name].shape for name in stores if name in arrays}
+        needed = {name: (n, *store.shape[1:]) for name, store in stores.items()}
+        if given != needed:
+            raise ConfigError(f"dataset {path}: holds arrays of shape {given}, this model needs {needed}")
         self.clear()
-        self.add(observations, actions)
+        self.add(arrays["observations"], arrays["actions"])
 
 
-def draw_rows(n_rows: int, count: int, rng: np.random.Generator) -> npt.NDArray[np.int64]:
-    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder drawn at random."""
+def sample_rows(n_rows: int, count: int, rng: np.random.Generator) -> IntArray:
+    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at random."""
     passes, rest = divmod(count, n_rows)
     parts = [rng.permutation(n_rows) for _ in range(passes)]
     return np.concatenate([*parts, rng.integers(n_rows, size=rest)]).astype(np.int64, copy=False)
+
+
+def _npz(path: str | Path) -> Path:
+    return Path(path) if Path(path).suffix else Path(f"{path}.npz")

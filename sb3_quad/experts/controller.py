@@ -130,6 +130,3 @@ def observation_function(source: Any, deterministic: bool = True) -> Ask:
     if hasattr(source, "predict"):
         return lambda observation: source.predict(observation, deterministic=deterministic)[0]
     return lambda observation: source(observation)
-
-
-ExpertLabeller = Controller.for_env

@@ -11,6 +11,8 @@ import torch as th
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_quad.base.arrays import Float32Array, IntArray
+
 
 class ExpertRolloutBufferSamples(NamedTuple):
     """SB3's ``RolloutBufferSamples`` and ``expert_actions`` of shape (batch_size, action_dim)."""
@@ -31,7 +33,7 @@ class ExpertRolloutBuffer(RolloutBuffer):
     ``pos`` before it calls :meth:`add` for the same step.
     """
 
-    expert_actions: npt.NDArray[np.float32]
+    expert_actions: Float32Array
 
     def reset(self) -> None:
         self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32)
@@ -45,7 +47,7 @@ class ExpertRolloutBuffer(RolloutBuffer):
         yield from super().get(batch_size)  # type: ignore[misc]
 
     def _get_samples(  # type: ignore[override]
-        self, batch_inds: npt.NDArray[np.int64], env: VecNormalize | None = None
+        self, batch_inds: IntArray, env: VecNormalize | None = None
     ) -> ExpertRolloutBufferSamples:
         """SB3's samples and the labels; gathered by PyTorch, in a third of the time of NumPy's indexing and a copy."""
         rows = th.from_numpy(batch_inds)

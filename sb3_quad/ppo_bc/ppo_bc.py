@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar, cast
+import inspect
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch as th
@@ -10,32 +12,36 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
+from torch.nn import functional as F
 
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss
-from sb3_quad.experts.controller import ExpertLabeller
+from sb3_quad.common.forward import evaluate_actions
+from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss, cloning_errors, l2_loss
+from sb3_quad.common.losses import value_loss as max_clipped_value_loss
+from sb3_quad.experts.controller import Controller
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer, ExpertRolloutBufferSamples
-from sb3_quad.ppo_bc.gradients import gradient_norms
-from sb3_quad.ppo_bc.loss import BC_FILTERS, LossTerms, Weights, loss_terms
 
-SelfPPOBC = TypeVar("SelfPPOBC", bound="PPOBC")
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+BC_FILTERS = ("none", "negative_advantage", "agreement")
+AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
 
 
 class PPOBC(PPO):
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
     The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H · entropy + c_BC · L_BC.
-    Errata of the thesis, followed in their meant sense: Eq. 3.5 prints the probability ratio as a difference of logs (the
-    ratio is its exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
+    The thesis has three errata here, followed as they are meant: Eq. 3.5 prints the probability ratio as a difference of logs
+    (the ratio is its exponential); Eq. 3.6 is a maximised objective; Eq. 4.4 prints + c_H H, while entropy is encouraged.
 
-    All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. With ``bc_coef=0``, ``l2_coef=0`` and
-    ``critic_warmup=0`` (and either no ``clip_range_vf`` or ``max_clipped_value=False``) training is PPO's, bit for bit; with
-    any of them it is equal to PPO's to rounding, plus what is added, by an update that takes two thirds of the time. A saved
-    model loads with ``PPO.load``, also where this package is not installed.
+    All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. An update that adds nothing (a cloning
+    weight and an ``l2_coef`` of 0, no ``critic_warmup``, and either no ``clip_range_vf`` or ``max_clipped_value=False``) is
+    PPO's, bit for bit; any other is equal to PPO's to rounding, plus what is added, and takes two thirds of the time. A saved
+    model loads with ``PPO.load``, even where this package is not installed.
 
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
         an SB3 model, or a callable from observations to actions. Needed when learning starts with a cloning weight.
@@ -51,40 +57,17 @@ class PPOBC(PPO):
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std`` are left out.
     :param max_clipped_value: the value loss of Eq. 3.8, the larger of the clipped and the unclipped error, where
         ``clip_range_vf`` is given; False for stock PPO's clipped error.
-    :param critic_warmup: for this many rollouts only the critic learns: a critic that comes from another task, or from
-        another policy, would else spoil the actor with its first advantages.
+    :param critic_warmup: for this many rollouts only the critic learns. A critic that comes from another task, or from another
+        policy, would otherwise spoil the actor with its first advantages.
     :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
-    :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
-    :raises TrainingError: a loss that is not finite; the parameters are those of the step before.
+    :raises ExpertError: when learning starts, or at the latest with the first rollout that is to be cloned: no expert, or
+        one whose labels do not fit.
+    :raises TrainingError: a loss or gradient that is not finite; the parameters are those of the step before.
     """
 
     def __init__(
         self,
-        policy: str | type[ActorCriticPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        n_steps: int = 2048,
-        batch_size: int = 64,
-        n_epochs: int = 10,
-        gamma: float = 0.99,
-        gae_lambda: float = 0.95,
-        clip_range: float | Schedule = 0.2,
-        clip_range_vf: float | Schedule | None = None,
-        normalize_advantage: bool = True,
-        ent_coef: float = 0.0,
-        vf_coef: float = 0.5,
-        max_grad_norm: float = 0.5,
-        use_sde: bool = False,
-        sde_sample_freq: int = -1,
-        rollout_buffer_class: type[RolloutBuffer] | None = None,
-        rollout_buffer_kwargs: dict[str, Any] | None = None,
-        target_kl: float | None = None,
-        stats_window_size: int = 100,
-        tensorboard_log: str | None = None,
-        policy_kwargs: dict[str, Any] | None = None,
-        verbose: int = 0,
-        seed: int | None = None,
-        device: th.device | str = "auto",
+        *args: Any,
         expert: Any = None,
         bc_coef: float | Schedule = 0.005,
         bc_loss: CloningLoss = "nll",
@@ -93,35 +76,9 @@ class PPOBC(PPO):
         max_clipped_value: bool = True,
         critic_warmup: int = 0,
         _init_setup_model: bool = True,
+        **kwargs: Any,
     ):
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            n_steps=n_steps,
-            batch_size=batch_size,
-            n_epochs=n_epochs,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip_range=clip_range,
-            clip_range_vf=clip_range_vf,
-            normalize_advantage=normalize_advantage,
-            ent_coef=ent_coef,
-            vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class or ExpertRolloutBuffer,
-            rollout_buffer_kwargs=rollout_buffer_kwargs,
-            target_kl=target_kl,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=False,
-        )
+        super().__init__(*args, _init_setup_model=False, **kwargs)  # type: ignore[misc]
         if bc_loss not in CLONING_LOSSES:
             raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
         if bc_filter not in BC_FILTERS:
@@ -132,14 +89,15 @@ class PPOBC(PPO):
             raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss = bc_loss
+        self.bc_loss: CloningLoss = bc_loss
         self.bc_filter = bc_filter
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
         self._n_rollouts_trained = 0
-        self._next_bc_coef: float | None = None
-        self._labeller: ExpertLabeller | None = None
+        self._next_bc_coef: float | None = None  # set by set_bc_coef, holds from the next rollout on
+        self._rollout_bc_coef = 0.0  # the weight in the update on the present rollout, which is labelled if there is one
+        self._labeller: Controller | None = None
         self._labels: Any = None
 
         if _init_setup_model:
@@ -151,12 +109,14 @@ class PPOBC(PPO):
                 f"observation space {self.observation_space}: PPOBC does not support Dict; wrap the environment in "
                 "gymnasium.wrappers.FlattenObservation"
             )
+        if self.rollout_buffer_class is None:
+            self.rollout_buffer_class = ExpertRolloutBuffer
         super()._setup_model()
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
-        if self.use_sde and self.bc_loss == "nll" and self._ever_clones():
-            raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")
         self.bc_coef = FloatSchedule(self.bc_coef)
+        if self._will_clone():
+            self._check_distribution()
 
     def _excluded_save_params(self) -> list[str]:
         own = ["expert", "_labeller", "_labels", "rollout_buffer_class", "rollout_buffer_kwargs"]
@@ -175,22 +135,31 @@ class PPOBC(PPO):
         """
         if not 0.0 <= bc_coef < float("inf"):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
-        if bc_coef > 0.0 and self.expert is None:
-            raise ExpertError(f"bc_coef {bc_coef}: PPOBC needs an expert to clone, PPOBC(..., expert=PIDExpert())")
+        if bc_coef > 0.0:
+            self._check_expert()
         self._next_bc_coef = float(bc_coef)  # not now: the rollout that is under way was labelled, or not, by the old one
 
-    def _current_bc_coef(self) -> float:
-        return float(self.bc_coef(self._current_progress_remaining))  # type: ignore[operator]
+    def _will_clone(self) -> bool:
+        """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell."""
+        return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())  # type: ignore[operator]
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self.expert is None and self._ever_clones():
+    def _check_expert(self) -> None:
+        if self.expert is None:
             raise ExpertError(
                 "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
             )
+
+    def _check_distribution(self) -> None:
+        if self.use_sde and self.bc_loss == "nll":
+            raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        if self._will_clone():
+            self._check_expert()
         result = super()._setup_learn(*args, **kwargs)
         if self.expert is not None:
             assert self.env is not None
-            self._labeller = ExpertLabeller(self.expert, self.env)
+            self._labeller = Controller.for_env(self.expert, self.env)
         return result
 
     def collect_rollouts(
@@ -198,14 +167,17 @@ class PPOBC(PPO):
     ) -> bool:
         if self._next_bc_coef is not None:
             self.bc_coef, self._next_bc_coef = FloatSchedule(self._next_bc_coef), None
-        if self._labelling and self._labeller is not None and self._labeller.needs_state:
-            observation: Any = self._last_obs
-            self._labels = self._labeller.labels(observation)  # the first step's state, before it
+        # The update on this rollout comes at its end, and with the weight of that time: that weight decides about labels.
+        end = self.num_timesteps + n_rollout_steps * env.num_envs
+        self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
+        if self._rollout_bc_coef != 0.0:
+            self._check_expert()
+            self._check_distribution()
+            assert self._labeller is not None
+            if self._labeller.needs_state:
+                observation: Any = self._last_obs
+                self._labels = self._labeller.labels(observation)  # the first step's state, before it
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-
-    @property
-    def _labelling(self) -> bool:
-        return self._labeller is not None and self._current_bc_coef() != 0.0
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         """Called by ``collect_rollouts`` after ``env.step`` and before ``rollout_buffer.add``: writes the step's labels.
@@ -214,137 +186,178 @@ class PPOBC(PPO):
         observation; an expert on the true state was asked before the step, and now for the step to come.
         """
         super()._update_info_buffer(infos, dones)
-        if not self._labelling:
+        if self._rollout_bc_coef == 0.0:
             return
         assert self._labeller is not None and isinstance(self.rollout_buffer, ExpertRolloutBuffer)
         observation: Any = self._last_obs
+        labels = self._labeller.labels(observation)
         if self._labeller.needs_state:
-            self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labels
-            self._labels = self._labeller.labels(observation)
-        else:
-            self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = self._labeller.labels(observation)
-
-    @property
-    def _adds_nothing(self) -> bool:
-        """Whether the loss is PPO's own, from the first update to the last."""
-        cloning = self._labeller is not None and self._ever_clones()
-        own_value_loss = self.clip_range_vf is not None and self.max_clipped_value
-        return not (cloning or own_value_loss or self.l2_coef > 0.0 or self.critic_warmup > 0)
-
-    def _ever_clones(self) -> bool:
-        return any(FloatSchedule(self.bc_coef)(progress) for progress in (1.0, 0.5, 0.0))
+            labels, self._labels = self._labels, labels
+        self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = labels
 
     def train(self) -> None:
-        """One update on the current rollout; without any addition, ``PPO.train`` itself."""
-        if self._adds_nothing:
-            self._train_as_ppo()
-            return
+        """One update on the rollout just flown: PPO's loop, with what is added to it marked by ``+``."""
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
-        weights = self._weights()
-        warming_up = self._n_rollouts_trained < self.critic_warmup
+        progress = self._current_progress_remaining
+        clip_range = self.clip_range(progress)  # type: ignore[operator]
+        clip_range_vf = None if self.clip_range_vf is None else self.clip_range_vf(progress)  # type: ignore[operator]
+        # + What is added, if anything is.
+        bc_coef, warming_up = self._rollout_bc_coef, self._n_rollouts_trained < self.critic_warmup
+        own_value_loss = clip_range_vf is not None and self.max_clipped_value
+        adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
+
         parameters = list(self.policy.parameters())
+        monitored: list[dict[str, th.Tensor]] = []  # by mini-batch: scalars for the logger, under SB3's names
         grad_norms: dict[str, float] = {}
-        monitored: list[dict[str, th.Tensor]] = []
-        stopped = False
+        continue_training = True
 
         for epoch in range(self.n_epochs):
             first = len(monitored)
-            for samples in self.rollout_buffer.get(self.batch_size):
-                terms = loss_terms(self.policy, cast(ExpertRolloutBufferSamples, samples), weights)
-                loss = terms.weighted["value"] if warming_up else th.stack(list(terms.weighted.values())).sum()
-                monitored.append({"loss": loss.detach(), **terms.monitored})
-                self._check_finite(loss, terms)
-                if not grad_norms:
-                    grad_norms = gradient_norms(terms.weighted, parameters)
-                kl = terms.monitored["approx_kl"]
-                if self.target_kl is not None and kl > 1.5 * self.target_kl:
-                    stopped = True
+            for samples in cast(ExpertRolloutBuffer, self.rollout_buffer).get(self.batch_size):
+                actions = samples.actions
+                if isinstance(self.action_space, spaces.Discrete):
+                    actions = actions.long().flatten()
+
+                entropy: th.Tensor | None
+                if adds:  # + in less time, and with the mean action
+                    values, log_prob, entropy, mean = evaluate_actions(self.policy, samples.observations, actions)
+                else:
+                    try:
+                        values, log_prob, entropy = self.policy.evaluate_actions(samples.observations, actions)
+                    except ValueError as error:  # + of a distribution whose mean is not finite
+                        raise self._diverged("the policy is no longer finite") from error
+                    values = values.flatten()
+
+                advantages = samples.advantages
+                if self.normalize_advantage and len(advantages) > 1:
+                    advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+
+                # The clipped surrogate loss; the ratio of new and old policy is one at first.
+                log_ratio = log_prob - samples.old_log_prob
+                ratio = log_ratio.exp()
+                clipped = ratio.clamp(1 - clip_range, 1 + clip_range)
+                policy_loss = -th.min(advantages * ratio, advantages * clipped).mean()
+
+                if clip_range_vf is None:
+                    value_loss = F.mse_loss(samples.returns, values)
+                elif self.max_clipped_value:  # + Eq. 3.8
+                    value_loss = max_clipped_value_loss(values, samples.old_values, samples.returns, clip_range_vf)
+                else:
+                    change = (values - samples.old_values).clamp(-clip_range_vf, clip_range_vf)
+                    value_loss = F.mse_loss(samples.returns, samples.old_values + change)
+
+                entropy_loss = log_prob.mean() if entropy is None else -entropy.mean()
+
+                terms = {"policy": policy_loss, "value": self.vf_coef * value_loss}
+                if self.ent_coef != 0.0:
+                    terms["entropy"] = self.ent_coef * entropy_loss
+                with th.no_grad():
+                    approx_kl = (ratio - 1 - log_ratio).mean()
+                    clip_fraction = ((ratio - 1).abs() > clip_range).float().mean()
+                logged = {
+                    "policy_gradient_loss": policy_loss,
+                    "value_loss": value_loss,
+                    "entropy_loss": entropy_loss,
+                    "approx_kl": approx_kl,
+                    "clip_fraction": clip_fraction,
+                }
+                if bc_coef != 0.0:  # +
+                    logged["bc_loss"] = self._bc_loss(mean, samples)
+                    terms["bc"] = bc_coef * logged["bc_loss"]
+                if self.l2_coef > 0.0:  # +
+                    logged["l2_loss"] = l2_loss(self.policy)
+                    terms["l2"] = self.l2_coef * logged["l2_loss"]
+                loss = terms["value"] if warming_up else th.stack(list(terms.values())).sum()  # + warming_up
+                monitored.append({name: value.detach() for name, value in {"loss": loss, **logged}.items()})
+                if adds and not grad_norms:  # +
+                    grad_norms = _gradient_norms(terms, parameters)
+
+                if self.target_kl is not None and approx_kl > 1.5 * self.target_kl:
+                    continue_training = False
                     if self.verbose >= 1:
-                        print(f"Early stopping at step {epoch} due to reaching max kl: {kl:.2f}")
+                        print(f"Early stopping at step {epoch} due to reaching max kl: {approx_kl:.2f}")
                     break
+
                 self.policy.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+                norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+                if not (th.isfinite(loss) and th.isfinite(norm)):  # +
+                    parts = f"policy {policy_loss.item():.3g}, value {value_loss.item():.3g}, gradient {norm.item():.3g}"
+                    raise self._diverged(f"the loss is {loss.item():.3g} ({parts})")
                 self.policy.optimizer.step()
+
             self._n_updates += 1
-            if stopped:
+            if not continue_training:
                 break
+
         self._n_rollouts_trained += 1
-        self._record(monitored, first, weights, grad_norms)
-
-    def _train_as_ppo(self) -> None:
-        """``PPO.train``, which goes on after a loss that is not finite: the parameters from before it are put back then."""
-        before = [parameter.detach().clone() for parameter in self.policy.parameters()]
-        try:
-            super().train()
-        except ValueError:  # of a distribution whose parameters are NaN
-            finite = False
-        else:
-            finite = all(bool(th.isfinite(parameter).all()) for parameter in self.policy.parameters())
-        if not finite:
-            with th.no_grad():
-                for parameter, old in zip(self.policy.parameters(), before, strict=True):
-                    parameter.copy_(old)
-            raise TrainingError(f"the loss is not finite after {self.num_timesteps} steps: try a smaller learning_rate")
-
-    def _weights(self) -> Weights:
-        progress = self._current_progress_remaining
-        return Weights(
-            clip_range=self.clip_range(progress),  # type: ignore[operator]
-            clip_range_vf=None if self.clip_range_vf is None else self.clip_range_vf(progress),  # type: ignore[operator]
-            max_clipped_value=self.max_clipped_value,
-            normalize_advantage=self.normalize_advantage,
-            vf_coef=self.vf_coef,
-            ent_coef=self.ent_coef,
-            bc_coef=self._current_bc_coef() if self._labeller is not None else 0.0,
-            bc_loss=self.bc_loss,
-            bc_filter=self.bc_filter,
-            l2_coef=self.l2_coef,
-        )
-
-    def _check_finite(self, loss: th.Tensor, terms: LossTerms) -> None:
-        if not th.isfinite(loss):
-            raise TrainingError(
-                f"the loss is {loss.item()} after {self.num_timesteps} steps (policy "
-                f"{terms.monitored['policy_gradient_loss'].item():.3g}, value {terms.monitored['value_loss'].item():.3g}): "
-                "try a smaller learning_rate or bc_coef, and check the expert's actions"
-            )
-
-    def _record(
-        self, monitored: list[dict[str, th.Tensor]], first: int, weights: Weights, grad_norms: dict[str, float]
-    ) -> None:
-        """Log an update under PPO's names. As there, ``approx_kl`` is of the last epoch, which began at row ``first``."""
-        for name in monitored[0]:
+        for name in monitored[0]:  # as in PPO, approx_kl is of the last epoch and loss of the last mini-batch
             rows = monitored[-1:] if name == "loss" else monitored[first:] if name == "approx_kl" else monitored
             self.logger.record(f"train/{name}", th.stack([row[name] for row in rows]).mean().item())
-        values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
-        self.logger.record("train/explained_variance", explained_variance(values, returns))
+        old_values, returns = self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten()
+        self.logger.record("train/explained_variance", explained_variance(old_values, returns))
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/clip_range", weights.clip_range)
-        if weights.clip_range_vf is not None:
-            self.logger.record("train/clip_range_vf", weights.clip_range_vf)
-        self.logger.record("train/bc_coef", weights.bc_coef)
-        for name, norm in grad_norms.items():
-            self.logger.record(f"train/grad_norm_{name}", norm)
+        self.logger.record("train/clip_range", clip_range)
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+        self.logger.record("train/bc_coef", bc_coef)  # +
+        for name, value in grad_norms.items():  # +
+            self.logger.record(f"train/grad_norm_{name}", value)
+
+    def _diverged(self, what: str) -> TrainingError:
+        advice = "try a smaller learning_rate or bc_coef, and check the expert's actions"
+        return TrainingError(f"{what} after {self.num_timesteps} timesteps: {advice}")
+
+    def _bc_loss(self, mean: th.Tensor, samples: ExpertRolloutBufferSamples) -> th.Tensor:
+        """L_BC of Eq. 3.12 over the mini-batch, a scalar; rows that the filter leaves out count as zero.
+
+        :param mean: the policy's mean actions, (batch_size, action_dim).
+        """
+        errors = cloning_errors(self.bc_loss, mean, self.policy.log_std, samples.expert_actions)
+        if self.bc_loss == "nll":
+            errors = errors / samples.expert_actions.shape[1]
+        if self.bc_filter == "negative_advantage":
+            errors = errors * (samples.advantages < 0)  # their sign before they are normalised
+        elif self.bc_filter == "agreement":
+            errors = errors * ((mean - samples.expert_actions).square().mean(dim=1) < AGREEMENT**2)
+        return errors.mean()
 
     def learn(
-        self: SelfPPOBC,
+        self,
         total_timesteps: int,
         callback: MaybeCallback = None,
         log_interval: int = 1,
         tb_log_name: str = "PPOBC",
         reset_num_timesteps: bool = True,
         progress_bar: bool = False,
-    ) -> SelfPPOBC:
+    ) -> Self:
         """As ``PPO.learn``; see the class for what it raises."""
         return super().learn(
-            total_timesteps=total_timesteps,
-            callback=callback,
-            log_interval=log_interval,
-            tb_log_name=tb_log_name,
-            reset_num_timesteps=reset_num_timesteps,
-            progress_bar=progress_bar,
+            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
         )
+
+
+def _gradient_norms(terms: Mapping[str, th.Tensor], parameters: list[th.nn.Parameter]) -> dict[str, float]:
+    """The norm of each term's own gradient over all parameters; the graph stays for the real backward pass.
+
+    PPO's gradient clip is joint: these numbers show which term pulls how hard, and whether one starves the others.
+    """
+    norms = {}
+    for name, term in terms.items():
+        gradients = th.autograd.grad(term, parameters, retain_graph=True, allow_unused=True)
+        squares = [gradient.square().sum() for gradient in gradients if gradient is not None]
+        norms[name] = float(th.stack(squares).sum().sqrt()) if squares else 0.0
+    return norms
+
+
+def _full_signature() -> inspect.Signature:
+    """The constructor's parameters: those of PPO, then what ``PPOBC`` adds, by keyword."""
+    theirs, ours = (inspect.signature(each.__init__).parameters for each in (PPO, PPOBC))
+    own = [parameter for parameter in ours.values() if parameter.kind is parameter.KEYWORD_ONLY]
+    return inspect.Signature([each for name, each in theirs.items() if name not in ours or name == "self"] + own)
+
+
+PPOBC.__init__.__signature__ = _full_signature()  # type: ignore[attr-defined]

@@ -22,7 +22,7 @@ from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import takes_expert
 from sb3_quad.settings.config import SETTINGS, VEC_ENVS
 from sb3_quad.settings.literals import parse_mapping
-from sb3_quad.training.handover import hand_over
+from sb3_quad.training.handover import transfer_policy
 from sb3_quad.zoo.registration import OWN_ALGORITHMS, Settings, register_space, to_keywords
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             return super()._load_pretrained_agent(hyperparams, env)  # type: ignore[no-any-return]
         given: Settings = {"tensorboard_log": self.tensorboard_log, "seed": self.seed, "verbose": self.verbose}
         model = ALGOS[self.algo](env=env, device=self.device, **given, **hyperparams)
-        hand_over(self.trained_agent, model)
+        transfer_policy(self.trained_agent, model)
         return model  # type: ignore[no-any-return]
 
     def _save_config(self, saved_hyperparams: Settings) -> None:

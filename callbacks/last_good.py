@@ -6,25 +6,23 @@ import random
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import TrainingError
 from sb3_quad.base.files import model_bytes
-from sb3_quad.training.environments import environment_state
 
 ENVIRONMENT = "environment."  # before the names of the environments' arrays
-Arrays = dict[str, npt.NDArray[np.generic]]
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A training between two rollouts: all that it needs to go on as if nothing had happened, but for a dataset."""
+    """A training between two rollouts: everything it needs to continue as if nothing had happened, except a dataset."""
 
     timesteps: int
     model: bytes  # the zip
-    state: Arrays  # random numbers and environments, as ``random_state`` and the environment give them
+    state: Arrays  # random numbers, and the environments' arrays under ``ENVIRONMENT``
 
 
 class LastGoodModel(BaseCallback):
@@ -39,7 +37,7 @@ class LastGoodModel(BaseCallback):
     >>> last_good.snapshot.timesteps, PPO.load(io.BytesIO(last_good.snapshot.model), device="cpu").num_timesteps
     (800, 800)
 
-    :raises TrainingError: parameters that are no longer finite; the snapshot then is the one before that update.
+    :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from before that update.
     """
 
     snapshot: Snapshot | None = None
@@ -47,11 +45,10 @@ class LastGoodModel(BaseCallback):
     def _on_rollout_start(self) -> None:
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
-                raise TrainingError(
-                    f"after {self.num_timesteps:,} transitions {name} is no longer finite; lower learning_rate"
-                )
-        state = random_state()
-        state |= {f"{ENVIRONMENT}{name}": array for name, array in environment_state(self.training_env).items()}
+                raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")
+        batch = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
+        arrays = {} if batch is None else batch.snapshot()
+        state = random_state() | {f"{ENVIRONMENT}{name}": array for name, array in arrays.items()}
         self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model), state)
 
     def _on_step(self) -> bool:
@@ -60,7 +57,7 @@ class LastGoodModel(BaseCallback):
 
 def random_state() -> Arrays:
     """The states of torch's, NumPy's and Python's global random number generators."""
-    _, keys, position, has_normal, normal = np.random.get_state(legacy=True)  # noqa: NPY002 - SB3 draws from it
+    _, keys, position, has_normal, normal = np.random.get_state(legacy=True)  # noqa: NPY002 - SB3 samples from it
     version, words, gauss = random.getstate()
     return {
         "torch": th.get_rng_state().numpy().copy(),

@@ -1,0 +1,66 @@
+"""Callbacks that do something every so many timesteps: their base class, and the simplest one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from stable_baselines3.common.callbacks import EventCallback
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import save_model
+
+
+class EveryTimesteps(EventCallback):
+    """Calls :meth:`_on_event` after the first step at or beyond each multiple of ``every``, also in a resumed training.
+
+    SB3's EveryNTimesteps counts from its last call instead, so its events drift away from the multiples.
+
+    :param every: timesteps, over all environments together.
+    :param counts: further arguments that must be at least 1, by name.
+    :raises ConfigError: one of these numbers is below 1.
+    """
+
+    def __init__(self, every: int, verbose: int = 0, **counts: int) -> None:
+        super().__init__(verbose=verbose)
+        for name, value in {"every": every, **counts}.items():
+            if value < 1:
+                raise ConfigError(f"{type(self).__name__}: {name} is {value}, must be at least 1")
+        self._every, self._next = every, every
+
+    def _on_training_start(self) -> None:
+        self._next = (self.num_timesteps // self._every + 1) * self._every
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps < self._next:
+            return True
+        self._next = (self.num_timesteps // self._every + 1) * self._every
+        return self._on_event()
+
+
+class Checkpoint(EveryTimesteps):
+    """Saves the model every ``every`` timesteps, each file whole or not at all.
+
+    >>> from stable_baselines3 import PPO
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> model = PPO("MlpPolicy", QuadcopterVecEnv(8, seed=0), n_steps=100, batch_size=400, device="cpu")
+    >>> _ = model.learn(1600, callback=Checkpoint(800, "checkpoints/rl_model_{steps}_steps.zip"))
+    >>> sorted(path.name for path in Path("checkpoints").iterdir())
+    ['rl_model_1600_steps.zip', 'rl_model_800_steps.zip']
+
+    :param every: timesteps, over all environments together.
+    :param path: the file, with ``{steps}`` where the number of timesteps goes; or a function from that number to the file.
+        A file there is replaced.
+    :raises ConfigError: ``every`` below 1, a path without ``{steps}``; when saving, a folder that cannot be written.
+    """
+
+    def __init__(self, every: int, path: str | Callable[[int], Path], verbose: int = 0) -> None:
+        super().__init__(every, verbose)
+        if isinstance(path, str) and "{steps}" not in path:
+            raise ConfigError(f"Checkpoint: {path}: must hold {{steps}}, or each checkpoint would replace the one before")
+        self._path = path
+
+    def _on_event(self) -> bool:
+        path, steps = self._path, self.num_timesteps
+        save_model(self.model, path.replace("{steps}", str(steps)) if isinstance(path, str) else path(steps))
+        return True
