@@ -15,9 +15,9 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays, refuse_existing, write_arrays, write_text
 from sb3_quad.base.yaml_files import SUFFIXES, parse_mapping_file
 from sb3_quad.callbacks.every import EveryTimesteps
-from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, FEATURES, GROUPS, OBSERVATION_SIZE
 
-UNITS = {"position": "m", "rotation": "-", "velocity": "m/s", "body_rates": "rad/s"}
+UNITS = {feature.name: feature.unit for feature in FEATURES}
 
 
 class ObservationStatistics(EveryTimesteps):

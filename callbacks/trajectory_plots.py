@@ -38,7 +38,7 @@ class TrajectoryPlots(EveryTimesteps):
     :param seed: of the first episode; the next one has the next seed.
     :param max_steps: control steps after which an episode ends at the latest.
     :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as ``task`` and ``vehicle``.
-    :raises ConfigError: ``every`` or ``n_flights`` below 1, an unknown keyword; when training begins, a policy of other spaces.
+    :raises ConfigError: ``every`` or ``n_flights`` below 1, an unknown keyword; a policy of other spaces.
     """
 
     def __init__(

@@ -161,7 +161,8 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
         # One row of the batched environment, whose body PyBullet moves.
-        self._row = QuadcopterBatch(1, task, task_kwargs, **{"max_episode_steps": _NO_LIMIT, **keywords}, autoreset=False)
+        keywords.setdefault("max_episode_steps", _NO_LIMIT)
+        self._row = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._seeded = self._ready = False
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
@@ -256,7 +257,7 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
 
     def observe(self) -> Float32Array:
         """The present observation, (18,); the same numbers until the next step, unless something was set meanwhile."""
-        return self._row.observe()[0]
+        return np.asarray(self._row.observe()[0])
 
     def true_state(self) -> QuadcopterState:
         """The true state, a live view of one row."""
@@ -270,7 +271,7 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
     @property
     def target(self) -> FloatArray:
         """r_T, (3,), world frame, m."""
-        return self.true_state().target[0].copy()
+        return np.array(self.true_state().target[0])
 
     @property
     def noise(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -36,7 +37,7 @@ def progress_bar(wanted: bool | None) -> Iterator[Show]:
     """
     columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True))
     description = TextColumn("{task.description}", markup=False)
-    options = {"console": Console(file=sys.stderr), "disable": not shows_progress(wanted)}
+    options: dict[str, Any] = {"console": Console(file=sys.stderr), "disable": not shows_progress(wanted)}
     # Lines printed meanwhile appear above the bar, or go where stdout leads.
     with Progress(*columns, description, transient=True, redirect_stdout=sys.stdout.isatty(), **options) as bar:
         task = bar.add_task("", total=None)

@@ -16,8 +16,9 @@ def first_rows(sizes: Mapping[str, int]) -> Any:
     >>> first_rows({"position": 3, "quaternion": 4})
     Rows(position=0, quaternion=3)
     """
-    starts = accumulate(sizes.values(), initial=0)
-    return namedtuple("Rows", list(sizes))(*list(starts)[:-1])  # type: ignore[misc]
+    starts = [0, *accumulate(sizes.values())]
+    rows: Any = namedtuple("Rows", list(sizes))  # type: ignore[misc]
+    return rows._make(starts[:-1])
 
 
 def row_slices(sizes: Mapping[str, int]) -> dict[str, slice]:

@@ -114,4 +114,4 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     features *= 1.0 + settings.noise * rng.standard_normal(features.shape)
     mean = DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
     std = DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
-    return ((features - mean) / std).astype(np.float32)
+    return np.asarray((features - mean) / std, dtype=np.float32)

@@ -27,7 +27,7 @@ def write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm,
     if resumable:
         if hasattr(model, "save_dataset"):
             model.save_dataset(run.dataset)
-        write_arrays(run.resume_state, timesteps=np.array(snapshot.timesteps), **snapshot.state)
+        write_arrays(run.resume_state, compressed=False, timesteps=np.array(snapshot.timesteps), **snapshot.state)
     write_bytes(run.model, snapshot.model)
 
 

@@ -57,13 +57,13 @@ def run(options: argparse.Namespace) -> int:
     times = (f"{measured.time_to_0_1_m:.2f} s", f"{measured.tracking_reward:.2f}")
     rows = [("state recovery", *recovery), ("target tracking", *tracking, *times)]
     console().print(text_table("on fresh episodes, true state", heads, rows))
-    rows = []
+    starts = []
     for quantity, groups in recoveries.flown.items():
         for group, flown in groups.items():
             lost = recoveries.lost[quantity][group]
             success = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
-            rows.append((f"{quantity} {group}", str(flown), str(lost), success))
-    console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "success"), rows))
+            starts.append((f"{quantity} {group}", str(flown), str(lost), success))
+    console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "success"), starts))
     print(f"{search.trials_done} gains tried, least cost {search.best_cost:.3f}; journal: {journal}")
     print(f"saved {output}")
     return signals.exit_code
