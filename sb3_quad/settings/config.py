@@ -73,7 +73,7 @@ class TrainingConfig(Frozen):
     env_kwargs: Keywords = Field(default_factory=dict)
     eval_env_kwargs: Keywords = Field(default_factory=dict)
     eval_tasks: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
-    eval_expert: StrictBool = False
+    eval_expert: StrictBool = Field(default=False, description="true or false")
     policy: str = "MlpPolicy"
     policy_kwargs: Keywords = Field(default_factory=dict)
     expert: Any = None

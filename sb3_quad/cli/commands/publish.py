@@ -29,9 +29,8 @@ def run(options: argparse.Namespace) -> int:
     zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
-    run = open_run(Path(options.model).parent)
-    command = options.made_by or _command(run)
-    content, facts, settings = slim_bytes(options.model), _facts(run), _settings(options.model)
+    content, run = slim_bytes(options.model), open_run(Path(options.model).parent)
+    command, facts, settings = options.made_by or _command(run), _facts(run), _settings(options.model)
     write_bytes(zip_file, content)
     rows = measure(load_model(zip_file), options.episodes, **settings)
     card = write_card(options.name, rows, command, facts, settings)
