@@ -98,21 +98,14 @@ def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-d
 def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped-def]
     """Desired force per mass in the world frame, m/s²."""
     distance = math.sqrt(ex * ex + ey * ey)
-    speed = (
-        _braking_profile(distance, gains[G.position], gains[G.deceleration]) / distance
-        if distance > 0.0
-        else gains[G.position]
-    )
+    speed = gains[G.position]  # per distance
+    if distance > 0.0:
+        speed = _braking_profile(distance, gains[G.position], gains[G.deceleration]) / distance
     fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
-    rise = math.copysign(
-        _braking_profile(
-            abs(ez), gains[G.height_position], gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
-        ),
-        ez,
-    )
-    fz = max(
-        0.1 * g, g + max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
-    )  # upwards, so that a tilt can be told
+    deceleration = gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
+    rise = math.copysign(_braking_profile(abs(ez), gains[G.height_position], deceleration), ez)
+    climb = max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
+    fz = max(0.1 * g, g + climb)  # upwards, so that the force has a tilt
     horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[G.tilt] * fz
     scale = limit / horizontal if horizontal > limit else 1.0
     return scale * fx, scale * fy, fz

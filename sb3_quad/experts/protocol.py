@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.errors import ExpertError
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.rotation import nearest_rotation, quaternion_from_rotation
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
@@ -57,8 +57,9 @@ class Expert(ABC):
         :raises ExpertError: observations of another shape.
         """
         array = np.asarray(observation, dtype=np.float64)
-        if array.ndim not in (1, 2) or array.shape[-1] != DEFAULT_MEAN.size:
-            raise ExpertError(f"{type(self).__name__}: observation of shape {array.shape}, expected (18,) or (n, 18)")
+        if array.ndim not in (1, 2) or array.shape[-1] != OBSERVATION_SIZE:
+            sizes = f"({OBSERVATION_SIZE},) or (n, {OBSERVATION_SIZE})"
+            raise ExpertError(f"{type(self).__name__}: observation of shape {array.shape}, expected {sizes}")
         actions = self.actions(observed_state(np.atleast_2d(array), self.observation_mean, self.observation_std))
         return (actions[0] if array.ndim == 1 else actions), state
 
@@ -66,15 +67,16 @@ class Expert(ABC):
 def observed_state(
     observation: npt.NDArray[np.float64], mean: npt.NDArray[np.float64], std: npt.NDArray[np.float64]
 ) -> QuadcopterState:
-    """The state that observations of shape (n, 18) tell of, with the target as origin (Eq. 3.16 undone).
+    """The state that observations of shape (n, 18) describe, with the target as origin (Eq. 3.16 undone).
 
     Noise leaves ᴮRᴵ no rotation; the nearest one is taken. Rotor speeds cannot be observed and are zero.
     """
     features = observation * std + mean
-    rotation = nearest_rotation(features[:, 3:12].reshape(-1, 3, 3).transpose(0, 2, 1))
+    part = {name: features[:, columns] for name, columns in GROUPS.items()}
+    rotation = nearest_rotation(part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1))
     array = np.zeros((STATE_SIZE, len(features)))
-    array[POSITION] = features[:, 0:3].T
+    array[POSITION] = part["position"].T
     array[QUATERNION] = quaternion_from_rotation(rotation).T
-    array[VELOCITY] = np.einsum("nij,nj->in", rotation, features[:, 12:15])
-    array[BODY_RATES] = features[:, 15:18].T
+    array[VELOCITY] = np.einsum("nij,nj->in", rotation, part["velocity"])
+    array[BODY_RATES] = part["body_rates"].T
     return QuadcopterState(array)

@@ -64,9 +64,7 @@ class Task(Frozen):
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
-SCORED = [
-    name for name in TASK if name == "max_distance" or name.endswith("_cost")
-]  # what a control step needs; they come last
+SCORED = [name for name in TASK if name == "max_distance" or name.endswith("_cost")]  # what a control step needs
 S = first_rows(dict.fromkeys(SCORED, 1))
 
 TASKS: Mapping[str, Task] = {

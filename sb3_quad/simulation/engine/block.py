@@ -22,6 +22,7 @@ from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 X = first_rows(STATE)
 T = first_rows(TASK)
 P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
+_SCORED = tuple(getattr(T, name) for name in SCORED)
 _WORDS = -(-OBSERVATION_SIZE // 4) * 4
 _NORMALS = -(-OBSERVATION_SIZE // 2) * 2
 
@@ -167,7 +168,7 @@ def load_scored(b, task_index, tasks, first, count):
     for lane in range(LANES):
         task = 0 if tasks.shape[0] == 1 else task_index[first + min(lane, count - 1)]
         for k in range(scored.shape[0]):
-            scored[k, lane] = tasks[task, T.max_distance + k]
+            scored[k, lane] = tasks[task, _SCORED[k]]
 
 
 @compiled

@@ -101,6 +101,15 @@ def _turned(qw, qx, qy, qz, aw, ax, ay, az):
     )
 
 
+@compiled(inline="always")
+def _advance(b, lane, dt):
+    """The position by the new velocity; the axis of the turn, dt ω / 2."""
+    x, v, w, half_step = b.position, b.velocity, b.body_rates, 0.5 * dt
+    for k in range(3):
+        x[k, lane] += dt * v[k, lane]
+    return half_step * w[0, lane], half_step * w[1, lane], half_step * w[2, lane]
+
+
 @compiled(fastmath=True)
 def move(b, dt):
     """Position and attitude by the new velocities, for steps up to ``SMALL_STEP``.
@@ -108,13 +117,9 @@ def move(b, dt):
     With h = dt |ω| / 2 below 0.2166, sin(h)/h to h¹⁰ and cos(h) to h¹² are exact to double precision, and the new
     quaternion is off unit norm by rounding only, which one step of Newton's method takes back.
     """
-    x, q, v, w = b.position, b.quaternion, b.velocity, b.body_rates
-    half_step = 0.5 * dt
+    q = b.quaternion
     for lane in range(LANES):
-        x[0, lane] += dt * v[0, lane]
-        x[1, lane] += dt * v[1, lane]
-        x[2, lane] += dt * v[2, lane]
-        ax, ay, az = half_step * w[0, lane], half_step * w[1, lane], half_step * w[2, lane]
+        ax, ay, az = _advance(b, lane, dt)
         h2 = ax * ax + ay * ay + az * az
         sinc = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0 * (1.0 - h2 / 110.0))))
         aw = 1.0 - h2 / 2.0 * (
@@ -131,13 +136,9 @@ def move(b, dt):
 @compiled(fastmath=True)
 def move_far(b, dt):
     """As :func:`move`, for steps of any length: PyBullet's cut of the angle, longer series, full normalisation."""
-    x, q, v, w, work = b.position, b.quaternion, b.velocity, b.body_rates, b.work
-    half_step = 0.5 * dt
+    q, work = b.quaternion, b.work
     for lane in range(LANES):
-        x[0, lane] += dt * v[0, lane]
-        x[1, lane] += dt * v[1, lane]
-        x[2, lane] += dt * v[2, lane]
-        ax, ay, az = half_step * w[0, lane], half_step * w[1, lane], half_step * w[2, lane]
+        ax, ay, az = _advance(b, lane, dt)
         h2 = min(ax * ax + ay * ay + az * az, MAX_HALF_ANGLE * MAX_HALF_ANGLE)
         sinc = 1.0 - h2 / 156.0 * (1.0 - h2 / 210.0)
         sinc = 1.0 - h2 / 6.0 * (1.0 - h2 / 20.0 * (1.0 - h2 / 42.0 * (1.0 - h2 / 72.0 * (1.0 - h2 / 110.0 * sinc))))

@@ -64,19 +64,18 @@ def philox(c0, c1, c2, c3, k0, k1):
     return uint32(c0), uint32(c1), uint32(c2), uint32(c3)
 
 
+@compiled(forceinline=True)
+def _words(streams, row, block, purpose):
+    counter = uint32(block), streams[STEP, row], streams[EPISODE, row], uint32(purpose)
+    return philox(*counter, streams[KEY_LO, row], streams[KEY_HI, row])
+
+
 @compiled
 def uniforms(streams, row, blocks, purpose):
     """Doubles uniform on (0, 1), of 53 bits each, two per block: shape (2 blocks,)."""
     numbers = np.empty(2 * blocks)
     for block in range(blocks):
-        w0, w1, w2, w3 = philox(
-            uint32(block),
-            streams[STEP, row],
-            streams[EPISODE, row],
-            uint32(purpose),
-            streams[KEY_LO, row],
-            streams[KEY_HI, row],
-        )
+        w0, w1, w2, w3 = _words(streams, row, block, purpose)
         numbers[2 * block] = (((uint64(w0) << _SHIFT | uint64(w1)) >> uint64(11)) + 0.5) * 2.0**-53
         numbers[2 * block + 1] = (((uint64(w2) << _SHIFT | uint64(w3)) >> uint64(11)) + 0.5) * 2.0**-53
     return numbers
@@ -88,18 +87,9 @@ def random_words(b):
     word, stream = b.word, b.stream
     for block in range(word.shape[0] // 4):
         for lane in range(LANES):
-            w0, w1, w2, w3 = philox(
-                uint32(block),
-                stream[STEP, lane],
-                stream[EPISODE, lane],
-                uint32(OBSERVATION_NOISE),
-                stream[KEY_LO, lane],
-                stream[KEY_HI, lane],
-            )
-            word[4 * block, lane] = w0
-            word[4 * block + 1, lane] = w1
-            word[4 * block + 2, lane] = w2
-            word[4 * block + 3, lane] = w3
+            w0, w1, w2, w3 = _words(stream, lane, block, OBSERVATION_NOISE)
+            word[4 * block, lane], word[4 * block + 1, lane] = w0, w1
+            word[4 * block + 2, lane], word[4 * block + 3, lane] = w2, w3
 
 
 @compiled(forceinline=True)
