@@ -12,7 +12,10 @@ from sb3_quad.experts.models import load_model
 from sb3_quad.pretrained_policies import agent_path, pretrained_names
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
-EXPERTS = {"pid": "sb3_quad.experts.pid:PIDExpert", "geometric": "sb3_quad.experts.geometric:GeometricExpert"}
+EXPERTS = {
+    "pid": "sb3_quad.experts.pid:PIDExpert",
+    "geometric": "sb3_quad.experts.geometric:GeometricExpert",
+}
 
 
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:

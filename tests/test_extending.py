@@ -1,0 +1,105 @@
+"""The diffs of docs/extending.md, applied to a copy of the source tree: they are what they say, and fly as PyBullet does."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+DIFFS = re.findall(r"```diff\n(.*?)```", PAGE, flags=re.DOTALL)
+STEPS = 150
+
+SCRIPT = """
+import json
+import numpy as np
+from sb3_quad.cli import main
+from sb3_quad.envs import QuadcopterEnv
+from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import FEATURE_NAMES
+
+def batch(**task_kwargs):
+    made = QuadcopterBatch(2, "upright_fall", task_kwargs, "trainer_quad", noise=0.0, seed=5, autoreset=False)
+    made.reset()
+    return made
+
+def single(row):
+    made = QuadcopterEnv("upright_fall", {"speed_cost": 0.01}, vehicle="trainer_quad", noise=0.0)
+    made.reset(seed=5 + row)
+    return made
+
+plain, costly, twins = batch(), batch(speed_cost=0.01), [single(row) for row in range(2)]
+found = {"state": 0.0, "reward": 0.0, "term": 0.0, "feature": 0.0, "observation": 0.0}
+def note(name, difference):
+    found[name] = max(found[name], float(np.abs(difference).max()))
+
+actions = np.random.default_rng(0).uniform(-1, 1, (STEPS, 2, 4)).astype(np.float32)
+for step in range(STEPS):
+    plain.step(actions[step])
+    observations, _, _ = costly.step(actions[step])
+    state, reward = costly.true_state(), costly.outcome["reward"]
+    note("term", plain.outcome["reward"] - reward - 0.01 * np.linalg.norm(state.velocity, axis=1))
+    note("feature", observations[:, -4:] - state.rotor_speeds / 600.0)
+    for row, env in enumerate(twins):
+        seen, worth, _, _, _ = env.step(actions[step, row])
+        for name in ("position", "rotation", "velocity", "body_rates", "rotor_speeds"):
+            note("state", getattr(env.true_state(), name)[0] - getattr(state, name)[row])
+        note("reward", worth - reward[row])
+        note("observation", seen - observations[row])
+expert = resolve_expert("hover", "trainer_quad")
+found["size"] = len(FEATURE_NAMES)
+found["expert"] = float(np.abs(expert.predict(observations)[0] - expert.vehicle.hover_action).max())
+found["command"] = main(["vehicles"])
+print(json.dumps(found))
+"""
+
+
+def apply(diff, root):
+    """Apply a unified diff, each hunk where its old lines stand."""
+    for old, new, hunks in re.findall(r"--- (\S+)\n\+\+\+ (\S+)\n(.*?)(?=\n--- |\Z)", diff, flags=re.DOTALL):
+        path = root / new.removeprefix("b/")
+        text = "" if old == "/dev/null" else path.read_text(encoding="utf-8")
+        for hunk in re.split(r"(?:^|\n)@@.*\n", hunks)[1:]:
+            lines = hunk.rstrip("\n").split("\n")
+            before = "".join(f"{line[1:]}\n" for line in lines if line[:1] in " -")
+            after = "".join(f"{line[1:]}\n" for line in lines if line[:1] in " +")
+            assert text.count(before) == 1 or not text, f"{path.name}: {before}"
+            text = text.replace(before, after) if text else after
+        path.write_text(text, encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def extended(tmp_path_factory):
+    root = tmp_path_factory.mktemp("extended")
+    for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
+        shutil.copytree(ROOT / name, root / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "setup.cfg", root)
+    for diff in DIFFS:
+        apply(diff, root)
+    return root
+
+
+@pytest.mark.parametrize("diff", DIFFS, ids=lambda diff: diff.split("\n+++ b/")[1].split("\n")[0])
+def test_each_is_small(diff):
+    assert 1 <= diff.count("\n+++ ") <= 2
+    assert len([line for line in diff.splitlines() if line[:1] in "+-" and line[:3] not in ("+++", "---")]) <= 24
+
+
+def test_the_extended_package_flies_as_pybullet_does(extended):
+    environment = {**os.environ, "PYTHONPATH": str(extended)}
+    command = [sys.executable, "-c", SCRIPT.replace("STEPS", str(STEPS))]
+    done = subprocess.run(command, cwd=extended, env=environment, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["state"] < 1e-9 and found["reward"] < 1e-9 and found["term"] < 1e-12
+    assert found["feature"] < 1e-6 and found["observation"] < 1e-6  # float32
+    assert found["size"] == 22 and found["expert"] < 1e-6 and found["command"] == 0
+    assert "trainer_quad: 1.2 kg" in done.stdout
