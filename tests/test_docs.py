@@ -84,6 +84,10 @@ def check_dynamics(scope):
     assert scope["observed"] < 1e-6 and scope["fastest"] > 20.0
 
 
+def check_environments(scope):
+    assert scope["difference"] < 1e-9
+
+
 def check_vehicles(scope):
     assert abs(scope["flights"].success.mean() - 0.953) < 0.01
 
@@ -93,6 +97,7 @@ CHECKS = {
     "README.md": check_readme,
     "docs/dagger.md": check_dagger,
     "docs/dynamics.md": check_dynamics,
+    "docs/environments.md": check_environments,
     "docs/ppo_bc.md": check_ppo_bc,
     "docs/vehicles.md": check_vehicles,
 }
