@@ -1,7 +1,7 @@
-"""Every range of seeds, by what it is for: the episodes of one purpose are never those of another.
+"""Every range of seeds, by what it is for: what judges a training is never what it was trained on.
 
-A run with ``seed`` trains on episodes of the seeds ``seed``, ``seed + 1``, …, one for each environment. What judges the run is
-flown on other episodes, whose first seed is :func:`seed_for` its purpose. Seeds of the suites are part of the scenarios.
+A seed names an episode's stream of random numbers. A purpose has ``ROOM`` seeds, one for each run; environment i takes the i-th
+after its run's.
 """
 
 from __future__ import annotations
@@ -10,26 +10,27 @@ from typing import Literal
 
 from sb3_quad.base.errors import ConfigError
 
-Purpose = Literal["evaluation", "trim", "table", "expert", "offset", "card"]
+Purpose = Literal["training", "evaluation", "trim", "table", "expert", "offset", "card"]
 
+ROOM = 2**17
+SUITE = 2**19  # of scenarios that name no seed: the episodes of closing tables, which judge as well
+SCENARIO_STREAM = 0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
+LARGEST = 2**32 - 2**20
 _FIRST: dict[Purpose, int] = {
+    "training": 0,
     "evaluation": 2**18,  # along the way
-    "trim": 3 * 2**17,  # an agent's offset before and after it is trimmed
+    "trim": 3 * 2**17,  # before and after an agent is trimmed
     "table": 2**19,  # at the end of a run
-    "expert": 1_000_000,  # what an expert reaches: tune-expert, check-vehicle
-    "offset": 2**21,  # the offset that adaptive scaling cancels
+    "expert": 1_000_000,  # tune-expert, check-vehicle
+    "offset": 2**21,  # that adaptive scaling cancels
     "card": 20_000_000,  # of published policies
 }
-SUITE = 2**19  # scenarios that name no seed
-ROOM = 2**17  # seeds between one purpose and the next
-LARGEST = 2**32 - 2**20
-SCENARIO_STREAM = 0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
 
 
 def seed_for(purpose: Purpose, seed: int = 0) -> int:
-    """The first seed of the episodes that judge a run with ``seed``.
+    """The first seed of the episodes that a run with ``seed`` flies for some purpose.
 
-    A seed that leaves the room between two purposes is moved beyond all ranges, together with its purpose's number.
+    Seeds of ``ROOM`` and above would reach into the next purpose's; they get ranges beyond all others.
     """
     if seed < ROOM:
         return _FIRST[purpose] + seed

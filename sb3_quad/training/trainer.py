@@ -110,7 +110,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
     made: list[VecEnv] = []
     evaluating: EvalEnvs = {}
     try:
-        made.append(make_environments(config, config.n_envs, job.seed))
+        made.append(make_environments(config, config.n_envs, seed_for("training", job.seed)))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
             for task in (None, *config.eval_tasks):
@@ -140,11 +140,13 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
     try:
-        return get_algorithm(config.algo)(config.policy, env, **keywords)
+        model = get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
+    env.seed(seed_for("training", job.seed))  # SB3 has just seeded it with the seed of the policy
+    return model
 
 
 def _learn(
