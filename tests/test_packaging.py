@@ -197,43 +197,25 @@ print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs
 
 @pytest.mark.slow
 def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
-    """From another folder: what a newcomer does after ``pip install``."""
-    command, seed = installed / "sb3-quad", ("--seed", "0")
-    small = ("--hyperparams", "n_steps:50", "gradient_steps:5", "batch_size:256")
-    run(command, "train", "--algo", "dagger", "-n", "24000", "--eval-episodes", "0", *seed, *small, cwd=tmp_path)
-    model = tmp_path / "logs" / "dagger" / "QuadTargetTracking-v0_1" / "QuadTargetTracking-v0.zip"
-    fly = """
-import sys
-sys.modules["sb3_quad"] = None
-import numpy as np
-from stable_baselines3 import PPO
-print(PPO.load(sys.argv[1], device="cpu").predict(np.zeros(18, dtype=np.float32))[0].shape)
-"""
-    assert run(installed / "python", "-c", fly, model, cwd=tmp_path).strip() == "(4,)"
-    pretrained = "import sb3_quad; print(sb3_quad.load_pretrained('itm-recovery').num_timesteps)"
-    assert int(run(installed / "python", "-c", pretrained, cwd=tmp_path).splitlines()[-1]) > 0
-    for file_format, ending in (("onnx", ".onnx"), ("c", ".h")):
-        run(command, "export", model, "--format", file_format, cwd=tmp_path)
-        assert model.with_suffix(ending).stat().st_size > 10_000
-    space = tmp_path / "space.yml"
-    space.write_text("learning_rate: {low: 1.0e-3, high: 1.0e-2, log: true}\n")
-    search = (
-        "--algo",
-        "dagger",
-        "-n",
-        "1600",
-        "--n-envs",
-        "16",
-        "--n-trials",
-        "3",
-        "--n-evaluations",
-        "1",
-        "--eval-episodes",
-        "2",
+    """From another folder, what a newcomer does after ``pip install``; in one process, which compiles once."""
+    algo = ["--algo", "dagger", "--eval-episodes"]
+    small = ["--seed", "0", "--hyperparams", "n_steps:50", "gradient_steps:5", "batch_size:256"]
+    search = ["-n", "1600", "--n-envs", "16", "--n-trials", "2", "--n-evaluations", "1", "--search-space", "space.yml"]
+    zip_file, best = (
+        "logs/dagger/QuadTargetTracking-v0_1/QuadTargetTracking-v0.zip",
+        "logs/tune/dagger/QuadTargetTracking-v0_1/best.yml",
     )
-    run(command, "tune", *search, *seed, *small, "--search-space", space, cwd=tmp_path)
-    best = tmp_path / "logs" / "tune" / "dagger" / "QuadTargetTracking-v0_1" / "best.yml"
-    run(command, "train", "--algo", "dagger", "--conf-file", best, "-n", "1600", "--eval-episodes", "0", cwd=tmp_path)
+    commands = [
+        ["train", *algo, "0", "-n", "12000", *small],
+        ["export", zip_file, "--format", "onnx"],
+        ["export", "itm-recovery", "--format", "torchscript", "-o", "pretrained.pt"],
+        ["tune", *algo, "2", *search, *small],
+        ["train", *algo, "0", "-n", "1600", "--conf-file", best],
+    ]
+    (tmp_path / "space.yml").write_text("learning_rate: {low: 1.0e-3, high: 1.0e-2, log: true}\n")
+    run(installed / "python", "-c", f"from sb3_quad.cli import main; assert not any(map(main, {commands!r}))", cwd=tmp_path)
+    for path in (Path(zip_file).with_suffix(".onnx"), Path("pretrained.pt")):
+        assert (tmp_path / path).stat().st_size > 10_000
 
 
 @pytest.mark.slow
