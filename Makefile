@@ -31,7 +31,7 @@ train: $(INSTALLED)
 	$(PY) -m sb3_quad.cli train $(ARGS)
 
 test: $(INSTALLED)
-	$(PY) -m pytest $(ARGS)
+	$(PY) -m pytest -n auto --maxprocesses 4 $(ARGS)
 
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py $(ARGS)
