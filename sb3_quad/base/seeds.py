@@ -1,7 +1,7 @@
 """Every range of seeds, by what it is for: what judges a training is never what it was trained on.
 
-A seed names an episode's stream of random numbers. A purpose has ``ROOM`` seeds, one for each run; environment i takes the i-th
-after its run's.
+A seed names an environment's stream of random numbers. Each purpose has ``ROOM`` of them, one for each run; environment i of a
+run takes the i-th after it.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def parse_value(text: str, key: str = "") -> Any:
     :raises ConfigError: there is a ``key``, which the message names, and the text is no literal.
     """
     try:
-        return _evaluate(ast.parse(text.strip(), mode="eval").body)
+        return ast.literal_eval(_AsLiterals().visit(ast.parse(text.strip(), mode="eval")))
     except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError) as error:
         if key:
             raise ConfigError(f"{key}: {text!r} cannot be read ({one_line(error)}); write dict(name=literal, …)") from None
@@ -72,24 +72,19 @@ def _named(value: Any, key: str) -> Any:
     return pkgutil.resolve_name(f"torch.{match[1]}")
 
 
-def _evaluate(node: ast.expr) -> Any:
-    """The value of a syntax tree of literals, containers, ``dict(…)`` calls; names such as ``nn.Tanh`` as strings."""
-    match node:
-        case ast.Constant(value=value) if value is None or isinstance(value, (bool, int, float, str)):
-            return value
-        case ast.UnaryOp(op=ast.USub() | ast.UAdd() as sign, operand=ast.Constant(value=int() | float() as number)):
-            return -number if isinstance(sign, ast.USub) else number
-        case ast.List(elts=items):
-            return [_evaluate(item) for item in items]
-        case ast.Tuple(elts=items):
-            return tuple(_evaluate(item) for item in items)
-        case ast.Dict(keys=keys, values=values) if None not in keys:
-            return {_evaluate(key): _evaluate(value) for key, value in zip(keys, values, strict=True) if key is not None}
-        case ast.Call(func=ast.Name(id="dict"), args=[], keywords=keywords) if all(entry.arg for entry in keywords):
-            return {str(entry.arg): _evaluate(entry.value) for entry in keywords}
-        case ast.Attribute() if _CLASS_NAME.match(ast.unparse(node)):
-            return ast.unparse(node)
-    raise ValueError(f"{ast.unparse(node)!r} is not a literal")
+class _AsLiterals(ast.NodeTransformer):
+    """Makes literals of ``dict(…)`` calls, and strings of names such as ``nn.Tanh``."""
+
+    def visit_Call(self, node: ast.Call) -> ast.AST:
+        self.generic_visit(node)
+        names = [entry.arg for entry in node.keywords]
+        if ast.unparse(node.func) != "dict" or node.args or None in names:
+            return node
+        return ast.Dict([ast.Constant(name) for name in names], [entry.value for entry in node.keywords])
+
+    def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
+        text = ast.unparse(node)
+        return ast.Constant(text) if _CLASS_NAME.match(text) else node
 
 
 class ZooLoader(yaml.SafeLoader):

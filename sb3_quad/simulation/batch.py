@@ -13,7 +13,7 @@ from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.checks import per_row, whole_number
 from sb3_quad.simulation.engine.random import new_streams, stream_key
-from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, step_arrays
+from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, StepArrays, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, compilation_notice, run
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.state import STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
@@ -104,19 +104,11 @@ class QuadcopterBatch:
 
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
-        return self._look(self.rows(rows))
+        return self._run(LOOK, self.rows(rows)).observations
 
     def observe(self) -> Float32Array:
         """The present observations, float32 (n, 18); the same numbers until the next step."""
-        return self._look([])
-
-    def _look(self, resetting: Any) -> Float32Array:
-        arrays = step_arrays(self.n)
-        arrays.dones[resetting] = True
-        self.job["mode"] = LOOK
-        run(self._job_numbers, self.threads, arrays)
-        self.job["mode"] = FLY
-        return arrays.observations
+        return self._run(LOOK).observations
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         """One control step of every row.
@@ -137,11 +129,16 @@ class QuadcopterBatch:
 
     def score(self) -> tuple[Float32Array, Float32Array, BoolArray]:
         """As :meth:`step`, of a control step that another simulator has flown and written into ``state``."""
+        arrays = self._run(SCORE)
+        return arrays.observations, arrays.rewards, arrays.dones
+
+    def _run(self, mode: int, resetting: Any = ()) -> StepArrays:
         arrays = step_arrays(self.n)
-        self.job["mode"] = SCORE
+        arrays.dones[np.array(resetting, dtype=np.int64)] = True
+        self.job["mode"] = mode
         run(self._job_numbers, self.threads, arrays)
         self.job["mode"] = FLY
-        return arrays.observations, arrays.rewards, arrays.dones
+        return arrays
 
     def rows(self, rows: Rows) -> IntArray:
         """Row numbers from None (all), a number, a slice or a sequence."""
@@ -201,11 +198,8 @@ class QuadcopterBatch:
         levels = per_row("noise", level, chosen.size, None)[0]
         if (levels < 0).any():
             raise ConfigError(f"noise {level!r}: must not be negative")
-        if rows is None and self.noise_level.size == 1 and np.ndim(level) == 0:
-            self.noise_level[:] = levels[0]
-            return
-        self._set_rows_apart()
-        self.noise_level[chosen] = levels
+        columns = self._columns(rows, one_for_all=np.ndim(level) == 0)
+        self.noise_level[columns] = levels[: columns.size]
 
     def set_observation_scaling(self, mean: Any = None, std: Any = None, rows: Rows = None) -> None:
         """μ and σ of Eq. 3.16, (18,) or (rows, 18) each; None leaves one as it is."""
@@ -214,14 +208,10 @@ class QuadcopterBatch:
         stds = None if std is None else per_row("observation_std", std, chosen.size, OBSERVATION_SIZE)
         if stds is not None and (stds <= 0).any():
             raise ConfigError("observation_std: every value must be positive")
-        together = rows is None and self.mean.shape[1] == 1 and np.ndim(mean) < 2 and np.ndim(std) < 2
-        if not together:
-            self._set_rows_apart()
-        columns = np.zeros(1, dtype=np.int64) if together else chosen
-        if means is not None:
-            self.mean[:, columns] = means[:, : columns.size]
-        if stds is not None:
-            self.std[:, columns] = stds[:, : columns.size]
+        columns = self._columns(rows, one_for_all=np.ndim(mean) < 2 and np.ndim(std) < 2)
+        for array, values in ((self.mean, means), (self.std, stds)):
+            if values is not None:
+                array[:, columns] = values[:, : columns.size]
 
     def set_max_episode_steps(self, steps: int) -> None:
         """Control steps after which an episode is truncated, for all rows from the next step on."""
@@ -239,14 +229,16 @@ class QuadcopterBatch:
         self.tasks = TaskTable(parameters, weights, (*(self.tasks.tasks[k] for k in used), *new.tasks))
         self._bind()
 
-    def _set_rows_apart(self) -> None:
-        """A noise level and a scaling for each row."""
+    def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
+        """The columns of noise level and scaling to write for some rows, which are set apart unless one serves all."""
         if self.mean.shape[1] < self.n:
+            if rows is None and one_for_all:
+                return np.zeros(1, dtype=np.int64)
             self.noise_level = np.repeat(self.noise_level, self.n)
-            self.mean = np.repeat(self.mean, self.n, axis=1)
-            self.std = np.repeat(self.std, self.n, axis=1)
+            self.mean, self.std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
             if hasattr(self, "job"):
                 self._bind()
+        return self.rows(rows)
 
     def _bind(self) -> None:
         """Write down for the compiled step where all arrays are; again whenever one is replaced."""
