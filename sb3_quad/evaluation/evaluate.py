@@ -16,17 +16,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.base.signals import ignore_interrupts
-from sb3_quad.evaluation.controllers import ControllerSpec, build, describe, measured
+from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import episode_arrays
 from sb3_quad.evaluation.folder import RESULTS, flights_path, load_results, read_entries, write_entry, write_results
-from sb3_quad.evaluation.hits import find_limit
 from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry, Failure, Results
-from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.scenarios.scenario import Scenario, Suite
 
@@ -91,7 +91,7 @@ def evaluate(
     failures: dict[str, list[Failure]] = {spec.label: [] for spec in controllers}
     for spec in controllers:
         try:
-            records[spec.label] = measured(spec, describe(spec), suite.scenarios[0].vehicle)
+            records[spec.label] = describe(spec, suite.scenarios[0].vehicle)
         except SB3QuadError as error:
             failures[spec.label].append(_failure(spec.label, None, error))
     loaded = [spec for spec in controllers if spec.label in records]
@@ -171,7 +171,7 @@ def run_job(job: Job) -> Entry | Failure:
     try:
         controller = build(job.spec, scenario.vehicle, job.record.offset)
         flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None)
-        limit = find_limit(controller, scenario, job.backend) if scenario.hit_search is not None else None
+        limit = find_limit(controller, scenario, job.backend)
     except SB3QuadError as error:
         return _failure(label, scenario.name, error)
     entry = Entry(
@@ -211,8 +211,6 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | F
 
 
 def _begin_worker() -> None:
-    import torch  # takes a second, which the process that started the workers need not wait for
-
     ignore_interrupts()  # the process that started the workers ends them
     torch.set_num_threads(1)
 
