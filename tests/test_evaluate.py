@@ -94,7 +94,17 @@ def times_of_change(folder):
 def test_table_results_and_episodes_agree(here, capsys):
     assert evaluate("pid", "still=my_controllers:hover") == 0
     text = capsys.readouterr().out
-    for part in ("pid", "still", "paper", "expert 50 %", "expert 1.25 s", "expert 2 to 3 m", "tilt 60", "waypoints reached"):
+    for part in (
+        "pid",
+        "still",
+        "paper",
+        "success, %",
+        "expert 50",
+        "expert 1.25",
+        "expert 2 to 3",
+        "tilt 60",
+        "waypoints reached",
+    ):
         assert part in text
     results = load_results("out")
     assert [record.label for record in results.controllers] == ["pid", "still"]

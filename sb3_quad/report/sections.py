@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_quad.drawing.palette import colours_of
-from sb3_quad.evaluation.metric_tables import SUCCESS, entry_cells, mark_best, metric_rows, reference_cells, scenario_groups
+from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, measured_cells, metric_rows, reference_cells, scenario_groups
 from sb3_quad.evaluation.records import Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
@@ -87,7 +87,7 @@ def _scenario_plots(scenario: Scenario, flown: Sequence[Flown], source: str) -> 
 
 
 def _metric_table(results: Results, scenario: Scenario, colours: Mapping[str, str]) -> Table:
-    measured = [entry_cells(results.entry(label, scenario.name)) for label in colours]
+    measured = [measured_cells(results, label, scenario) for label in colours]
     rows = metric_rows(scenario, measured, scenario.reference.values(), brief=True)
     return Table(_columns(colours, scenario.reference, results.source), rows)
 
@@ -108,7 +108,7 @@ def _success_table(
 
 
 def _success(results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
-    found = [entry_cells(results.entry(label, scenario.name)) for scenario in scenarios]
+    found = [measured_cells(results, label, scenario) for scenario in scenarios]
     shares = [cells[SUCCESS] for cells in found if cells is not None]
     if not shares:
         return Cell(words="failed")

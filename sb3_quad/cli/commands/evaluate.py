@@ -28,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
     if labels:
-        console().print(overview(flown, labels, suite.source))
+        console().print(overview(flown, labels))
     print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and results.entries:
         try:
