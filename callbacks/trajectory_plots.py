@@ -61,7 +61,7 @@ class TrajectoryPlots(EveryTimesteps):
             raise ConfigError(f"TrajectoryPlots: observations and actions of shape {shapes}, must be those of the quadcopter")
 
     def _on_event(self) -> bool:
-        recorder = Recorder(len(self._seeds), self._settings.max_episode_steps)
+        recorder = Recorder(len(self._seeds))
         fly_settings(self.model, self._settings, self._seeds, hooks=[recorder])
         plot = Figure(_plot(recorder.arrays()), close=False)
         self.logger.record("flights/figure", plot, exclude=("stdout", "log", "json", "csv"))

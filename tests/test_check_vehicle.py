@@ -99,7 +99,7 @@ def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, cap
     vehicle = load_vehicle(own)
     assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed and "physical" in printed and "tune-expert" in printed
     assert all(f"{each:.1f} rad/s²" in printed for each in authority(vehicle).accelerations)
-    assert re.search(r"success +│ +\S+ % .* 100 %", printed) and "mean time to 0.1 m" in printed
+    assert re.search(r"success, % +│ +\S+ \(.* 100\.0 \(", printed) and "mean time to 0.1 m" in printed
     assert "thesis" not in printed  # its figures are of another vehicle
 
 

@@ -14,8 +14,9 @@ from rich.console import Console
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
-from sb3_quad.evaluation.metric_tables import comparison
-from sb3_quad.evaluation.summary import summarise
+from sb3_quad.evaluation.metric_tables import metric_cells, metric_rows
+from sb3_quad.evaluation.summary import share, summarise
+from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.vehicles.vehicle import vehicle_names
@@ -134,6 +135,12 @@ def text_of(table) -> str:
     return console.file.getvalue()
 
 
+def table_of(metrics, name, beside):
+    scenario = load_suite("thesis").scenario(name)
+    rows = metric_rows(scenario, [metric_cells(metrics)], [scenario.reference[each] for each in beside])
+    return Table([Column("agent"), *(Column(each, source="thesis") for each in beside)], rows)
+
+
 def test_tables_say_how_many_arrived():
     n = 4
     flights = Flights(
@@ -154,13 +161,15 @@ def test_tables_say_how_many_arrived():
     assert figures.success.value == 0.75 and (figures.collisions, figures.out_of_range) == (1, 0)
     assert figures.arrivals[-1].time.value == 5.0 and figures.arrivals[-1].share.value == 0.75
     assert figures.final_error_max == 0.3 and figures.final_offset == pytest.approx((0.2, 0.0, 0.0))
-    text = text_of(comparison("title", {"agent": figures}, load_suite("thesis").scenario("tracking"), ["expert"]))
-    for part in ("75 % (", "5.00 ±", "(75 % arrive)", "never", "0.300 m", "thesis: expert", "7.75 s"):
+    text = text_of(table_of(figures, "tracking", ["expert"]))
+    for part in ("success, %", "75.0 (", "5.00 (", ", 75 % arrive", "never", "0.300", "thesis: expert", "7.75"):
         assert part in text
+    one_lost = figures.model_copy(update={"success": share([False] + [True] * 3839)})
+    assert metric_cells(one_lost)["success"].number == "99.97"  # not 100
 
 
 def test_tables_stand_without_a_single_success():
     figures = summarise(fly(fall, "state_recovery", 2, seed=0))
-    text = text_of(comparison("title", {"agent": figures}, load_suite("thesis").scenario("recovery")))
-    assert "0 % (" in text
+    text = text_of(table_of(figures, "recovery", ["expert", "RL-agent", "PPO only"]))
+    assert "0.0 (" in text and "88.25, 88.75 % while training" in text
     assert "nan" not in text

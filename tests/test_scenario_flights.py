@@ -11,9 +11,8 @@ from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.hits import find_limit
-from sb3_quad.evaluation.scaling import AdaptiveScaling, adapt_observation, adaptive_factor, hover_offset, measure_mean
-from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
+from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.summary import mean, share, summarise
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.scenarios.load import load_suite, parse_suite
@@ -194,7 +193,7 @@ def test_scaling_changes_the_position_only():
     observation = np.random.default_rng(0).normal(size=(5, 18)).astype(np.float32)
     std = np.full(3, 10 / np.sqrt(3))
     observation[0, :3] = [1 / np.sqrt(3) * np.sqrt(3), 0, 0]  # 10/√3 m: α = 0.5 (1 + 1/√3)
-    adapted = adapt_observation(observation, np.array([0.1, 0.0, -0.2]), std)
+    adapted = AdaptiveScaling(lambda seen: seen, (0.1, 0.0, -0.2), std)(observation)
     np.testing.assert_array_equal(adapted[:, 3:], observation[:, 3:])
     metres = observation[:, :3] * std
     factor = 0.5 * (1 + np.linalg.norm(metres, axis=1) / 10)

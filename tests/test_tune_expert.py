@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import sys
@@ -16,7 +17,10 @@ from hypothesis import strategies as st
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.cli.commands import tune_expert
-from sb3_quad.evaluation.expert_figures import by_start, start_states
+from sb3_quad.evaluation.expert_metrics import by_start
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.tuning import expert
 from sb3_quad.tuning.expert import ExpertObjective, ExpertSearch, with_gains
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
@@ -90,17 +94,19 @@ def test_the_cost_tells_better_gains_from_worse_and_repeats_itself():
 
 
 def test_recoveries_by_start_count_each_flight_once_per_quantity():
-    state = start_states("state_recovery", 200, 5, ITM)
+    flights = fly(GeometricExpert(), "state_recovery", 200, 5, noise=0.0, max_steps=1)
     recovered = np.random.default_rng(0).random(200) < 0.7
-    counts = by_start(recovered, state)
+    counts = by_start(dataclasses.replace(flights, success=recovered))
     for quantity in ("tilt", "falling", "body rate"):
-        assert sum(counts.flown[quantity].values()) == 200
-        assert sum(counts.lost[quantity].values()) == (~recovered).sum()
+        flown, lost = zip(*(counts[start] for start in counts if start.startswith(quantity)), strict=True)
+        assert len(flown) == 3 and sum(flown) == 200 and sum(lost) == (~recovered).sum()
+    batch = QuadcopterBatch(200, "state_recovery", noise=0.0, seed=5)
+    batch.reset()
+    state = batch.true_state()
     upside_down = state.rotation[:, 2, 2] < -0.5
-    assert counts.flown["tilt"]["above 120°"] == upside_down.sum()
-    assert counts.lost["tilt"]["above 120°"] == (upside_down & ~recovered).sum()
-    assert counts.flown["falling"]["below 2 m/s"] == (state.velocity[:, 2] > -2).sum()
-    assert counts.flown["body rate"]["above 10 rad/s"] == (np.linalg.norm(state.body_rates, axis=1) >= 10).sum()
+    assert counts["tilt above 120°"] == (upside_down.sum(), (upside_down & ~recovered).sum())
+    assert counts["falling below 2 m/s"][0] == (state.velocity[:, 2] > -2).sum()
+    assert counts["body rate above 10 rad/s"][0] == (np.linalg.norm(state.body_rates, axis=1) >= 10).sum()
 
 
 def test_it_writes_a_vehicle_that_flies_and_goes_on_where_it_was_left(slow_itm, tmp_path, capsys):

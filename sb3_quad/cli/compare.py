@@ -7,9 +7,9 @@ from typing import Any
 
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flights import fly_settings
-from sb3_quad.evaluation.metric_tables import TASK_SCENARIOS, comparison
+from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.summary import summarise
-from sb3_quad.evaluation.tables import Table
+from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.settings.flight import FlightSettings
@@ -17,6 +17,7 @@ from sb3_quad.training.job import TrainingJob
 
 FRESH_EPISODES = 240
 THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
+SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of its suite, by task
 
 
 def task_table(
@@ -30,10 +31,12 @@ def task_table(
     :param beside: the columns of the thesis that stand beside them; none but of the vehicle that it flew.
     """
     seeds = range(seed, seed + n)
-    columns = {name: summarise(fly_settings(each, settings, seeds)) for name, each in controllers.items()}
-    scenario = load_suite("thesis").scenario(TASK_SCENARIOS[settings.task])
-    shown = beside if settings.vehicle == THESIS_VEHICLE else ()
-    return comparison(f"{settings.task}: {n} fresh episodes, {title}", columns, scenario, shown)
+    measured = [metric_cells(summarise(fly_settings(each, settings, seeds))) for each in controllers.values()]
+    scenario = load_suite("thesis").scenario(SCENARIOS[settings.task])
+    shown = [name for name in beside if name in scenario.reference and settings.vehicle == THESIS_VEHICLE]
+    columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
+    rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
+    return Table(columns, rows, title=f"{settings.task}: {n} fresh episodes, {title}", caption=CAPTION)
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:

@@ -6,23 +6,19 @@ import hashlib
 import importlib
 import inspect
 import re
+import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
-
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.evaluation.records import ControllerRecord
+from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.evaluation.records import ControllerRecord, Scaling
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.experts.models import saved_algorithm
 from sb3_quad.experts.resolve import EXPERTS, resolve_expert
 from sb3_quad.pretrained_policies import agent_path
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
-
-Scaling = Literal["none", "adaptive"]
-SCALINGS = ("none", "adaptive")
+from sb3_quad.settings.flight import FlightSettings
 
 
 @dataclass(frozen=True)
@@ -39,21 +35,24 @@ class ControllerSpec:
     scaling: Scaling = "none"
 
 
-def parse_controllers(texts: Sequence[str], scaling: Scaling = "none") -> list[ControllerSpec]:
+def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[ControllerSpec]:
     """Controllers from ``spec`` or ``label=spec``; a label left out is as short as tells them apart.
 
-    :raises ConfigError: two controllers of the same label.
+    :param scaling: of all but the experts, ``none`` or ``adaptive``.
+    :raises ConfigError: an unknown scaling, or two controllers of the same label.
     """
-    given = [_named(text) for text in texts]
-    paths = [spec for label, spec in given if label is None and spec.endswith(".zip")]
+    if scaling not in typing.get_args(Scaling):
+        raise ConfigError(unknown("scaling", scaling, typing.get_args(Scaling)))
+    given = [_label_and_spec(text) for text in texts]
+    zips = [spec for label, spec in given if not label and spec.endswith(".zip")]
     found = []
     for label, spec in given:
-        name = label or (_short(spec, paths) if spec.endswith(".zip") else spec)
+        name = label or (_short(spec, zips) if spec.endswith(".zip") else spec)
         adapted = scaling == "adaptive" and spec not in EXPERTS
-        found.append(ControllerSpec(f"{name} (adaptive)" if adapted else name, spec, "adaptive" if adapted else "none"))
-    slugs = [file_name(entry.label) for entry in found]
-    for slug, entry in zip(slugs, found, strict=True):
-        if slugs.count(slug) > 1:
+        found.append(ControllerSpec(f"{name} (adaptive)", spec, "adaptive") if adapted else ControllerSpec(name, spec))
+    files = [file_name(entry.label) for entry in found]
+    for file, entry in zip(files, found, strict=True):
+        if files.count(file) > 1:
             raise ConfigError(f"controller {entry.label!r}: two are called so; label them: name={entry.spec}")
     return found
 
@@ -63,17 +62,26 @@ def file_name(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", label).strip("_.") or "_"
 
 
-def describe(spec: ControllerSpec) -> ControllerRecord:
-    """Who a controller is, without its offset.
+def describe(spec: ControllerSpec, vehicle: str) -> ControllerRecord:
+    """Who a controller is; with adaptive scaling also the offset that it needs, measured by flying to targets.
 
-    :raises ConfigError: an unknown name, a missing file, a module that cannot be imported.
+    :param vehicle: what it is measured with.
+    :raises ConfigError: an unknown name, a missing file, a module that cannot be imported, a policy whose offset cannot be
+        measured since it crashes on the way in more than half of the flights.
     """
-    if spec.spec.endswith(".zip"):
-        algorithm = saved_algorithm(spec.spec)
-        content = Path(spec.spec).read_bytes()
-        return _record(spec, "model", Path(spec.spec).name, algorithm, content)
-    location = EXPERTS.get(spec.spec, spec.spec)
-    return _record(spec, "expert" if spec.spec in EXPERTS else "factory", spec.spec, None, _source(location))
+    path = Path(spec.spec)
+    if path.suffix == ".zip":
+        who: dict[str, Any] = {"kind": "model", "spec": path.name, "algorithm": saved_algorithm(path)}
+        content = path.read_bytes()
+    else:
+        who = {"kind": "expert" if spec.spec in EXPERTS else "factory", "spec": spec.spec}
+        content = _source(EXPERTS.get(spec.spec, spec.spec))
+    if spec.scaling == "adaptive":
+        controller = build(spec, vehicle)
+        if isinstance(controller, AdaptiveScaling):
+            mean = measure_mean(controller.policy, settings=FlightSettings(vehicle=vehicle))
+            who |= {"scaling": "adaptive", "offset": mean.tolist()}
+    return ControllerRecord(label=spec.label, content=hashlib.sha256(content).hexdigest(), **who)
 
 
 def build(spec: ControllerSpec, vehicle: str, mean: Sequence[float] | None = None) -> Any:
@@ -81,43 +89,24 @@ def build(spec: ControllerSpec, vehicle: str, mean: Sequence[float] | None = Non
 
     :param vehicle: what experts and factories are given, the one they are to know.
     :param mean: with adaptive scaling: the position components of μ, (3,), m; None: zero.
-    :raises ConfigError: it cannot be loaded, or its spaces are not the quadcopter's.
+    :raises ConfigError: it cannot be loaded.
     :raises ExpertError: a factory that fails.
     """
     controller = resolve_expert(spec.spec, vehicle, "controller")
-    _check_spaces(controller, spec.spec)
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
-    return AdaptiveScaling(controller, (0.0, 0.0, 0.0) if mean is None else mean)
+    return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0))
 
 
-def measured(spec: ControllerSpec, record: ControllerRecord, vehicle: str) -> ControllerRecord:
-    """The record with the offset that adaptive scaling needs, measured by flying to targets; without it, as it is.
-
-    :raises ConfigError: a controller that crashes on the way in more than half of the flights.
-    """
-    if spec.scaling == "none":
-        return record
-    controller = build(spec, vehicle)
-    if not isinstance(controller, AdaptiveScaling):
-        return record.model_copy(update={"scaling": "none"})
-    offset = tuple(measure_mean(controller.policy, vehicle=vehicle).tolist())
-    return record.model_copy(update={"offset": offset})
-
-
-def _named(text: str) -> tuple[str | None, str]:
-    label, spec = _split(text)
-    path = agent_path(spec)
-    return (spec if label is None and path != spec else label), path
-
-
-def _split(text: str) -> tuple[str | None, str]:
+def _label_and_spec(text: str) -> tuple[str, str]:
+    """What a controller is called, empty if nothing is said, and its name or path."""
     label, equals, spec = text.partition("=")
     if not equals or "/" in label or "\\" in label:  # an equals sign further on belongs to the path
-        return None, text
+        path = agent_path(text)
+        return ("" if path == text else text), path
     if not label or not spec:
         raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
-    return label, spec
+    return label, agent_path(spec)
 
 
 def _short(path: str, paths: Sequence[str]) -> str:
@@ -130,13 +119,6 @@ def _short(path: str, paths: Sequence[str]) -> str:
     return "/".join(parts)
 
 
-def _record(
-    spec: ControllerSpec, kind: Literal["expert", "model", "factory"], name: str, algorithm: str | None, content: bytes
-) -> ControllerRecord:
-    digest = hashlib.sha256(content).hexdigest()
-    return ControllerRecord(label=spec.label, spec=name, kind=kind, algorithm=algorithm, content=digest, scaling=spec.scaling)
-
-
 def _source(location: str) -> bytes:
     """The source of the module that holds an expert or factory, or what else tells its versions apart."""
     module_name, colon, _ = location.partition(":")
@@ -147,16 +129,3 @@ def _source(location: str) -> bytes:
     except Exception:  # build() says what is wrong with it
         return location.encode()
     return location.encode() + (Path(file).read_bytes() if file is not None else b"")
-
-
-def _check_spaces(controller: Any, spec: str) -> None:
-    """:raises ConfigError: a model whose observations or actions are not the quadcopter's."""
-    wanted = {"observation_space": (OBSERVATION_SIZE,), "action_space": (4,)}
-    for name, shape in wanted.items():
-        space = getattr(controller, name, None)
-        if space is None:
-            continue
-        found = getattr(space, "shape", None)
-        if found != shape or not np.issubdtype(space.dtype, np.floating):
-            what = name.removesuffix("_space")
-            raise ConfigError(f"controller {spec}: its {what}s are {space}, the quadcopter's are of shape {shape}")

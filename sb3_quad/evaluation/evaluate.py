@@ -7,7 +7,7 @@ import itertools
 import json
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -16,17 +16,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.base.signals import ignore_interrupts
-from sb3_quad.evaluation.controllers import ControllerSpec, build, describe, measured
+from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import episode_arrays
 from sb3_quad.evaluation.folder import RESULTS, flights_path, load_results, read_entries, write_entry, write_results
-from sb3_quad.evaluation.hits import find_limit
 from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry, Failure, Results
-from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.scenarios.scenario import Scenario, Suite
 
@@ -87,13 +87,15 @@ def evaluate(
         raise ConfigError(f"workers {workers}: must be at least 1")
     place = Path(folder)
     before = load_results(place) if (place / RESULTS).is_file() else None
+    asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
+    earlier = [] if before is None else before.failures
+    failures = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
     records: dict[str, ControllerRecord] = {}
-    failures: dict[str, list[Failure]] = {spec.label: [] for spec in controllers}
     for spec in controllers:
         try:
-            records[spec.label] = measured(spec, describe(spec), suite.scenarios[0].vehicle)
+            records[spec.label] = describe(spec, suite.scenarios[0].vehicle)
         except SB3QuadError as error:
-            failures[spec.label].append(_failure(spec.label, None, error))
+            failures.append(_failure(spec.label, None, error))
     loaded = [spec for spec in controllers if spec.label in records]
     jobs = [Job(spec, records[spec.label], each, backend, folder) for each in suite.scenarios for spec in loaded]
     missing = _missing(place, jobs, overwrite)
@@ -103,10 +105,10 @@ def evaluate(
         for job, outcome in run_jobs(missing, workers):
             done += 1
             if isinstance(outcome, Failure):
-                failures[job.record.label].append(outcome)
+                failures.append(outcome)
             progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
     finally:  # an interrupt, too, leaves what is done in order
-        results = _collect(place, before, suite, records, failures)
+        results = _collect(place, before, suite, list(records.values()), failures)
         if results.entries or results.failures:
             write_results(place, results)
     return results
@@ -138,19 +140,11 @@ def _missing(folder: Path, jobs: Sequence[Job], overwrite: bool) -> list[Job]:
 
 
 def _collect(
-    folder: Path,
-    before: Results | None,
-    suite: Suite,
-    records: Mapping[str, ControllerRecord],
-    failures: Mapping[str, Sequence[Failure]],
+    folder: Path, before: Results | None, suite: Suite, records: list[ControllerRecord], failures: list[Failure]
 ) -> Results:
     """All that the folder holds by now; what was there before comes first."""
-    flown = {scenario.name: scenario for scenario in suite.scenarios}
-    scenarios, controllers, kept = dict(flown), dict(records), list[Failure]()
-    if before is not None:
-        scenarios = {scenario.name: scenario for scenario in before.scenarios} | flown
-        controllers = {record.label: record for record in before.controllers} | controllers
-        kept = [each for each in before.failures if each.controller not in failures or each.scenario not in {None, *flown}]
+    scenarios = {each.name: each for each in [*(before.scenarios if before else []), *suite.scenarios]}
+    controllers = {each.label: each for each in [*(before.controllers if before else []), *records]}
     entries = {(entry.scenario, entry.controller): entry for entry in read_entries(folder)}
     return Results(
         suite=suite.name,
@@ -160,18 +154,18 @@ def _collect(
         controllers=list(controllers.values()),
         scenarios=list(scenarios.values()),
         entries=[entries[key] for key in itertools.product(scenarios, controllers) if key in entries],
-        failures=[*kept, *itertools.chain.from_iterable(failures.values())],
+        failures=failures,
     )
 
 
 def run_job(job: Job) -> Entry | Failure:
-    """Fly, sum up, write; a controller that fails leaves a :class:`Failure`."""
+    """Fly, sum up, write; of a controller that fails, its :class:`Failure`."""
     label, scenario = job.record.label, job.scenario
     start = time.perf_counter()
     try:
         controller = build(job.spec, scenario.vehicle, job.record.offset)
         flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None)
-        limit = find_limit(controller, scenario, job.backend) if scenario.hit_search is not None else None
+        limit = find_limit(controller, scenario, job.backend)
     except SB3QuadError as error:
         return _failure(label, scenario.name, error)
     entry = Entry(
@@ -211,8 +205,6 @@ def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | F
 
 
 def _begin_worker() -> None:
-    import torch  # takes a second, which the process that started the workers need not wait for
-
     ignore_interrupts()  # the process that started the workers ends them
     torch.set_num_threads(1)
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -15,141 +14,100 @@ from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.layout import row_slices
 from sb3_quad.simulation.state import STATE, QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle
 
 MAX_CLIENTS = 512  # PyBullet allows about 1000 physics clients in a process
+ENDLESS = {"max_episode_steps": 2**62}  # who flies says when an episode is over
 
 
 class FleetStep(NamedTuple):
-    """What a control step gives: observations (n, 18), rewards (n,), which rows are lost (n,), |r - r_T| (n,) in m."""
+    """What a control step of n vehicles gives."""
 
-    observation: Float32Array
-    reward: FloatArray
-    lost: BoolArray
-    distance: FloatArray
+    observation: Float32Array  # (n, 18)
+    reward: FloatArray  # (n,)
+    lost: BoolArray  # (n,), on the ground or out of range
+    collided: BoolArray  # (n,), on the ground
+    distance: FloatArray  # |r - r_T|, (n,), m
 
 
-class Fleet(ABC):
-    """n vehicles in their first episodes; a row that is lost stays so.
+class BatchFleet:
+    """n vehicles in their first episodes, in one batched environment; a row that is lost stays so.
 
     :param seeds: of the episodes, (n,).
     :param settings: how they fly; ``max_episode_steps`` has no meaning here.
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        self.n, self.seeds = len(seeds), seeds
-        self.keywords = {key: value for key, value in settings.keywords().items() if key != "max_episode_steps"}
-        self.collided = np.zeros(self.n, dtype=np.bool_)
-        """Whether the last control step of each row ended on the ground, (n,)."""
+        self._batch = QuadcopterBatch(len(seeds), **{**settings.keywords(), **ENDLESS}, autoreset=False)
+        self._batch.seed(seeds)
+        self.vehicle = self._batch.vehicle_list[0]
 
-    @property
-    @abstractmethod
-    def vehicle(self) -> Vehicle:
-        """What flies."""
-
-    @abstractmethod
-    def reset(self, start: Mapping[str, FloatArray] | None = None) -> Float32Array:
+    def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         """Begin; observations (n, 18).
 
-        :param start: what the episodes' own sample is replaced by: position, velocity, body_rates, target (n, 3) or
+        :param start: what replaces the episodes' own sample: any of position, velocity, body_rates, target (n, 3) and
             quaternion (n, 4).
         """
+        self._batch.reset()
+        for name, values in start.items():
+            self._batch.state[row_slices(STATE)[name]] = values.T
+        return self._batch.observe()
 
-    @abstractmethod
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
         """One control step of the rows that are ``flying``; what comes back of the others has no meaning."""
+        observation, reward, _ = self._batch.step(actions)
+        end = self._batch.outcome
+        return FleetStep(observation, reward.astype(np.float64), ~end["truncated"], end["collision"], end["distance"])
 
-    @abstractmethod
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         """Move the targets of some rows, (len(rows), 3); all observations with the new targets, (n, 18)."""
+        self._batch.set_target(targets, rows)
+        return self._batch.observe()
 
-    @abstractmethod
     def set_wrench(self, wrench: FloatArray) -> None:
         """The wrench from now on, (n, WRENCH_SIZE), see :mod:`sb3_quad.simulation.state`."""
+        self._batch.wrench[:] = wrench.T
 
-    @abstractmethod
     def true_state(self) -> QuadcopterState:
         """The true state of all rows, fresh or live."""
+        return self._batch.true_state()
 
-    def close(self) -> None:  # noqa: B027 - most hold nothing
-        """Release the environments."""
-
-
-class BatchFleet(Fleet):
-    """All rows in one batched environment."""
-
-    def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        super().__init__(seeds, settings)
-        self.batch = QuadcopterBatch(self.n, **self.keywords, max_episode_steps=2**62, autoreset=False)
-        self.batch.seed(seeds)
-        self.collided = self.batch.outcome["collision"]
-
-    @property
-    def vehicle(self) -> Vehicle:
-        return self.batch.vehicle_list[0]
-
-    def reset(self, start: Mapping[str, FloatArray] | None = None) -> Float32Array:
-        observation = self.batch.reset()
-        for name, values in (start or {}).items():
-            self.batch.state[row_slices(STATE)[name]] = values.T
-        return self.batch.observe() if start else observation
-
-    def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
-        observation, rewards, _ = self.batch.step(actions)
-        outcome = self.batch.outcome
-        return FleetStep(observation, rewards.astype(np.float64), ~outcome["truncated"], outcome["distance"].copy())
-
-    def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
-        self.batch.set_target(targets, rows)
-        return self.batch.observe()
-
-    def set_wrench(self, wrench: FloatArray) -> None:
-        self.batch.wrench[:] = wrench.T
-
-    def true_state(self) -> QuadcopterState:
-        return self.batch.true_state()
+    def close(self) -> None:
+        """Release the environments, where they hold anything."""
 
 
-class PyBulletFleet(Fleet):
-    """A PyBullet environment per row, in turn; the controller still sees them as one batch."""
+class PyBulletFleet:
+    """As :class:`BatchFleet`, with a PyBullet environment per row, in turn; the controller still sees them as one batch."""
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        super().__init__(seeds, settings)
-        if self.n > MAX_CLIENTS:
+        if len(seeds) > MAX_CLIENTS:
             raise ConfigError(
-                f"n_episodes {self.n}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts"
+                f"n_episodes {len(seeds)}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts"
             )
-        self._envs = [QuadcopterEnv(**self.keywords) for _ in seeds]
+        self._seeds = seeds
+        self._envs = [QuadcopterEnv(**{**settings.keywords(), **ENDLESS}) for _ in seeds]
+        self.vehicle = self._envs[0].vehicle
 
-    @property
-    def vehicle(self) -> Vehicle:
-        return self._envs[0].vehicle
-
-    def reset(self, start: Mapping[str, FloatArray] | None = None) -> Float32Array:
-        rows = []
-        for k, env in enumerate(self._envs):
-            options: dict[str, Any] = {"state": {name: values[k] for name, values in (start or {}).items()}}
-            options["target"] = options["state"].pop("target", None)
-            rows.append(env.reset(seed=self.seeds[k], options=options)[0])
-        self._observation = np.stack(rows)
-        return self._observation
+    def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
+        for row, (env, seed) in enumerate(zip(self._envs, self._seeds, strict=True)):
+            state = {name: values[row] for name, values in start.items()}
+            options: dict[str, Any] = {"target": state.pop("target", None), "state": state}
+            env.reset(seed=seed, options=options)
+        self._observation = np.stack([env.observe() for env in self._envs])
+        return self._observation.copy()
 
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
-        observation = self._observation.copy()
-        rewards, distance = np.zeros(self.n), np.full(self.n, np.nan)
-        lost = np.zeros(self.n, dtype=np.bool_)
-        for k in np.flatnonzero(flying):
-            observation[k], rewards[k], lost[k], _, info = self._envs[k].step(actions[k])
-            distance[k], self.collided[k] = info["distance"], info["collision"]
-        self._observation = observation
-        return FleetStep(observation, rewards, lost, distance)
+        n = len(actions)
+        reward, distance, lost, collided = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        for row in np.flatnonzero(flying):
+            self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(actions[row])
+            collided[row], distance[row] = info["collision"], info["distance"]
+        return FleetStep(self._observation.copy(), reward, lost, collided, distance)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
-        self._observation = self._observation.copy()
         for row, target in zip(rows, targets, strict=True):
             self._envs[row].set_target(target)
             self._observation[row] = self._envs[row].observe()
-        return self._observation
+        return self._observation.copy()
 
     def set_wrench(self, wrench: FloatArray) -> None:
         for env, values in zip(self._envs, wrench, strict=True):
@@ -163,4 +121,5 @@ class PyBulletFleet(Fleet):
             env.close()
 
 
+Fleet: TypeAlias = BatchFleet | PyBulletFleet
 FLEETS: Mapping[str, type[Fleet]] = {"batch": BatchFleet, "pybullet": PyBulletFleet}

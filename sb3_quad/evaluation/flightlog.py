@@ -1,4 +1,4 @@
-"""Sampled trajectories of flights, and the ``.npz`` file that holds them beside the figures of every flight.
+"""Sampled trajectories of flights, and the ``.npz`` file that holds them beside the metrics of every flight.
 
 ====================  =================  ============================================================================
 array                 shape              meaning; m flights, k samples (50 Hz), n episodes, T tolerances, W waypoints
@@ -44,72 +44,58 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
-TRAJECTORIES = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "action": 4, "target": 3, "wrench": 6}
 
 
 class Recorder(Hook):
-    """Samples the first ``m`` flights at 50 Hz; float32, since it is for looking at.
+    """Samples the first ``m`` flights at 50 Hz, or nearly so; float32, since it is for looking at."""
 
-    :param m: flights to record.
-    :param max_steps: control steps of the longest of them.
-    :param rate: Hz; as near to it as whole control steps allow.
-    """
-
-    def __init__(self, m: int, max_steps: int, rate: float = SAMPLE_RATE) -> None:
-        self._m, self._max_steps, self._rate = m, max_steps, rate
+    def __init__(self, m: int) -> None:
+        self._m = m
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         self._control_step = vehicle.control_step
-        self._stride = max(1, round(1.0 / (self._rate * vehicle.control_step)))
-        k = self._max_steps // self._stride + 1
-        self._arrays = {name: np.full((self._m, k, size), np.nan, np.float32) for name, size in TRAJECTORIES.items()}
-        self._samples = np.zeros(self._m, dtype=np.int64)
-        self._wrench, self._steps = np.zeros((self._m, TRAJECTORIES["wrench"])), 0
-        self._write(0, state, np.ones(self._m, dtype=np.bool_))
+        self._stride = max(1, round(1.0 / (SAMPLE_RATE * vehicle.control_step)))
+        m = min(self._m, state.n)
+        self._log: list[Arrays] = []
+        self._samples = np.zeros(m, dtype=np.int64)
+        self._wrench = np.zeros((m, 6))
+        self._sample(state, np.full((state.n, 4), np.nan, np.float32), np.ones(state.n, dtype=np.bool_))
 
     def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
-        self._steps += 1
-        if not wrench.any():
-            return
-        rows = wrench[: self._m]
-        rotation = QuadcopterState(state.array[:, : self._m]).rotation
-        self._wrench[:, :3] += rows[:, FORCE_WORLD] + np.einsum("nij,nj->ni", rotation, rows[:, FORCE_BODY])
-        self._wrench[:, 3:] += rows[:, TORQUE_BODY] + np.einsum("nji,nj->ni", rotation, rows[:, TORQUE_WORLD])
+        if wrench.any():
+            rows = wrench[: self._m]
+            rotation = QuadcopterState(state.array[:, : self._m]).rotation
+            self._wrench[:, :3] += rows[:, FORCE_WORLD] + np.einsum("nij,nj->ni", rotation, rows[:, FORCE_BODY])
+            self._wrench[:, 3:] += rows[:, TORQUE_BODY] + np.einsum("nji,nj->ni", rotation, rows[:, TORQUE_WORLD])
 
     def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
-        if step % self._stride:
-            return
-        rows, number = flying[: self._m], step // self._stride
-        self._arrays["action"][rows, number] = actions[: self._m][rows]
-        self._write(number, state, rows)
+        if step % self._stride == 0:
+            self._sample(state, actions, flying)
 
-    def _write(self, number: int, state: QuadcopterState, rows: BoolArray) -> None:
-        for name in STATES:
-            self._arrays[name][rows, number] = getattr(state, name)[: self._m][rows]
-        self._arrays["wrench"][rows, number] = self._wrench[rows] / max(1, self._steps)
-        self._wrench[:], self._steps = 0.0, 0
-        self._samples[rows] = number + 1
+    def _sample(self, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+        rows = flying[: self._m]
+        values = {name: getattr(state, name)[: self._m] for name in STATES}
+        values |= {"action": actions[: self._m], "wrench": self._wrench / self._stride}
+        self._log.append({name: np.where(rows[:, None], each, np.nan).astype(np.float32) for name, each in values.items()})
+        self._samples[rows] = len(self._log)
+        self._wrench[:] = 0.0
 
     def arrays(self) -> Arrays:
-        """``time``, ``samples`` and the arrays of ``TRAJECTORIES``, as long as the longest flight."""
-        k = int(self._samples.max(initial=1))
-        time = np.arange(k) * (self._stride * self._control_step)
-        return {"time": time, "samples": self._samples, **{name: values[:, :k] for name, values in self._arrays.items()}}
+        """The arrays of this module's table but those of the episodes, as long as the longest flight."""
+        log = self._log[: self._samples.max(initial=1)]
+        time = np.arange(len(log)) * (self._stride * self._control_step)
+        trajectories = {name: np.stack([sample[name] for sample in log], axis=1) for name in log[0]}
+        return {"time": time, "samples": self._samples, **trajectories}
 
 
 def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     """The ``episode_`` arrays of this module's table."""
-    outcome = np.where(flights.success, "success", np.where(flights.collision, "collision", "out_of_range"))
+    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset")
     return {
         "episode_seed": np.asarray(seeds, dtype=np.int64),
-        "episode_outcome": outcome,
-        "episode_start": flights.start,
-        "episode_target": flights.target,
-        "episode_flown": flights.flown,
-        "episode_reward": flights.reward,
+        "episode_outcome": np.where(flights.success, "success", np.where(flights.collision, "collision", "out_of_range")),
+        **{f"episode_{name}": getattr(flights, name) for name in as_they_are},
         "episode_path": flights.path_length,
-        "episode_final_error": flights.final_error,
-        "episode_final_offset": flights.final_offset,
         "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),
         "episode_tolerances": np.array(list(flights.time_to)),
         "episode_waypoints": flights.waypoint_times,

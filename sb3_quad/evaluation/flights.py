@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -21,11 +22,13 @@ from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.experts.controller import Controller
 from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 ACTIONS = spaces.Box(-1.0, 1.0, (4,), np.float32)
+OBSERVATIONS = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,25 +160,22 @@ def fly_settings(
     hooks: Sequence[Hook] = (),
     plan: Plan | None = None,
 ) -> Flights:
-    """As :func:`fly`, by one record of how the episodes are flown: the first episode of each seed, from its start to its end.
+    """As :func:`fly`, by one record of how the episodes are flown: the first episode of each seed.
 
-    :param hooks: are called along the way.
+    :param plan: what happens to the episodes along the way.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
-    fleet = FLEETS[backend](seeds, settings)
-    try:
+    with closing(FLEETS[backend](seeds, settings)) as fleet:
         return _fly_fleet(fleet, controller, plan or Plan(), settings.max_episode_steps, tolerances, hooks)
-    finally:
-        fleet.close()
 
 
 def _fly_fleet(
     fleet: Fleet, controller: Any, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
 ) -> Flights:
-    asked = Controller(controller, ACTIONS, true_state=fleet.true_state)
-    n, control_step, count = fleet.n, fleet.vehicle.control_step, len(plan.waypoints)
+    asked = Controller(controller, ACTIONS, OBSERVATIONS, fleet.true_state)
     observation = fleet.reset(plan.start)
+    n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()
     start = np.concatenate([state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES)]).T.copy()
     first_target, position, error = state.target.copy(), state.position.copy(), state.distance
@@ -197,7 +197,7 @@ def _fly_fleet(
         actions = _ask(asked, observation, flying, (step - 1) * control_step)
         for hook in hooks:
             hook.before_step(state, observation, wrench, flying)
-        observation, step_reward, lost, error = fleet.step(actions, flying)
+        observation, step_reward, lost, collided, error = fleet.step(actions, flying)
         state = fleet.true_state()
         reward[flying] += step_reward[flying]
         path[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
@@ -206,7 +206,7 @@ def _fly_fleet(
         length[flying] = step
         times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
         ended = flying & lost
-        collision |= ended & fleet.collided
+        collision |= ended & collided
         success &= ~ended
         flying &= ~lost
         for hook in hooks:

@@ -7,19 +7,18 @@ import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, write_arrays, write_text
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen, Model, validate
 from sb3_quad.evaluation.controllers import file_name
 from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.records import Entry, Results
 
-Record = TypeVar("Record", bound=Frozen)
 RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
 _TARGET = ("target_x", "target_y", "target_z")
 _START = (
@@ -110,7 +109,7 @@ def _write(path: Path, record: Frozen) -> None:
     write_text(path, record.model_dump_json(indent=2, by_alias=True) + "\n")
 
 
-def _read(path: Path, model: type[Record]) -> Record:
+def _read(path: Path, model: type[Model]) -> Model:
     text = read_text(path)
     try:
         return validate(model, json.loads(text), "damaged, or of another version")

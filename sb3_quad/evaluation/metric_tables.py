@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from sb3_quad.evaluation.records import Entry, Estimate, HitLimit, Metrics, Results
+from sb3_quad.evaluation.records import Estimate, HitLimit, Metrics, Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.scenarios.scenario import Reference, Scenario
+from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 from sb3_quad.scenarios.vary import axis_name
 
 SUCCESS, REWARD, PATH, MEDIAN, LARGEST = "success", "mean reward", "mean path", "final error, median", "final error, largest"
@@ -19,8 +19,7 @@ TIME = "mean time to"  # begins the names of the rows with times to a tolerance
 ALWAYS_COMPARABLE = {SUCCESS, REACHED, COMPLETED, HIT}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
 MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
-CAPTION = "(…): 95 % interval; ±: half of it; bold: best of its row, intervals apart"
-TASK_SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of the thesis suite
+CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
 
 Cells = Mapping[str, Cell]  # by the names of the rows
 
@@ -43,8 +42,8 @@ def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
         note = f"{100 * arrival.share.value:.3g} % arrive" if some else ""
         cells[time_row(arrival.tolerance)] = replace(_mean(arrival.time, "never"), note=note)
     cells[PATH] = _mean(metrics.path)
-    for row, error in ((MEDIAN, metrics.final_error_median), (LARGEST, metrics.final_error_max)):
-        cells[row] = Cell(words="–") if error is None else Cell(error, decimals=3)
+    cells[MEDIAN] = Cell(metrics.final_error_median, decimals=3, words="–")
+    cells[LARGEST] = Cell(metrics.final_error_max, decimals=3, words="–")
     if metrics.course is not None:
         cells[REACHED], cells[COMPLETED] = _mean(metrics.course.reached), _share(metrics.course.completed)
         cells[COURSE_TIME] = _mean(metrics.course.time, "never")
@@ -53,43 +52,19 @@ def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
     return cells
 
 
-def entry_cells(entry: Entry | None) -> Cells | None:
-    """As :func:`metric_cells`; None for a controller that failed."""
+def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
+    """As :func:`metric_cells`, of the controller with that label; None if it failed."""
+    entry = results.entry(controller, scenario.name)
     return None if entry is None else metric_cells(entry.metrics, entry.hit_limit)
 
 
 def reference_cells(reference: Reference) -> Cells:
     """Others' metrics."""
-    given = {SUCCESS: reference.success, REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error}
-    given |= {FLOWN: reference.flown}
-    cells = {row: _given(row, value) for row, value in given.items() if value is not None}
-    if SUCCESS in cells:
-        cells[SUCCESS] = replace(cells[SUCCESS], note=reference.note)
-    for tolerance, time in reference.time_to.items():
-        row = time_row(tolerance)
-        cells[row] = Cell(words="never") if time is None else _given(row, time)
-    return cells
-
-
-def shown_rows(scenario: Scenario, brief: bool = False) -> list[str]:
-    """The rows that mean something in a scenario.
-
-    :param brief: only the main ones of many tolerances; a plot shows the others.
-    """
-    if scenario.target.waypoints is not None:
-        return [SUCCESS, REACHED, COMPLETED, COURSE_TIME]
-    if scenario.group is not None:
-        return [SUCCESS, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
-    tolerances = scenario.tolerances
-    if brief and len(tolerances) > MOST_TOLERANCES:
-        referenced = {float(key) for reference in scenario.reference.values() for key in reference.time_to}
-        kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
-        tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
-    if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        names = [SUCCESS, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
-    else:
-        names = [SUCCESS, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
-    return names + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
+    given = {REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error, FLOWN: reference.flown}
+    cells = {row: _given(value) for row, value in given.items() if value is not None}
+    if reference.success is not None:
+        cells[SUCCESS] = replace(_given(reference.success, 100.0), note=reference.note)
+    return cells | {time_row(tolerance): _given(time) for tolerance, time in reference.time_to.items()}
 
 
 def metric_rows(
@@ -98,12 +73,12 @@ def metric_rows(
     """The rows of a scenario, the best of each marked: first the cells of the controllers, then those from elsewhere.
 
     :param measured: of each controller; None: it failed.
-    :param brief: as :func:`shown_rows` takes it.
+    :param brief: only the main ones of many tolerances; a plot shows the others.
     """
     others = [reference_cells(reference) for reference in references]
     none_lost = all(cells is None or cells[SUCCESS].value == 100.0 for cells in measured)
     rows = []
-    for name in shown_rows(scenario, brief):
+    for name in _row_names(scenario, brief):
         failed = Cell(words="failed") if name == SUCCESS else Cell()
         own = [failed if cells is None else cells.get(name, Cell()) for cells in measured]
         if all(cell == Cell() for cell in own):
@@ -128,38 +103,27 @@ def mark_best(row: str, cells: Sequence[Cell]) -> list[Cell]:
     return marked
 
 
-def comparison(
-    title: str, columns: Mapping[str, Metrics], scenario: Scenario, only: Iterable[str] | None = None, source: str = "thesis"
-) -> Table:
-    """A table of controllers side by side in one scenario, and the columns of its reference metrics.
-
-    :param columns: from the name of each controller to its metrics.
-    :param only: the reference columns to show; None: all.
-    :param source: where these come from.
-    """
-    kept = [name for name in (scenario.reference if only is None else only) if name in scenario.reference]
-    rows = metric_rows(scenario, list(map(metric_cells, columns.values())), [scenario.reference[name] for name in kept])
-    heads = [*map(Column, columns), *(Column(name, source=source) for name in kept)]
-    return Table(heads, rows, title=title, caption=CAPTION)
-
-
-def overview(results: Results, controllers: Sequence[str], source: str = "reference") -> Table:
+def overview(results: Results, controllers: Sequence[str]) -> Table:
     """All scenarios in one table: a section each, a column per controller, reference metrics in the last column.
 
     :param controllers: labels, in the order of their columns.
-    :param source: heads the column of the reference metrics.
     """
+    columns = [*map(Column, controllers), Column(results.source, align="left")]
+    if not any(scenario.reference for scenario in results.scenarios):
+        columns.pop()
     rows = []
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
         for scenario in scenarios:
-            measured = [entry_cells(results.entry(label, scenario.name)) for label in controllers]
+            measured = [measured_cells(results, label, scenario) for label in controllers]
             found = metric_rows(scenario, measured, scenario.reference.values())
-            rows += [_overview_row(row, scenario, len(controllers), len(found) > 1) for row in found]
-    columns = [*map(Column, controllers), Column(source, align="left")]
-    if not any(scenario.reference for scenario in results.scenarios):
-        columns.pop()
-        rows = [replace(row, cells=row.cells[:-1]) for row in rows]
+            varied = ", ".join(f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items())
+            for row in found:
+                name = f"{varied}, {row.name}" if varied and len(found) > 1 else varied or row.name
+                others = zip(scenario.reference, row.cells[len(controllers) :], strict=True)
+                beside = "; ".join(f"{who} {replace(cell, note='').text}" for who, cell in others if cell != Cell())
+                cells = [*row.cells[: len(controllers)], Cell(words=beside)]
+                rows.append(Row(f"  {name}", row.unit, cells[: len(columns)]))
     return Table(columns, rows, title=results.suite, caption=CAPTION)
 
 
@@ -173,16 +137,22 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
     return groups
 
 
-def _overview_row(row: Row, scenario: Scenario, n: int, named: bool) -> Row:
-    """A row of one scenario: the cells of n controllers as they are, those of all references as one.
-
-    :param named: whether the row of a cell of ``vary`` needs its own name beside that of the cell.
-    """
-    cell = ", ".join(f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items())
-    name = f"{cell}, {row.name}" if cell and named else cell or row.name
-    others = zip(scenario.reference, row.cells[n:], strict=True)
-    words = "; ".join(f"{who} {replace(each, note='').in_terminal(row.unit)}" for who, each in others if each != Cell())
-    return Row(f"  {name}", row.unit, [*row.cells[:n], Cell(words=words)])
+def _row_names(scenario: Scenario, brief: bool) -> list[str]:
+    """The rows that mean something in a scenario."""
+    if scenario.target.waypoints is not None:
+        return [SUCCESS, REACHED, COMPLETED, COURSE_TIME]
+    if scenario.group is not None:
+        return [SUCCESS, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
+    tolerances = scenario.tolerances
+    if brief and len(tolerances) > MOST_TOLERANCES:
+        referenced = {float(key) for reference in scenario.reference.values() for key in reference.time_to}
+        kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
+        tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
+    if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
+        names = [SUCCESS, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
+    else:
+        names = [SUCCESS, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
+    return names + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
 
 
 def _beats(cell: Cell, other: Cell, higher: bool) -> bool:
@@ -191,7 +161,9 @@ def _beats(cell: Cell, other: Cell, higher: bool) -> bool:
 
 
 def _share(estimate: Estimate) -> Cell:
-    return Cell(100 * estimate.value, (100 * estimate.low, 100 * estimate.high), decimals=1)
+    """In percent, with as many digits as a single flight takes to show."""
+    digits = len(str(estimate.n // 200))
+    return Cell(100 * estimate.value, (100 * estimate.low, 100 * estimate.high), decimals=digits)
 
 
 def _mean(estimate: Estimate | None, none: str = "–") -> Cell:
@@ -206,9 +178,10 @@ def _limit(limit: HitLimit) -> tuple[Cell, Cell]:
     return Cell(factor, (limit.low, float("inf") if limit.high is None else limit.high)), Cell(words=size)
 
 
-def _given(row: str, value: float | tuple[float, float]) -> Cell:
-    """A number as its source prints it; a pair is a range."""
-    factor, unit = (100.0 if row == SUCCESS else 1.0), unit_of(row)
+def _given(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
+    """A number as its source prints it; a pair is a range, None a time that never came."""
+    if value is None:
+        return Cell(words="never")
     if isinstance(value, tuple):
-        return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−") + f" {unit}".rstrip())
+        return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−"))
     return Cell(factor * value, decimals=len(f"{factor * value:g}".partition(".")[2]))

@@ -21,6 +21,7 @@ from sb3_quad.scenarios.scenario import Scenario
 
 SCHEMA_VERSION: Literal[1] = 1
 Vector = tuple[float, float, float]
+Scaling = Literal["none", "adaptive"]
 
 
 class Estimate(Frozen):
@@ -90,9 +91,9 @@ class ControllerRecord(Frozen):
     label: str = Field(description="column title; unique in a folder")
     spec: str = Field(description="as given: pid, geometric, the file name of a zip, package.module:factory")
     kind: Literal["expert", "model", "factory"]
-    algorithm: str | None = Field(description="SB3 class that loaded a zip")
+    algorithm: str | None = Field(default=None, description="SB3 class that loaded a zip")
     content: str = Field(description="SHA-256 of the zip, or of the source and version of an expert or factory")
-    scaling: Literal["none", "adaptive"] = Field(description="of its observation (4.3.1)")
+    scaling: Scaling = Field(default="none", description="of its observation (4.3.1)")
     offset: Vector | None = Field(
         default=None, description="with adaptive scaling: the position components of μ, measured beforehand, m"
     )

@@ -30,24 +30,11 @@ def adaptive_factor(distance: npt.ArrayLike) -> FloatArray:
     return 0.5 * (1.0 + np.asarray(distance, dtype=np.float64) / 10.0)
 
 
-def adapt_observation(observation: Float32Array, mean: FloatArray, std: FloatArray) -> Float32Array:
-    """Observations scaled anew: (s - μ) / (α σ) in the position components, where s / σ is what the environment gives.
-
-    The distance in Eq. 4.10 is the observed one, noise and all, so that a policy needs nothing but its observation.
-
-    :param observation: (n, 18), as the environment scales it by μ = 0 and σ (Eq. 3.16).
-    :param mean: position components of μ, (3,), m.
-    :param std: position components of σ, (3,), m.
-    """
-    position = observation[:, _POSITION] * std
-    factor = adaptive_factor(np.linalg.norm(position, axis=1, keepdims=True))
-    adapted = observation.copy()
-    adapted[:, _POSITION] = (position - mean) / (factor * std)
-    return adapted
-
-
 class AdaptiveScaling:
     """A policy behind the thesis's scaling: a function from observations (n, 18) to actions (n, 4).
+
+    In the position components it shows the policy (s - μ) / (α σ), where s / σ is what the environment gives. The distance in
+    α is the observed one, noise and all, so that a policy needs nothing but its observation.
 
     :param policy: an SB3 model, or a function of observations.
     :param mean: position components of μ, (3,), m; zero: only α.
@@ -55,25 +42,29 @@ class AdaptiveScaling:
     """
 
     def __init__(self, policy: Any, mean: npt.ArrayLike = (0.0, 0.0, 0.0), std: npt.ArrayLike | None = None) -> None:
-        self.policy = policy
+        self.policy, self.observation_space = policy, getattr(policy, "observation_space", None)
         self.mean = np.asarray(mean, dtype=np.float64)
         self.std = np.asarray(DEFAULT_STD[_POSITION] if std is None else std, dtype=np.float64)
         self._ask = observation_function(policy)
 
     def __call__(self, observation: Float32Array) -> Any:
-        return self._ask(adapt_observation(np.asarray(observation), self.mean, self.std))
+        position = observation[:, _POSITION] * self.std
+        factor = adaptive_factor(np.linalg.norm(position, axis=1, keepdims=True))
+        adapted = observation.copy()
+        adapted[:, _POSITION] = (position - self.mean) / (factor * self.std)
+        return self._ask(adapted)
 
 
 def hover_offset(
-    controller: Any, n_flights: int = N_FLIGHTS, seed: int = 0, settings: FlightSettings | None = None, **changes: Any
+    controller: Any, n_flights: int = N_FLIGHTS, seed: int = 0, settings: FlightSettings | None = None
 ) -> FloatArray:
     """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking, over the flights that last.
 
-    :param settings: how it flies; task and episode length are those of this measurement. ``changes`` are put over them.
+    :param settings: how it flies; task and episode length are those of this measurement.
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
-    own = {"task": "target_tracking", "task_kwargs": None, "max_episode_steps": STEPS, **changes}
-    flights = fly_settings(controller, (settings or FlightSettings()).with_changes(**own), range(seed, seed + n_flights))
+    episodes = {"task": "target_tracking", "task_kwargs": None, "max_episode_steps": STEPS}
+    flights = fly_settings(controller, (settings or FlightSettings()).with_changes(**episodes), range(seed, seed + n_flights))
     lost = 1.0 - float(flights.success.mean())
     if lost > 0.5:
         raise ConfigError(
@@ -82,16 +73,15 @@ def hover_offset(
     return np.asarray(flights.final_offset[flights.success].mean(axis=0))
 
 
-def measure_mean(policy: Any, n_flights: int = N_FLIGHTS, **changes: Any) -> FloatArray:
+def measure_mean(policy: Any, n_flights: int = N_FLIGHTS, settings: FlightSettings | None = None) -> FloatArray:
     """The position components of μ, (3,), m, with which a policy behind :class:`AdaptiveScaling` stops at its target.
 
     Eq. 4.10 shrinks the offset, too, so it is measured with α at work, and again after each correction.
 
-    :param changes: as of :func:`hover_offset`, such as ``vehicle``.
     :raises ConfigError: see :func:`hover_offset`.
     """
     mean = np.zeros(3)
     for number in range(ROUNDS):
         seed = seed_for("offset") + number * N_FLIGHTS
-        mean = mean - hover_offset(AdaptiveScaling(policy, mean), n_flights, seed, **changes)
+        mean = mean - hover_offset(AdaptiveScaling(policy, mean), n_flights, seed, settings)
     return mean

@@ -1,19 +1,25 @@
-"""Flying the episodes of a scenario."""
+"""Flying the episodes of a scenario, and finding how large a hit a controller survives there."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from sb3_quad.base.arrays import Arrays, FloatArray
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import Flights, Plan, fly_settings
+from sb3_quad.evaluation.records import Estimate, HitLimit, HitTrial
+from sb3_quad.evaluation.summary import share
 from sb3_quad.scenarios.sample import Episodes, sample_episodes
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
 RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most
+FIRST_GRID, GRID = 16, 8  # factors of a hit that are flown side by side, in the first round and in those after it
+MAX_ROUNDS = 8
 
 
 def fly_scenario(
@@ -38,16 +44,14 @@ def fly_scenario(
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
     size = PART_SIZES.get(backend, 1)
-    parts, trajectories = [], None
+    parts, recorder = [], Recorder(recorded)
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
         episodes = sample_episodes(scenario, chosen[part], None if factors is None else factors[part])
-        recorder = Recorder(min(recorded, len(episodes.seeds)), episodes.steps) if recorded and first == 0 else None
         settings, plan = flown_as(episodes)
-        hooks = () if recorder is None else (recorder,)
+        hooks = [recorder] if recorded and first == 0 else []
         parts.append(fly_settings(controller, settings, episodes.seeds, backend, scenario.tolerances, hooks, plan))
-        trajectories = recorder.arrays() if recorder is not None else trajectories
-    return Flights.concatenate(parts), trajectories or {}
+    return Flights.concatenate(parts), recorder.arrays() if recorded else {}
 
 
 def flown_as(episodes: Episodes) -> tuple[FlightSettings, Plan]:
@@ -56,3 +60,47 @@ def flown_as(episodes: Episodes) -> tuple[FlightSettings, Plan]:
         task=episodes.task, vehicle=episodes.vehicle, noise=episodes.noise, max_episode_steps=episodes.steps
     )
     return settings, Plan(episodes.start, episodes.wrenches, episodes.waypoints, episodes.radius)
+
+
+def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> HitLimit | None:
+    """The least factor of a scenario's wrenches, force and torque alike, at which half of the flights are lost.
+
+    A grid of factors from 0 to ``hit_search.largest`` is flown first, so that survival need not fall evenly; then the interval
+    in which it first drops to a half is divided again and again, until it is narrower than ``hit_search.resolution`` of its
+    upper end. All factors see the same episodes.
+
+    :return: None for a scenario without ``hit_search``.
+    :raises ControllerError: a controller that fails in flight.
+    """
+    search = scenario.hit_search
+    if search is None:
+        return None
+    seeds = range(scenario.seed, scenario.seed + search.episodes)
+    tried: dict[float, Estimate] = {}
+    low, high = 0.0, search.largest
+    grid = np.linspace(low, high, FIRST_GRID + 1)
+    for _ in range(MAX_ROUNDS):
+        factors = np.repeat(grid, search.episodes)
+        flights, _ = fly_scenario(controller, scenario, backend, [*seeds] * grid.size, factors)
+        survived = flights.success.reshape(grid.size, search.episodes)
+        tried |= {factor: share(row) for factor, row in zip(grid.tolist(), survived, strict=True)}
+        lost = next((factor for factor in sorted(tried) if tried[factor].value <= 0.5), None)
+        if lost is None:
+            break
+        low, high = max((factor for factor in tried if factor < lost), default=0.0), lost
+        if high - low <= search.resolution * high:
+            break
+        grid = np.linspace(low, high, GRID + 1)[1:-1]
+    factor = lost
+    if lost is not None and low < high:  # where the line between the two shares passes a half
+        above, below = tried[low].value, tried[high].value
+        factor = low + (high - low) * (above - 0.5) / (above - below)
+    end = np.inf if lost is None else lost
+    return HitLimit(
+        factor=factor,
+        low=max((each for each in tried if tried[each].low > 0.5 and each < end), default=0.0),
+        high=min((each for each in tried if tried[each].high < 0.5 and each >= end), default=None),
+        force=max(wrench.force.largest for wrench in scenario.wrenches),
+        torque=max(wrench.torque.largest for wrench in scenario.wrenches),
+        trials=[HitTrial(factor=each, survived=tried[each]) for each in sorted(tried)],
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -31,39 +30,24 @@ class Cell:
     @property
     def number(self) -> str:
         """The value, with a proper minus sign; empty if there is none."""
-        return "" if self.value is None else self._text(self.value).replace("-", "−")
+        return "" if self.value is None else self._rounded(self.value)
 
     @property
     def interval(self) -> str:
         """The interval in words; empty where it is narrower than the last digit."""
-        low, high = ("", "") if self.ends is None else map(self._text, self.ends)
+        low, high = ("", "") if self.ends is None else map(self._rounded, self.ends)
         if low == high:
             return ""
-        return (f"above {low}" if high == "inf" else f"{low} to {high}").replace("-", "−")
+        return f"above {low}" if high == "inf" else f"{low} to {high}"
 
-    def in_markdown(self) -> str:
-        """The number, the interval in brackets, the note; the number is bold if it is the best."""
-        number = self.words if self.value is None else self.number
-        number = f"**{number}**" if self.best and number else number
-        return number + (f" ({self.interval})" if self.interval else "") + (f", {self.note}" if self.note else "")
+    @property
+    def text(self) -> str:
+        """The number or the words, the interval in brackets, the note."""
+        interval, note = (f" ({self.interval})" if self.interval else ""), (f", {self.note}" if self.note else "")
+        return (self.number or self.words) + interval + note
 
-    def in_terminal(self, unit: str) -> str:
-        """The number with its unit; means with ± half of their interval, shares and factors with its ends; the note."""
-        note = f" ({self.note})" if self.note else ""
-        if self.value is None:
-            return self.words + note
-        if unit == "%":
-            ends = "" if self.ends is None else f" ({self.ends[0]:.3g}-{self.ends[1]:.3g})"
-            return f"{self.value:.4g} %{ends}{note}"
-        if unit == "×":
-            return f"{self.number} x" + (f" ({self.interval.replace(' to ', '-')})" if self.interval else "") + note
-        half = self._text(0.0 if self.ends is None else 0.5 * (self.ends[1] - self.ends[0]))
-        spread = f" ± {half}" if float(half) > 0.0 else ""
-        return f"{self._text(self.value)}{spread} {unit}".rstrip() + note
-
-    def _text(self, value: float) -> str:
-        text = f"{value:.{self.decimals}f}"
-        return text.removeprefix("-") if math.isclose(float(text), 0.0) else text
+    def _rounded(self, value: float) -> str:
+        return f"{round(value, self.decimals) + 0.0:.{self.decimals}f}".replace("-", "−")  # + 0.0: zero without a sign
 
 
 @dataclass(frozen=True)
@@ -93,6 +77,11 @@ class Row:
     unit: str = ""
     cells: Sequence[Cell] = ()
 
+    @property
+    def heading(self) -> str:
+        """The name, the unit after it."""
+        return f"{self.name}, {self.unit}" if self.unit else self.name
+
 
 @dataclass(frozen=True)
 class Table:
@@ -109,15 +98,14 @@ class Table:
     caption: str = ""
 
     def markdown(self) -> str:
-        """The lines of the table; the units stand with the names of the rows."""
+        """The lines of the table; the best of a row is bold."""
         lines = [[self.corner, *(column.heading for column in self.columns)], ["---"] * (1 + len(self.columns))]
         for row in self.rows:
-            name = f"{row.name}, {row.unit}" if row.unit else row.name
-            lines.append([name, *(cell.in_markdown() for cell in row.cells)])
+            lines.append([row.heading, *(f"**{cell.text}**" if cell.best else cell.text for cell in row.cells)])
         return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
 
     def __rich__(self) -> rich.table.Table:
-        """The table as ``rich`` prints it; the units stand with the numbers."""
+        """The table as ``rich`` prints it; the best of a row is bold."""
         table = rich.table.Table(title=escape(self.title) or None, caption=escape(self.caption) or None)
         table.title_justify = table.caption_justify = "left"
         table.show_header = any([self.corner, *(column.heading for column in self.columns)])
@@ -127,8 +115,8 @@ class Table:
         for row in self.rows:
             if not row.cells:
                 table.add_section()
-            texts = (Text(cell.in_terminal(row.unit), "bold" if cell.best else "") for cell in row.cells)
-            table.add_row(Text(row.name, "" if row.cells else "bold"), *texts)
+            texts = (Text(cell.text, "bold" if cell.best else "") for cell in row.cells)
+            table.add_row(Text(row.heading, "" if row.cells else "bold"), *texts)
         return table
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 from sb3_quad.base.seeds import seed_for
@@ -76,7 +75,6 @@ def write_card(
     rows = []
     for task, metrics in measured.items():
         cells = dict(metric_cells(metrics))
-        cells[SUCCESS] = replace(cells[SUCCESS], decimals=2)
         if task == RECOVERY:  # begins at its target
             cells[NEAR] = Cell(words="–")
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))

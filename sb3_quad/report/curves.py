@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -18,20 +18,13 @@ from sb3_quad.report.plots import band, styled
 NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """The evaluations of one run, k of them.
+class Curve(NamedTuple):
+    """The evaluations of one run, k of them."""
 
-    :param timesteps: (k,).
-    :param seconds: of training, evaluations along the way included, (k,).
-    :param success: share of successful episodes, (k,).
-    :param reward: mean per episode, (k,).
-    """
-
-    timesteps: FloatArray
-    seconds: FloatArray
-    success: FloatArray
-    reward: FloatArray
+    timesteps: FloatArray  # (k,)
+    seconds: FloatArray  # of training, evaluations along the way included, (k,)
+    success: FloatArray  # share of successful episodes, (k,)
+    reward: FloatArray  # mean per episode, (k,)
 
 
 def read_curve(run: str | Path, task: str | None = None) -> Curve:

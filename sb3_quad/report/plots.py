@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.evaluation.records import Estimate
+from sb3_quad.evaluation.records import Estimate, Metrics, Results
 from sb3_quad.report.tracks import Flown, Track
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.scenarios.vary import axis_label, axis_name
@@ -44,6 +45,7 @@ STYLE: Any = {
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), QUIET),
 }
 styled = matplotlib.rc_context(STYLE)
+Cells = list[tuple[Scenario, Metrics]]  # those of a varied scenario that one controller has flown
 METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # left out: the same results give the same file
 
 
@@ -112,8 +114,8 @@ def _axes(width: float, x_label: str, y_label: str) -> tuple[Figure, Axes]:
 
 def _ends(estimates: Sequence[Estimate | None], factor: float = 1.0) -> FloatArray:
     """Values and both ends of their intervals, (3, n); NaN where there is none."""
-    names = ("value", "low", "high")
-    return factor * np.array([[np.nan if each is None else getattr(each, name) for each in estimates] for name in names])
+    rows = [[each and getattr(each, name) for each in estimates] for name in ("value", "low", "high")]
+    return factor * np.array(rows, dtype=np.float64)
 
 
 def band(axes: Axes, colour: str, label: str, x: FloatArray, ends: FloatArray, **style: Any) -> None:
@@ -212,55 +214,55 @@ def hits_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
 
 
 @styled
-def group_plots(scenarios: Sequence[Scenario], flown: Sequence[Sequence[Flown]]) -> list[Plot]:
-    """The plots of the cells that ``vary`` makes of a scenario: curves over one quantity, or heat maps over several.
+def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mapping[str, str]) -> list[Plot]:
+    """The plots of the cells that ``vary`` makes of a scenario: curves over one quantity, or a heat map over several.
 
-    :param flown: of each cell.
+    :param colours: by the labels of the controllers.
     """
-    cells: dict[str, list[tuple[Scenario, Flown]]] = {}
-    for scenario, entries in zip(scenarios, flown, strict=True):
-        for each in entries:
-            cells.setdefault(each.label, []).append((scenario, each))
-    return _sweep(cells) if len(scenarios[0].cell) == 1 else [_heat_map(scenarios, cells)]
+    flown: dict[str, Cells] = {}
+    for label, scenario in itertools.product(colours, scenarios):
+        entry = results.entry(label, scenario.name)
+        if entry is not None:
+            flown.setdefault(label, []).append((scenario, entry.metrics))
+    if not flown:
+        return []
+    return _sweep(scenarios[0], flown, colours) if len(scenarios[0].cell) == 1 else [_heat_map(scenarios, flown, colours)]
 
 
-def _sweep(cells: Mapping[str, Sequence[tuple[Scenario, Flown]]]) -> list[Plot]:
-    first = next(iter(cells.values()))[0][0]
+def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, str]) -> list[Plot]:
     (key,) = first.cell
     (success, shares), (error, distances) = (_axes(HALF, _label(key), name) for name in ("success (%)", "final distance (m)"))
-    for label, members in cells.items():
-        metrics, colour = [each.entry.metrics for _, each in members], members[0][1].colour
-        x = np.array([scenario.cell[key] for scenario, _ in members])
-        band(shares, colour, label, x, _ends([each.success for each in metrics], 100.0), **POINTS)
-        medians = [np.nan if each.final_error_median is None else each.final_error_median for each in metrics]
-        distances.plot(x, medians, color=colour, label=label, **POINTS)
+    for label, cells in flown.items():
+        x = np.array([scenario.cell[key] for scenario, _ in cells])
+        band(shares, colours[label], label, x, _ends([metrics.success for _, metrics in cells], 100.0), **POINTS)
+        medians = np.array([metrics.final_error_median for _, metrics in cells], dtype=np.float64)
+        distances.plot(x, medians, color=colours[label], label=label, **POINTS)
     shares.set_ylim(-3.0, 103.0)
     distances.set_ylim(bottom=0.0)
     legend(success, shares)
     legend(error, distances)
-    caption = "Median of the final error of flights that were not lost."
     success_plot = Plot(f"{first.group}_success", "Success, with 95 % intervals.", success)
-    return [success_plot, Plot(f"{first.group}_error", caption, error)]
+    return [success_plot, Plot(f"{first.group}_error", "Median of the final error of flights that were not lost.", error)]
 
 
-def _heat_map(scenarios: Sequence[Scenario], cells: Mapping[str, Sequence[tuple[Scenario, Flown]]]) -> Plot:
+def _heat_map(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours: Mapping[str, str]) -> Plot:
     """Success over the first two keys: a row of panels for each controller, a column for each combination of the others."""
     keys = list(scenarios[0].cell)
     x_values, y_values = (sorted({scenario.cell[key] for scenario in scenarios}) for key in keys[:2])
     columns = list(dict.fromkeys(_rest(scenario) for scenario in scenarios))
-    figure = Figure(figsize=(1.2 + 2.2 * len(columns), 0.5 + 1.7 * len(cells)), layout="constrained")
-    panels = figure.subplots(len(cells), len(columns), sharex=True, sharey=True, squeeze=False)
-    for row, (label, members) in zip(panels, cells.items(), strict=True):
+    figure = Figure(figsize=(1.2 + 2.2 * len(columns), 0.5 + 1.7 * len(flown)), layout="constrained")
+    panels = figure.subplots(len(flown), len(columns), sharex=True, sharey=True, squeeze=False)
+    for row, (label, cells) in zip(panels, flown.items(), strict=True):
         for axes, column in zip(row, columns, strict=True):
             grid = np.full((len(y_values), len(x_values)), np.nan)
-            for scenario, each in members:
+            for scenario, metrics in cells:
                 if _rest(scenario) == column:
                     x, y = x_values.index(scenario.cell[keys[0]]), y_values.index(scenario.cell[keys[1]])
-                    grid[y, x] = success = 100.0 * each.entry.metrics.success.value
+                    grid[y, x] = success = 100.0 * metrics.success.value
                     style = {"ha": "center", "va": "center", "fontsize": 7, "color": "#101010" if success > 60 else "#fefefe"}
                     axes.text(x + 0.5, y + 0.5, f"{success:.0f}", **style)
             image = axes.pcolormesh(grid, vmin=0, vmax=100, cmap="viridis", edgecolors=PAPER, linewidth=0.8)
-            axes.set_title(f"{label}, {column}".rstrip(", "), loc="left", color=members[0][1].colour)
+            axes.set_title(f"{label}, {column}".rstrip(", "), loc="left", color=colours[label])
             axes.set_xticks(np.arange(len(x_values)) + 0.5, [f"{value:g}" for value in x_values])
             axes.set_yticks(np.arange(len(y_values)) + 0.5, [f"{value:g}" for value in y_values])
             axes.grid(visible=False)

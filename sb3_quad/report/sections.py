@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_quad.drawing.palette import colours_of
-from sb3_quad.evaluation.metric_tables import SUCCESS, entry_cells, mark_best, metric_rows, reference_cells, scenario_groups
+from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, measured_cells, metric_rows, reference_cells, scenario_groups
 from sb3_quad.evaluation.records import Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
@@ -40,44 +40,30 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     groups = scenario_groups(results)
     parts = [Section("overview", "Success", OVERVIEW, [_success_table(results, groups, colours, "success (%)")])]
     for heading, scenarios in groups:
-        first = scenarios[0]
-        flown = [_flown(results, scenario, colours, folder) for scenario in scenarios]
+        first, each_of = scenarios[0], ""
         if first.group is None:
-            tables, plots = [_metric_table(results, first, colours)], _scenario_plots(first, flown[0], results.source)
+            tables, plots = [_metric_table(results, first, colours)], _scenario_plots(results, first, colours, folder)
         else:
-            cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
-            corner = f"{axis_label(next(iter(first.cell))).replace('_', ' ')}: success (%)"
-            tables = [_success_table(results, cells, colours, corner)] if len(first.cell) == 1 else []
-            plots = group_plots(scenarios, flown) if any(flown) else []
-        facts, name = _facts(scenarios), first.group or first.name
-        parts.append(Section(name, heading, first.description, tables, plots, facts))
+            each_of = f" in each of {len(scenarios)} cells"
+            tables, plots = [], group_plots(results, scenarios, colours)
+            if len(first.cell) == 1:
+                cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
+                corner = f"{axis_label(next(iter(first.cell))).replace('_', ' ')}: success (%)"
+                tables.append(_success_table(results, cells, colours, corner))
+        facts = (
+            f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
+            f"observation noise {100 * first.noise:g} %; seeds from {first.seed} on"
+        )
+        parts.append(Section(first.group or first.name, heading, first.description, tables, plots, facts))
     return parts
 
 
-def _facts(scenarios: Sequence[Scenario]) -> str:
-    first = scenarios[0]
-    cells = f" in each of {len(scenarios)} cells" if first.group is not None else ""
-    flights = f"{first.episodes} flights of each controller{cells}, {first.duration:g} s"
-    return f"{flights}; observation noise {100 * first.noise:g} %; seeds from {first.seed} on"
-
-
-def _columns(colours: Mapping[str, str], others: Iterable[str], source: str) -> list[Column]:
-    return [*(Column(*each) for each in colours.items()), *(Column(name, source=source) for name in others)]
-
-
-def _flown(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Flown]:
-    found = []
-    for label, colour in colours.items():
-        entry = results.entry(label, scenario.name)
-        if entry is not None:
-            found.append(Flown(label, colour, entry, read_tracks(folder, entry) if scenario.group is None else []))
-    return found
-
-
-def _scenario_plots(scenario: Scenario, flown: Sequence[Flown], source: str) -> list[Plot]:
+def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
+    entries = {label: results.entry(label, scenario.name) for label in colours}
+    flown = [Flown(label, colours[label], entry, read_tracks(folder, entry)) for label, entry in entries.items() if entry]
     plots = []
     if flown and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
-        plots.append(arrivals_plot(scenario, flown, source))
+        plots.append(arrivals_plot(scenario, flown, results.source))
     tracked = [each for each in flown if each.tracks]
     if tracked:
         plots += [paths_plot(scenario, tracked), errors_plot(scenario, tracked)]
@@ -87,7 +73,7 @@ def _scenario_plots(scenario: Scenario, flown: Sequence[Flown], source: str) -> 
 
 
 def _metric_table(results: Results, scenario: Scenario, colours: Mapping[str, str]) -> Table:
-    measured = [entry_cells(results.entry(label, scenario.name)) for label in colours]
+    measured = [measured_cells(results, label, scenario) for label in colours]
     rows = metric_rows(scenario, measured, scenario.reference.values(), brief=True)
     return Table(_columns(colours, scenario.reference, results.source), rows)
 
@@ -96,19 +82,18 @@ def _success_table(
     results: Results, groups: Sequence[tuple[str, Sequence[Scenario]]], colours: Mapping[str, str], corner: str
 ) -> Table:
     """Success in each group of scenarios; where there are several in one, from the worst to the best."""
-    given = [each for _, scenarios in groups for each in scenarios[0].reference.items()]
-    others = list(dict.fromkeys(name for name, reference in given if reference.success is not None))
+    references = [scenarios[0].reference for _, scenarios in groups]
+    others = dict.fromkeys(name for given in references for name in given if given[name].success is not None)
     rows = []
-    for heading, scenarios in groups:
+    for (heading, scenarios), given in zip(groups, references, strict=True):
         own = mark_best(SUCCESS, [_success(results, label, scenarios) for label in colours])
-        references = {name: reference_cells(reference) for name, reference in scenarios[0].reference.items()}
-        beside = [references.get(name, {}).get(SUCCESS, Cell()) for name in others]
+        beside = [reference_cells(given[name]).get(SUCCESS, Cell()) if name in given else Cell() for name in others]
         rows.append(Row(heading, "", [*own, *beside]))
     return Table(_columns(colours, others, results.source), rows, corner)
 
 
 def _success(results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
-    found = [entry_cells(results.entry(label, scenario.name)) for scenario in scenarios]
+    found = [measured_cells(results, label, scenario) for scenario in scenarios]
     shares = [cells[SUCCESS] for cells in found if cells is not None]
     if not shares:
         return Cell(words="failed")
@@ -116,3 +101,7 @@ def _success(results: Results, label: str, scenarios: Sequence[Scenario]) -> Cel
         return shares[0]
     values = [share.value for share in shares if share.value is not None]
     return Cell(words=f"{min(values):.0f} to {max(values):.0f}")
+
+
+def _columns(colours: Mapping[str, str], others: Iterable[str], source: str) -> list[Column]:
+    return [*(Column(*each) for each in colours.items()), *(Column(name, source=source) for name in others)]

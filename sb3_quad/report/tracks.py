@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,20 +15,14 @@ from sb3_quad.evaluation.records import Entry
 OUTCOMES = {"success": "", "collision": "touches the ground", "out_of_range": "leaves the range"}
 
 
-@dataclass(frozen=True, eq=False)
-class Track:
-    """One flight, k samples.
+class Track(NamedTuple):
+    """One flight, k samples."""
 
-    :param times: (k,), s; ``position`` and ``target``: (k, 3), world frame, m.
-    :param wrench: (k, 6), mean since the sample before: force, world frame, N; torque, body frame, N m.
-    :param lost: how it was lost, empty if it was not.
-    """
-
-    times: FloatArray
-    position: FloatArray
+    times: FloatArray  # (k,), s
+    position: FloatArray  # (k, 3), world frame, m; target likewise
     target: FloatArray
-    wrench: FloatArray
-    lost: str
+    wrench: FloatArray  # (k, 6), mean since the sample before: force, world frame, N; torque, body frame, N m
+    lost: str  # how it was lost, empty if it was not
 
     @property
     def error(self) -> FloatArray:
@@ -42,8 +36,7 @@ class Track:
         return np.asarray(self.target[[0, *changed]])
 
 
-@dataclass(frozen=True, eq=False)
-class Flown:
+class Flown(NamedTuple):
     """One controller in one scenario: its colour, its metrics, its sampled flights."""
 
     label: str
@@ -59,10 +52,8 @@ def read_tracks(folder: str | Path, entry: Entry) -> list[Track]:
     """
     arrays = read_flights(Path(folder) / entry.flights)
     tracks = []
-    for number, samples in enumerate(arrays.get("samples", np.array([], dtype=np.int64)).tolist()):
-        position, target, wrench = (
-            np.asarray(arrays[name][number, :samples], dtype=np.float64) for name in ("position", "target", "wrench")
-        )
+    for number, samples in enumerate(arrays.get("samples", ())):
+        rows = {name: arrays[name][number, :samples].astype(np.float64) for name in ("position", "target", "wrench")}
         lost = OUTCOMES.get(str(arrays["episode_outcome"][number]), "lost")
-        tracks.append(Track(np.asarray(arrays["time"][:samples], dtype=np.float64), position, target, wrench, lost))
+        tracks.append(Track(times=arrays["time"][:samples], lost=lost, **rows))
     return tracks

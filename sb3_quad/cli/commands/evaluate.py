@@ -6,11 +6,11 @@ import argparse
 import sys
 import time
 
-from sb3_quad.base.errors import ConfigError, MissingExtra, unknown
+from sb3_quad.base.errors import MissingExtra
 from sb3_quad.cli.arguments.evaluate import DEFAULT_FOLDER
 from sb3_quad.cli.commands.report import report
 from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.evaluation.controllers import SCALINGS, parse_controllers
+from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.metric_tables import overview
 from sb3_quad.scenarios.load import load_suite
@@ -18,8 +18,6 @@ from sb3_quad.scenarios.load import load_suite
 
 def run(options: argparse.Namespace) -> int:
     """Fly, print the table, tell where everything is. Returns the exit code."""
-    if options.scaling not in SCALINGS:
-        raise ConfigError(unknown("scaling", options.scaling, SCALINGS))
     suite = load_suite(options.suite).with_changes(options.scenario, options.episodes, options.seed, options.vehicle)
     controllers = parse_controllers(options.controllers, options.scaling)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
@@ -30,7 +28,7 @@ def run(options: argparse.Namespace) -> int:
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
     if labels:
-        console().print(overview(flown, labels, suite.source))
+        console().print(overview(flown, labels))
     print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and results.entries:
         try:

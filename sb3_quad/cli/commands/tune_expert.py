@@ -10,7 +10,7 @@ from sb3_quad.base.files import refuse_existing, write_text
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.evaluation.expert_figures import measure_expert
+from sb3_quad.evaluation.expert_metrics import measure_expert
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
 from sb3_quad.tuning.expert import ExpertSearch, with_gains
@@ -58,11 +58,9 @@ def run(options: argparse.Namespace) -> int:
     rows = [("state recovery", *recovery), ("target tracking", *tracking, *times)]
     console().print(text_table("on fresh episodes, true state", heads, rows))
     starts = []
-    for quantity, groups in recoveries.flown.items():
-        for group, flown in groups.items():
-            lost = recoveries.lost[quantity][group]
-            success = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
-            starts.append((f"{quantity} {group}", str(flown), str(lost), success))
+    for start, (flown, lost) in recoveries.items():
+        success = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
+        starts.append((start, str(flown), str(lost), success))
     console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "success"), starts))
     print(f"{search.trials_done} gains tried, least cost {search.best_cost:.3f}; journal: {journal}")
     print(f"saved {output}")
