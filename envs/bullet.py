@@ -5,16 +5,13 @@ from __future__ import annotations
 import sys
 import weakref
 
-import numpy as np
-import numpy.typing as npt
-
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.bullet import p
-from sb3_quad.drawing.window import has_display, open_window
+from sb3_quad.drawing.window import disconnect, has_display, open_window
 from sb3_quad.simulation.engine.rotors import write_body
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
-FloatArray = npt.NDArray[np.float64]
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -37,7 +34,7 @@ class BulletBody:
             print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
         self.client = open_window(*window) if window is not None and self.has_window else int(p.connect(p.DIRECT))
         # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's clients are limited.
-        self._close = weakref.finalize(self, _disconnect, self.client)
+        self._close = weakref.finalize(self, disconnect, self.client)
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
         p.setPhysicsEngineParameter(fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client)
         ball = p.createCollisionShape(p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client)
@@ -59,25 +56,23 @@ class BulletBody:
         p.resetBasePositionAndOrientation(self.body, first.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
         p.resetBaseVelocity(self.body, first.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
 
-    def fly(self, wrenches: FloatArray) -> None:
-        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame."""
-        client, body, frame = self.client, self.body, p.LINK_FRAME
-        push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
-        for force, torque in wrenches.tolist():
-            push(body, -1, force, _ORIGIN, frame, physicsClientId=client)
-            twist(body, -1, torque, frame, physicsClientId=client)
-            step(physicsClientId=client)
+    def fly(self, wrenches: FloatArray, world: FloatArray | None = None) -> None:
+        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame.
 
-    def fly_pushed(self, wrenches: FloatArray, world_force: FloatArray, world_torque: FloatArray) -> None:
-        """As :meth:`fly`, with a force and a torque in the world frame, (3,) each, besides."""
+        :param world: a force and a torque in the world frame that act besides, (2, 3); None: none.
+        """
         client, body = self.client, self.body
-        outer_force, outer_torque = world_force.tolist(), world_torque.tolist()
-        for wrench in wrenches:
-            # A world-frame force acts at a point of the world: the centre of mass, where it is now.
-            position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
-            p.applyExternalForce(body, -1, outer_force, position, p.WORLD_FRAME, physicsClientId=client)
-            p.applyExternalTorque(body, -1, outer_torque, p.WORLD_FRAME, physicsClientId=client)
-            self.fly(wrench[None])
+        push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
+        world_force, world_torque = ((), ()) if world is None else world.tolist()
+        for force, torque in wrenches.tolist():
+            if world is not None:
+                # A world-frame force acts at a point of the world: the centre of mass, where it is now.
+                position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
+                push(body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client)
+                twist(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+            push(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
+            twist(body, -1, torque, p.LINK_FRAME, physicsClientId=client)
+            step(physicsClientId=client)
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
@@ -88,8 +83,3 @@ class BulletBody:
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""
         self._close()
-
-
-def _disconnect(client: int) -> None:
-    if p.isConnected(client):
-        p.disconnect(physicsClientId=client)

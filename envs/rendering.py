@@ -9,11 +9,11 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.drawing.camera import ChaseCamera
-from sb3_quad.drawing.models import rotor_turning, scale_of
+from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose, Scene
 from sb3_quad.drawing.window import furnish_window, point_window, start_drawing
 from sb3_quad.envs.bullet import BulletBody
-from sb3_quad.simulation.state import POSITION, TARGET
+from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, TARGET
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
@@ -31,7 +31,6 @@ class Renderer:
         self.vehicle, self.client = vehicle, body.client
         self.width, self.height, self.human = width, height, body.has_window
         self.rotor_angles = np.zeros(4)
-        self.chase = ChaseCamera(scale_of(vehicle))
         self.shown_at = time.perf_counter()
         self.frames_due = 1.0
         if self.human:
@@ -39,33 +38,27 @@ class Renderer:
         # PyBullet would draw the collision sphere.
         p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
         self.scene = Scene(vehicle, self.client)
+        self.chase = ChaseCamera(self.scene.scale)
         if self.human:
             start_drawing(self.client)
 
     def reset(self, state: FloatArray) -> None:
-        """A new episode: the camera jumps to column 0 of ``state``, (STATE_SIZE, n)."""
+        """A new episode: the camera jumps to where ``state``, (STATE_SIZE,), says."""
         self.rotor_angles = np.zeros(4)
-        self.chase.reset(state[:, 0])
-        self._place(state[:, 0], np.zeros(12))
+        self.chase = ChaseCamera(self.scene.scale)
+        self.chase.turn(state, 1.0)
 
     def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
-        """Draw column 0 of ``state``, (STATE_SIZE, n), and of ``wrench``, (12, n).
+        """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,); once for each control step.
 
-        :return: uint8 (height, width, 3); None in human mode.
+        :return: uint8 (height, width, 3). None if there is a window: it is drawn WINDOW_FPS times a second, and this call
+            waits until real time has caught up.
         """
-        self.chase.turn(state[:, 0], 0.04)
-        self.rotor_angles += rotor_turning(self.vehicle, state[:, :1])[:, 0] * self.vehicle.control_step
-        if self.human:
-            self._show(state[:, 0], wrench[:, 0])
-            return None
-        self._place(state[:, 0], wrench[:, 0])
-        return self.scene.picture(self.chase.camera(state[:, 0]), self.width, self.height)
-
-    def _place(self, state: FloatArray, wrench: FloatArray) -> None:
-        self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])
-
-    def _show(self, state: FloatArray, wrench: FloatArray) -> None:
-        """Wait until real time has caught up, and show what is to be seen WINDOW_FPS times a second."""
+        self.chase.turn(state, 0.04)
+        self.rotor_angles += rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * self.vehicle.control_step
+        if not self.human:
+            self._place(state, wrench)
+            return self.scene.picture(self.chase.camera(state), self.width, self.height)
         self.frames_due += WINDOW_FPS * self.vehicle.control_step
         if self.frames_due >= 1.0:
             self.frames_due %= 1.0
@@ -77,3 +70,7 @@ class Renderer:
             time.sleep(ahead)
         else:
             self.shown_at -= ahead  # too slow for real time: do not hurry afterwards
+        return None
+
+    def _place(self, state: FloatArray, wrench: FloatArray) -> None:
+        self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])

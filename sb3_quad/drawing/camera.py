@@ -103,16 +103,10 @@ class ChaseCamera:
     """
 
     def __init__(self, scale: float) -> None:
-        self.scale = scale
-        self.course, self.elevation = 0.0, ELEVATION_AT_TARGET
-
-    def reset(self, state: FloatArray) -> None:
-        """A new flight: jump to where ``state``, (STATE_SIZE,), says."""
-        self.course, self.elevation = 0.0, ELEVATION_AT_TARGET
-        self.turn(state, 1.0)
+        self.scale, self.course, self.elevation = scale, 0.0, ELEVATION_AT_TARGET
 
     def turn(self, state: FloatArray, share: float) -> None:
-        """Turn towards the target by ``share`` of the angle; at the target, keep the course and level out."""
+        """Turn towards the target of ``state``, (STATE_SIZE,), by a share of the angle; at it, keep the course and level out."""
         x, y, z = state[TARGET] - state[POSITION]
         across = math.hypot(x, y)
         far = math.hypot(across, z) > self.scale

@@ -63,3 +63,9 @@ def point_window(client: int, camera: Camera, towards: FloatArray) -> None:
         physicsClientId=client,
     )
     p.configureDebugVisualizer(p.COV_ENABLE_SINGLE_STEP_RENDERING, 1, physicsClientId=client)
+
+
+def disconnect(client: int) -> None:
+    """Close a window or another client, unless that has been done, as by shutting the window."""
+    if p.isConnected(client):
+        p.disconnect(client)

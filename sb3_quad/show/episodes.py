@@ -1,13 +1,10 @@
-"""What is flown to be shown: episodes that are the same for all controllers."""
+"""What is flown to be shown: episodes that are the same for all controllers, and the agents of run folders."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
-
-import numpy as np
-import numpy.typing as npt
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
@@ -16,73 +13,83 @@ from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.scenarios.sample import Generators, sample_episodes, sample_wrenches
-from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.recording import Recording, record
 from sb3_quad.simulation.checks import vector
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.training.runs import find_run
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """What all controllers fly: some settings with a fixed target and wrench, or a scenario."""
+class Agent(NamedTuple):
+    """A trained agent."""
 
-    settings: FlightSettings
-    plan: Plan = field(default_factory=Plan)
-    scenario: Scenario | None = None
-
-    @staticmethod
-    def fixed(settings: FlightSettings, target: Sequence[float] | None = None, wrench: Wrench | None = None) -> Setting:
-        """Episodes of some settings.
-
-        :param target: r_T, (3,), m; None: the episode's own.
-        :raises ConfigError: an unknown vehicle, a target that is none.
-        """
-        vehicle = load_vehicle(settings.vehicle)
-        start = {} if target is None else {"target": _target(target, vehicle)[None]}
-        wrenches = [] if wrench is None else [wrench]
-        return Setting(settings, Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0]))))
-
-    @staticmethod
-    def of_scenario(text: str) -> Setting:
-        """A scenario by ``suite:name``.
-
-        :raises ConfigError: an unknown suite or name.
-        """
-        suite, colon, name = text.rpartition(":")
-        if not colon:
-            raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
-        scenario = load_suite(suite).scenario(name)
-        n_steps = round(scenario.duration / scenario.flown_vehicle().control_step)
-        settings = FlightSettings(vehicle=scenario.vehicle, max_episode_steps=n_steps)
-        return Setting(settings, scenario=scenario)
-
-    def fly(self, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:
-        """One episode.
-
-        :param n_steps: control steps, at most.
-        :raises ConfigError: settings that the environment refuses.
-        :raises ControllerError: a controller that fails in flight.
-        """
-        settings, plan = self.settings, self.plan
-        if self.scenario is not None:
-            settings, plan = flown_as(sample_episodes(self.scenario, [seed]))
-        return record(name, controller, settings.with_changes(max_episode_steps=n_steps), seed, plan, deterministic)
+    label: str  # heads its picture
+    path: Path  # of its zip
+    settings: FlightSettings  # that it was judged with
 
 
-def make_wrench(
-    force: Sequence[float] | None, torque: Sequence[float] | None, start: float, duration: float | None
-) -> Wrench | None:
-    """A push; None if neither force nor torque is given.
+def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None) -> Agent:
+    """The agent of a run, by rl-zoo's names.
 
-    :param force: world frame, N; ``torque``: body frame, N m.
-    :param start: s; ``duration``: s, None: to the end.
-    :raises ConfigError: a value that is none.
+    :param exp_id: number of the run; 0: the latest.
+    :param which: ``best``, ``last checkpoint``, or the timesteps of a checkpoint; None: trimmed, else best, else last.
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
     """
-    if force is None and torque is None:
-        return None
-    given = {"start": start, "duration": duration, "force": force or (0.0, 0.0, 0.0), "torque": torque or (0.0, 0.0, 0.0)}
-    return validate(Wrench, given, "the push")
+    run = find_run(log_folder, algo, env_id, exp_id)
+    if isinstance(which, int):
+        path = run.checkpoint(which)
+    elif which == "last checkpoint":
+        path = run.latest_checkpoint()
+    else:
+        path = run.best_model if which == "best" else run.result
+    if not path.is_file():
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
+    settings, _ = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
+    return Agent(f"{algo} {run.path.name}", path, run.flight_settings())
+
+
+class Setting(NamedTuple):
+    """What all controllers fly."""
+
+    settings: FlightSettings  # of all episodes
+    plan: Callable[[int], Plan]  # what happens in the episode of a seed
+
+
+def fixed_setting(
+    settings: FlightSettings, target: Sequence[float] | None = None, push: Mapping[str, Any] | None = None
+) -> Setting:
+    """Episodes of some settings, all with the same target and the same push.
+
+    :param target: r_T, (3,), m; None: the episode's own.
+    :param push: fields of a :class:`~sb3_quad.scenarios.parts.Wrench`; none: there is no push.
+    :raises ConfigError: an unknown vehicle, a target below ground, a push that is none.
+    """
+    vehicle = load_vehicle(settings.vehicle)
+    start = {}
+    if target is not None:
+        start["target"] = vector("--target", target, 3)[None]
+        if target[2] <= vehicle.collision_radius:
+            raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
+    wrenches = [validate(Wrench, push, "the push")] if push else []
+    plan = Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0])))
+    return Setting(settings, lambda seed: plan)
+
+
+def scenario_setting(text: str) -> Setting:
+    """Episodes of a scenario, named by ``suite:name``.
+
+    :raises ConfigError: an unknown suite or name.
+    """
+    suite, colon, name = text.rpartition(":")
+    if not colon:
+        raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
+    scenario = load_suite(suite).scenario(name)
+    settings, _ = flown_as(sample_episodes(scenario, [scenario.seed]))
+    return Setting(settings, lambda seed: flown_as(sample_episodes(scenario, [seed]))[1])
 
 
 def fly_all(
@@ -98,32 +105,25 @@ def fly_all(
     :param seed: of the first episode; the next has the next one.
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
     :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
-    :raises ConfigError: a number of steps or of episodes below one, keywords that the environment refuses.
+    :raises ConfigError: a number of steps or of episodes below one, settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
     left = setting.settings.max_episode_steps if n_timesteps is None else n_timesteps
-    if left < 1:
-        raise ConfigError(f"--n-timesteps {left}: must be at least 1")
-    if n_envs < 1:
-        raise ConfigError(f"--n-envs {n_envs}: must be at least 1")
-    number = 0
-    while left > 0 and (number == 0 or n_timesteps is not None):
-        steps = min(left, setting.settings.max_episode_steps)
+    for flag, number in (("--n-timesteps", left), ("--n-envs", n_envs)):
+        if number < 1:
+            raise ConfigError(f"{flag} {number}: must be at least 1")
+    while left > 0:
+        settings = setting.settings.with_changes(max_episode_steps=min(left, setting.settings.max_episode_steps))
         episode = []
         for name, controller in controllers.items():
-            for each in range(seed + number, seed + number + n_envs):
+            for each in range(seed, seed + n_envs):
                 label = name if n_envs == 1 else f"seed {each}, {name}"
                 try:
-                    episode.append(setting.fly(label, controller, each, steps, deterministic))
+                    episode.append(record(label, controller, settings, each, setting.plan(each), deterministic))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
         yield episode
+        if n_timesteps is None:
+            return
         left -= max(len(recording.times) - 1 for recording in episode)
-        number += n_envs
-
-
-def _target(target: Sequence[float], vehicle: Vehicle) -> npt.NDArray[np.float64]:
-    position = vector("--target", target, 3)
-    if position[2] <= vehicle.collision_radius:
-        raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
-    return np.asarray(position)
+        seed += n_envs

@@ -1,19 +1,24 @@
-"""Recorded flights as the frames of a film: a panel for each, its camera following vehicle and target."""
+"""Recorded flights as a film: a panel for each, its camera following vehicle and target; and the file it is written to."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import tempfile
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import FloatArray, Image
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.extras import require
+from sb3_quad.base.files import write_bytes
 from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
-from sb3_quad.drawing.labels import side_by_side, with_header
-from sb3_quad.drawing.palette import colours_of, rgb
+from sb3_quad.drawing.labels import colours_of, side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
 from sb3_quad.show.recording import Recording
-from sb3_quad.simulation.state import TARGET
 
 FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s
@@ -21,6 +26,40 @@ MARGIN = 0.9  # around vehicle and target, m, for a vehicle of the default one's
 PANELS_ABREAST = 3
 SMALL = 0.2  # a vehicle whose breadth is less of the picture's height is shown from near as well
 CLOSE_UP, GAP = 0.34, 8  # side of that picture, of the panel's; its distance from the edges, pixels
+MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+FORMATS = (".mp4", ".gif")
+
+
+def check_film(path: Path) -> Any:
+    """See whether a film can be written, before anything is flown; the package that writes it.
+
+    :raises ConfigError: the suffix is not one of FORMATS, or the packages that write videos are missing.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError(f"{path}: must end in {' or '.join(FORMATS)}")
+    require("imageio_ffmpeg", "video", "a video")
+    return require("imageio.v2", "video", "a video")
+
+
+def write_film(path: Path, frames: Iterable[Image]) -> None:
+    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves what was there before.
+
+    :raises ConfigError: a folder that cannot be written, a full disk, missing packages.
+    """
+    imageio = check_film(path)
+    suffix = path.suffix.lower()
+    options = {"fps": FPS, **MP4} if suffix == ".mp4" else {"duration": 1000 / FPS, "loop": 0}
+    # Not beside the file: when it is interrupted, the encoder may still be writing for a moment.
+    with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
+        draft = Path(folder, f"film{suffix}")
+        try:
+            with imageio.get_writer(draft, **options) as writer:
+                for frame in frames:
+                    writer.append_data(frame)
+            content = draft.read_bytes()
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be encoded ({error.strerror or error})") from error
+    write_bytes(path, content)
 
 
 def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
@@ -69,19 +108,17 @@ class _Panel:
         step, camera = self.steps[number], self.cameras[number]
         key = step, camera.eye.round(3).tolist()
         if self.shown is None or self.shown[0] != key:
-            lines = [self._caption(step)]
-            font_size = max(12, round(self.height / 26))
+            lines, font_size = [self._caption(step)], max(12, round(self.height / 26))
             self.shown = key, with_header(self._draw(step, camera), self.recording.name, lines, self.colour, font_size)
         return self.shown[1]
 
     def _draw(self, step: int, camera: Camera) -> Image:
-        recording, scene, side = self.recording, self.scene, self.side
-        scene.place([recording.pose(step)], recording.state[None, TARGET, step])
-        trail = Overlay(recording.path[: step + 1 : 2], rgb(self.colour), 0.75, width=0.03 * scene.scale)
+        scene, side, position = self.scene, self.side, self.recording.state.position
+        scene.place([self.recording.pose(step)], self.recording.state.target[[step]])
+        trail = Overlay(position[: step + 1 : 2], to_rgb(self.colour), 0.75, width=0.03 * scene.scale)
         pixels = scene.picture(camera, self.width, self.height, [trail])
-        position = recording.path[step]
-        if scene.span < SMALL * float((position - camera.eye) @ camera.axes[0]) * camera.slope:
-            near = framing_camera(position[None], 1.15 * scene.span, 1.0, self.forward)
+        if scene.span < SMALL * float((position[step] - camera.eye) @ camera.axes[0]) * camera.slope:
+            near = framing_camera(position[[step]], 1.15 * scene.span, 1.0, self.forward)
             left, top = self.corner
             pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
             pixels[top : top + side, left : left + side] = scene.picture(near, side, side, [trail])
@@ -97,9 +134,12 @@ class _Panel:
 
     def _caption(self, step: int) -> str:
         recording = self.recording
-        if step == len(recording.times) - 1 and recording.lost:
-            return f"{recording.times[-1]:5.2f} s   {recording.lost}"
+        seconds, lost = f"{recording.times[step]:5.2f} s", recording.lost
+        if step == len(recording.times) - 1 and lost:
+            return f"{seconds}   {lost}"
         force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
         push = f"   force {force:.1f} N" if force else ""
-        height = recording.path[step, 2]
-        return f"{recording.times[step]:5.2f} s   {recording.error[step]:.2f} m from target   {height:.1f} m high{push}"
+        return (
+            f"{seconds}   {recording.state.distance[step]:.2f} m from target"
+            f"   {recording.state.position[step, 2]:.1f} m high{push}"
+        )

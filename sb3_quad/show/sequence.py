@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import BoolArray, FloatArray, Image
 from sb3_quad.drawing.camera import Camera, broadside, framing_camera
-from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_tags
+from sb3_quad.drawing.labels import colours_of, side_by_side, tag_size, with_header, with_tags
 from sb3_quad.drawing.models import span
-from sb3_quad.drawing.palette import colours_of, rgb
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
 from sb3_quad.show.recording import Recording
@@ -60,12 +60,12 @@ def sequence(
 
 def _end(recording: Recording) -> int:
     """The step after which the vehicle stays at its target, or the last one."""
-    away = np.flatnonzero(recording.error > SETTLED)
+    away = np.flatnonzero(recording.state.distance > SETTLED)
     return min(int(away[-1]) + 1 if away.size else 0, len(recording.times) - 1)
 
 
 def _view(recordings: Sequence[Recording], ends: Sequence[int], size: tuple[int, int] | None) -> _View:
-    paths = [recording.path[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
+    paths = [recording.state.position[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
     points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
     forward = broadside(points)
     width, height = size or _proportions(points, forward)
@@ -89,7 +89,7 @@ def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
 
 def _apart(recording: Recording, end: int, view: _View) -> list[int]:
     """Steps whose poses do not hide one another: each is the first that is clear of those before it."""
-    places, breadth = view.project(recording.path[: end + 1])
+    places, breadth = view.project(recording.state.position[: end + 1])
 
     def clear_of(steps: Sequence[int], step: int) -> BoolArray:
         return np.asarray(np.linalg.norm(places[steps] - places[step], axis=1) > APART * breadth[step])
@@ -107,7 +107,7 @@ def _apart(recording: Recording, end: int, view: _View) -> list[int]:
 def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View, colour: str) -> Image:
     scene = Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)
     scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
-    trail = Overlay(recording.path[: end + 1], rgb(colour), 0.85, width=0.05 * view.breadth)
+    trail = Overlay(recording.state.position[: end + 1], to_rgb(colour), 0.85, width=0.05 * view.breadth)
     pixels = scene.picture(view.camera, view.width, view.height, [trail])
     scene.close()
     size = max(12, round(view.height / 34))
@@ -121,7 +121,7 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View, co
 
 def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
     """The time of each pose and where it is written: at the first place beside it that is inside the picture and free."""
-    places, breadth = view.project(recording.path[list(steps)])
+    places, breadth = view.project(recording.state.position[list(steps)])
     centres, halves = list(places), [np.full(2, 0.35 * each) for each in breadth]  # of what must not be hidden
     # Left of a steep path, above a level one, else around the pose from there.
     turns = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
@@ -147,4 +147,4 @@ def _outcome(recording: Recording, end: int) -> str:
         return f"{recording.lost} after {recording.times[-1]:.2f} s"
     if end < len(recording.times) - 1:
         return f"within {SETTLED:g} m of its target from {recording.times[end]:.2f} s on"
-    return f"{recording.error[end]:.2f} m from its target after {recording.times[end]:.2f} s"
+    return f"{recording.state.distance[end]:.2f} m from its target after {recording.times[end]:.2f} s"
