@@ -48,13 +48,12 @@ class BulletBody:
         """Whether the simulation is still there: neither closed nor its window shut."""
         return self._close.alive and bool(p.isConnected(self.client))
 
-    def place(self, state: FloatArray) -> None:
-        """Put the body where column 0 of ``state``, (STATE_SIZE, n), says."""
-        first = QuadcopterState(state[:, :1])
-        w, x, y, z = first.quaternion[0].tolist()
-        rates = first.rotation[0] @ first.body_rates[0]
-        p.resetBasePositionAndOrientation(self.body, first.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
-        p.resetBaseVelocity(self.body, first.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
+    def place(self, state: QuadcopterState) -> None:
+        """Put the body where the first vehicle of ``state`` is."""
+        w, x, y, z = state.quaternion[0].tolist()
+        rates = state.rotation[0] @ state.body_rates[0]
+        p.resetBasePositionAndOrientation(self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
+        p.resetBaseVelocity(self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
 
     def fly(self, wrenches: FloatArray, world: FloatArray | None = None) -> None:
         """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame.

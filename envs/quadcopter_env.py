@@ -196,7 +196,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
-        self._body.place(batch.state)
+        self._body.place(self.true_state())
         self._ready = True
         if self._renderer is not None:
             self._renderer.reset(batch.state[:, 0])

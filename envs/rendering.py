@@ -11,7 +11,7 @@ from sb3_quad.base.bullet import p
 from sb3_quad.drawing.camera import ChaseCamera
 from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose, Scene
-from sb3_quad.drawing.window import furnish_window, point_window, start_drawing
+from sb3_quad.drawing.window import point_window, start_drawing
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, TARGET
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -33,8 +33,6 @@ class Renderer:
         self.rotor_angles = np.zeros(4)
         self.shown_at = time.perf_counter()
         self.frames_due = 1.0
-        if self.human:
-            furnish_window(self.client)
         # PyBullet would draw the collision sphere.
         p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
         self.scene = Scene(vehicle, self.client)

@@ -74,24 +74,20 @@ class QuadcopterVecEnv(InFlight, VecEnv):
         rows = np.flatnonzero(dones)
         self._ended = rows.tolist()
         if self._ended:
-            self._fill_infos(rows)
+            elapsed = round(time.time() - self._start, 6)
+            outcomes = self.batch.outcome[rows].tolist()  # of a copy, so that the last observations are fresh
+            for row, outcome in zip(self._ended, outcomes, strict=True):
+                total, _, length, distance, collision, out_of_range, truncated, observation = outcome
+                self._infos[row] = {
+                    "terminal_observation": observation,
+                    "TimeLimit.truncated": truncated,
+                    "episode": {"r": round(total, 6), "l": length, "t": elapsed},
+                    "is_success": truncated,
+                    "distance": distance,
+                    "collision": collision,
+                    "out_of_range": out_of_range,
+                }
         return observations, rewards, dones, self._infos
-
-    def _fill_infos(self, rows: npt.NDArray[np.int64]) -> None:
-        elapsed = round(time.time() - self._start, 6)
-        outcomes = self.batch.outcome[rows].tolist()  # of a copy, so that the last observations are fresh
-        for row, (total, _, length, distance, collision, out_of_range, truncated, observation) in zip(
-            self._ended, outcomes, strict=True
-        ):
-            self._infos[row] = {
-                "terminal_observation": observation,
-                "TimeLimit.truncated": truncated,
-                "episode": {"r": round(total, 6), "l": length, "t": elapsed},
-                "is_success": truncated,
-                "distance": distance,
-                "collision": collision,
-                "out_of_range": out_of_range,
-            }
 
     def close(self) -> None:
         """Nothing to close; calling it twice is fine."""

@@ -27,7 +27,6 @@ from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show import sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, HOLD, film_frames, frame_times, write_film
-from sb3_quad.show.recording import record
 from sb3_quad.simulation.state import POSITION, TARGET
 from sb3_quad.training.runs import claim_run
 
@@ -37,7 +36,7 @@ VIDEO = importlib.util.find_spec("imageio_ffmpeg") is not None
 
 def flown(setting, n_timesteps=None):
     """The first episode of a setting, flown by the PID expert."""
-    ((recording,),) = fly_all({"pid": PIDExpert()}, setting, 0, n_timesteps, True)
+    ((recording,),) = fly_all({"pid": PIDExpert()}, setting, 0, n_timesteps)
     return recording
 
 
@@ -56,7 +55,8 @@ def hit():
 
 def test_a_recording_is_the_flight_of_the_environment():
     expert = PIDExpert()
-    recording = record("pid", expert, FlightSettings(task="state_recovery", max_episode_steps=40), seed=3)
+    setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=40))
+    ((recording,),) = fly_all({"pid": expert}, setting, 3, None)
     env = QuadcopterEnv(task="state_recovery")
     env.reset(seed=3)
     total = 0.0
@@ -85,7 +85,7 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
 
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
     setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=20))
-    episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50, True))
+    episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50))
     assert [len(a.times) - 1 for a, _ in episodes] == [20, 20, 10]
     for first, second in episodes:
         np.testing.assert_array_equal(first.state.array[:, 0], second.state.array[:, 0])
@@ -96,7 +96,7 @@ def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
 def test_a_controller_that_fails_is_named():
     setting = fixed_setting(FlightSettings(task="state_recovery"))
     with pytest.raises(ControllerError, match=r"controller odd: .*shape"):
-        list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5, True))
+        list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5))
 
 
 def test_a_course_has_all_its_targets():
@@ -354,8 +354,8 @@ def test_record_video_films_the_agent_of_a_run(run_folder, tmp_path, capsys):
 
 def test_episodes_side_by_side_have_one_seed_after_the_other():
     setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=5))
-    abreast = list(fly_all({"pid": PIDExpert()}, setting, 5, 10, True, n_envs=2))
-    alone = list(fly_all({"pid": PIDExpert()}, setting, 5, 20, True))
+    abreast = list(fly_all({"pid": PIDExpert()}, setting, 5, 10, n_envs=2))
+    alone = list(fly_all({"pid": PIDExpert()}, setting, 5, 20))
     assert [len(episode) for episode in abreast] == [2, 2]
     for ours, theirs in zip([each for episode in abreast for each in episode], alone, strict=True):
         np.testing.assert_array_equal(ours.state.array, theirs[0].state.array)

@@ -106,7 +106,7 @@ class ChaseCamera:
         self.scale, self.course, self.elevation = scale, 0.0, ELEVATION_AT_TARGET
 
     def turn(self, state: FloatArray, share: float) -> None:
-        """Turn towards the target of ``state``, (STATE_SIZE,), by a share of the angle; at it, keep the course and level out."""
+        """Turn towards the target of ``state``, (STATE_SIZE,), by a share of the angle; at it, keep course and level out."""
         x, y, z = state[TARGET] - state[POSITION]
         across = math.hypot(x, y)
         far = math.hypot(across, z) > self.scale

@@ -1,11 +1,10 @@
-"""Pictures of a PyBullet client: its software renderer before sky and ground, trails and turning rotors laid over it.
+"""What PyBullet does not draw: sky and ground behind its bodies, trails and turning rotors laid over them.
 
 Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its top.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -13,8 +12,7 @@ import numpy as np
 from PIL import Image as Pillow
 from PIL import ImageDraw
 
-from sb3_quad.base.arrays import Float32Array, FloatArray, Image
-from sb3_quad.base.bullet import p
+from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.drawing.camera import Camera
 
 NEAR, FAR = 0.05, 120.0
@@ -38,41 +36,11 @@ class Overlay(NamedTuple):
     width: float | None = None  # m
 
 
-def take_picture(
-    client: int, camera: Camera, width: int, height: int, shadows: FloatArray, overlays: Sequence[Overlay]
-) -> Image:
-    """Draw everything in a client: uint8 (height, width, 3).
+def backdrop(camera: Camera, width: int, height: int, shadows: FloatArray) -> Float32Array:
+    """Sky, and chequered ground with shadows and haze, (height, width, 3).
 
     :param shadows: centre x, y and radius of each shadow on the ground, (k, 3).
-    :param overlays: are drawn in this order, each hidden by the bodies before it.
     """
-    wide, high = SUPERSAMPLING * width, SUPERSAMPLING * height
-    forward, _, up = camera.axes
-    _, _, pixels, buffer, names = p.getCameraImage(
-        wide,
-        high,
-        p.computeViewMatrix(camera.eye.tolist(), (camera.eye + forward).tolist(), up.tolist()),
-        p.computeProjectionMatrixFOV(2.0 * math.degrees(math.atan(camera.slope)), wide / high, NEAR, FAR),
-        lightDirection=(np.array([1.2, 0.6, 6.0]) - 3.0 * forward).tolist(),
-        shadow=0,
-        lightAmbientCoeff=0.62,
-        lightDiffuseCoeff=0.45,
-        lightSpecularCoeff=0.08,
-        renderer=p.ER_TINY_RENDERER,
-        physicsClientId=client,
-    )
-    # Without numpy at PyBullet's build time these are flat tuples.
-    drawn = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
-    drawn[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
-    depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
-    both = Pillow.alpha_composite(Pillow.fromarray(drawn), draw_overlays(overlays, camera, depth))
-    small = np.asarray(both.reduce(SUPERSAMPLING), dtype=np.float32)
-    behind = 255.0 * backdrop(camera, width, height, shadows)
-    return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
-
-
-def backdrop(camera: Camera, width: int, height: int, shadows: FloatArray) -> Float32Array:
-    """Sky, and chequered ground with shadows and haze, (height, width, 3); the arguments as of :func:`take_picture`."""
     axes = camera.axes.astype(np.float32)
     x = np.float32(camera.slope / height) * (2.0 * np.arange(width, dtype=np.float32) + 1.0 - width)
     y = np.float32(camera.slope / height) * (height - 1.0 - 2.0 * np.arange(height, dtype=np.float32))

@@ -1,4 +1,4 @@
-"""Scenes: vehicles in poses, their targets and arrows, in a PyBullet client of their own or in another's."""
+"""Scenes, and pictures of them: vehicles in poses, their targets and arrows, in a PyBullet client."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from PIL import Image as Pillow
 
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.drawing import models
 from sb3_quad.drawing.camera import Camera
 from sb3_quad.drawing.models import FRONT, NOWHERE, WHITE, Colour, add_body, add_mesh, move_body
-from sb3_quad.drawing.picture import Overlay, take_picture
+from sb3_quad.drawing.picture import FAR, NEAR, SUPERSAMPLING, Overlay, backdrop, draw_overlays
 from sb3_quad.simulation.state import POSITION, QUATERNION, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -71,8 +72,30 @@ class Scene:
 
     def picture(self, camera: Camera, width: int, height: int, trails: Sequence[Overlay] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""
+        wide, high = SUPERSAMPLING * width, SUPERSAMPLING * height
+        forward, _, up = camera.axes
+        _, _, pixels, buffer, names = p.getCameraImage(
+            wide,
+            high,
+            p.computeViewMatrix(camera.eye.tolist(), (camera.eye + forward).tolist(), up.tolist()),
+            p.computeProjectionMatrixFOV(2.0 * math.degrees(math.atan(camera.slope)), wide / high, NEAR, FAR),
+            lightDirection=(np.array([1.2, 0.6, 6.0]) - 3.0 * forward).tolist(),
+            shadow=0,
+            lightAmbientCoeff=0.62,
+            lightDiffuseCoeff=0.45,
+            lightSpecularCoeff=0.08,
+            renderer=p.ER_TINY_RENDERER,
+            physicsClientId=self.client,
+        )
+        # Without numpy at PyBullet's build time these are flat tuples.
+        bodies = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
+        bodies[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
+        depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
         discs = sorted(self._discs, key=lambda disc: -float(np.linalg.norm(disc.points.mean(axis=0) - camera.eye)))
-        return take_picture(self.client, camera, width, height, self._shadows, [*discs, *trails])
+        both = Pillow.alpha_composite(Pillow.fromarray(bodies), draw_overlays([*discs, *trails], camera, depth))
+        small = np.asarray(both.reduce(SUPERSAMPLING), dtype=np.float32)
+        behind = 255.0 * backdrop(camera, width, height, self._shadows)
+        return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
 
     def close(self) -> None:
         """Give a client of its own back; calling it twice is fine."""

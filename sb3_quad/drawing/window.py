@@ -21,8 +21,9 @@ def has_display() -> bool:
 
 
 def open_window(width: int, height: int) -> int:
-    """Open PyBullet's window, of ``width`` and ``height`` pixels; its client.
+    """Open PyBullet's window, with a ground and without controls; it draws nothing until :func:`start_drawing`.
 
+    :return: its client.
     :raises ConfigError: there is one already in this process, or it cannot be opened.
     """
     sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
@@ -32,11 +33,6 @@ def open_window(width: int, height: int) -> int:
         raise ConfigError("render_mode 'human': PyBullet opens one window per process, and one is open already") from None
     if client < 0:
         raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
-    return client
-
-
-def furnish_window(client: int) -> None:
-    """Give a window a ground, and hide its controls; it does not draw until :func:`start_drawing`."""
     hidden = (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS)
     for option in hidden:
         p.configureDebugVisualizer(option, 0, physicsClientId=client)
@@ -44,10 +40,11 @@ def furnish_window(client: int) -> None:
     ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)
     p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=client)
     p.changeVisualShape(ground, -1, specularColor=(0.1, 0.1, 0.1), physicsClientId=client)
+    return client
 
 
 def start_drawing(client: int) -> None:
-    """Let a furnished window show what is in it."""
+    """Let a window show what is in it."""
     p.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1, physicsClientId=client)
 
 

@@ -1,4 +1,4 @@
-"""What is flown to be shown: episodes that are the same for all controllers, and the agents of run folders."""
+"""What is flown to be shown, by whom, and how it is recorded: the same episodes for all controllers, on PyBullet."""
 
 from __future__ import annotations
 
@@ -6,30 +6,30 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
+from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
-from sb3_quad.evaluation.flights import Plan
+from sb3_quad.drawing.labels import COLOURS
+from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
 from sb3_quad.evaluation.scenario_flights import flown_as
+from sb3_quad.experts.controller import observation_function
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.scenarios.sample import Generators, sample_episodes, sample_wrenches
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.recording import Recording, record
+from sb3_quad.show.recording import Recording
 from sb3_quad.simulation.checks import vector
+from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.training.runs import find_run
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
-class Agent(NamedTuple):
-    """A trained agent."""
-
-    label: str  # heads its picture
-    path: Path  # of its zip
-    settings: FlightSettings  # that it was judged with
-
-
-def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None) -> Agent:
-    """The agent of a run, by rl-zoo's names.
+def find_agent(
+    log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None
+) -> tuple[str, Path, FlightSettings]:
+    """The agent of a run, by rl-zoo's names: a label, its zip, and the settings that it was judged with.
 
     :param exp_id: number of the run; 0: the latest.
     :param which: ``best``, ``last checkpoint``, or the timesteps of a checkpoint; None: trimmed, else best, else last.
@@ -49,14 +49,14 @@ def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: 
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
         if settings.get(key):
             raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    return Agent(f"{algo} {run.path.name}", path, run.flight_settings())
+    return f"{algo} {run.path.name}", path, run.flight_settings()
 
 
 class Setting(NamedTuple):
     """What all controllers fly."""
 
-    settings: FlightSettings  # of all episodes
-    plan: Callable[[int], Plan]  # what happens in the episode of a seed
+    vehicle: Any  # that experts are made for; in a scenario another one may fly
+    episode: Callable[[int], tuple[FlightSettings, Plan]]  # by seed: how it is flown, and what happens in it
 
 
 def fixed_setting(
@@ -76,7 +76,7 @@ def fixed_setting(
             raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
     wrenches = [validate(Wrench, push, "the push")] if push else []
     plan = Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0])))
-    return Setting(settings, lambda seed: plan)
+    return Setting(settings.vehicle, lambda seed: (settings, plan))
 
 
 def scenario_setting(text: str) -> Setting:
@@ -88,8 +88,7 @@ def scenario_setting(text: str) -> Setting:
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).scenario(name)
-    settings, _ = flown_as(sample_episodes(scenario, [scenario.seed]))
-    return Setting(settings, lambda seed: flown_as(sample_episodes(scenario, [seed]))[1])
+    return Setting(scenario.vehicle, lambda seed: flown_as(sample_episodes(scenario, [seed])))
 
 
 def fly_all(
@@ -97,33 +96,67 @@ def fly_all(
     setting: Setting,
     seed: int,
     n_timesteps: int | None,
-    deterministic: bool,
+    deterministic: bool = True,
     n_envs: int = 1,
 ) -> Iterator[list[Recording]]:
     """Episodes one after the other, each flown by all controllers.
 
+    :param controllers: by label; each as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param seed: of the first episode; the next has the next one.
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
     :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
     :raises ConfigError: a number of steps or of episodes below one, settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
-    left = setting.settings.max_episode_steps if n_timesteps is None else n_timesteps
+    longest = setting.episode(seed)[0].max_episode_steps
+    left = longest if n_timesteps is None else n_timesteps
     for flag, number in (("--n-timesteps", left), ("--n-envs", n_envs)):
         if number < 1:
             raise ConfigError(f"{flag} {number}: must be at least 1")
     while left > 0:
-        settings = setting.settings.with_changes(max_episode_steps=min(left, setting.settings.max_episode_steps))
-        episode = []
+        together: list[Recording] = []
         for name, controller in controllers.items():
+            sampling = hasattr(controller, "predict") and not deterministic
+            flown = observation_function(controller, deterministic=False) if sampling else controller
             for each in range(seed, seed + n_envs):
-                label = name if n_envs == 1 else f"seed {each}, {name}"
+                label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
+                settings, plan = setting.episode(each)
                 try:
-                    episode.append(record(label, controller, settings, each, setting.plan(each), deterministic))
+                    settings = settings.with_changes(max_episode_steps=min(left, longest))
+                    together.append(_record(label, colour, flown, settings, plan, each))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-        yield episode
+        yield together
         if n_timesteps is None:
             return
-        left -= max(len(recording.times) - 1 for recording in episode)
+        left -= max(len(recording.times) - 1 for recording in together)
         seed += n_envs
+
+
+def _record(name: str, colour: str, controller: Any, settings: FlightSettings, plan: Plan, seed: int) -> Recording:
+    every = _EveryStep()
+    flights = fly_settings(controller, settings, [seed], "pybullet", (), [every], plan)
+    wrench = np.zeros((len(every.states), WRENCH_SIZE))
+    for first, values in sorted(plan.wrenches.items()):
+        wrench[first + 1 :] = values
+    return Recording(
+        name=name,
+        colour=colour,
+        vehicle=every.vehicle,
+        times=np.arange(len(every.states), dtype=np.float64) * every.vehicle.control_step,
+        state=QuadcopterState.concatenate(every.states),
+        wrench=wrench,
+        reward=float(flights.reward[0]),
+        lost="" if flights.success[0] else "collision" if flights.collision[0] else "out of range",
+    )
+
+
+class _EveryStep(Hook):
+    """Keeps the state after every control step of a flight, and before the first."""
+
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self.vehicle, self.states = vehicle, [state.copy()]
+
+    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+        self.states.append(state.copy())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.extras import require
 from sb3_quad.base.files import write_bytes
 from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
-from sb3_quad.drawing.labels import colours_of, side_by_side, with_header
+from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
 from sb3_quad.show.recording import Recording
@@ -77,69 +78,60 @@ def film_frames(recordings: Sequence[Recording], width: int, height: int, speed:
     """
     times = frame_times(recordings, speed)
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    colours = colours_of([recording.name for recording in recordings])
-    panels = [_Panel(each, times, forward, colours[each.name], width, height) for each in recordings]
-    try:
-        for number in range(len(times)):
-            yield side_by_side([panel.picture(number) for panel in panels], PANELS_ABREAST)
-    finally:
-        for panel in panels:
-            panel.scene.close()
+    panels = [_panel(recording, times, forward, width, height) for recording in recordings]
+    for pictures in zip(*panels, strict=True):
+        yield side_by_side(pictures, PANELS_ABREAST)
 
 
-class _Panel:
-    """One flight of a film, at the given times (s) of its frames, seen along ``forward``, (3,)."""
+def _panel(recording: Recording, times: FloatArray, forward: FloatArray, width: int, height: int) -> Iterator[Image]:
+    """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
+    steps = [recording.at(seconds) for seconds in times]
+    seen = [recording.vehicle_and_target(step) for step in steps]
+    frame_seconds, font_size = max(float(times[1] - times[0]), 1e-3), max(12, round(height / 26))
+    with closing(Scene(recording.vehicle)) as scene:
+        cameras = following_cameras(seen, frame_seconds, MARGIN * scene.scale, width / height, forward)
+        close_up = _free_corner(cameras, seen, width, height)
+        shown = None
+        for step, camera in zip(steps, cameras, strict=True):
+            if shown != (key := (step, camera.eye.round(3).tolist())):
+                shown = key
+                pixels = _draw(recording, step, scene, camera, width, height, close_up)
+                picture = with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
+            yield picture
 
-    def __init__(
-        self, recording: Recording, times: FloatArray, forward: FloatArray, colour: str, width: int, height: int
-    ) -> None:
-        self.recording, self.colour, self.forward = recording, colour, forward
-        self.width, self.height, self.side = width, height, round(CLOSE_UP * min(width, height))
-        self.steps = [recording.at(seconds) for seconds in times]
-        self.scene = Scene(recording.vehicle)
-        seen = [recording.vehicle_and_target(step) for step in self.steps]
-        frame_seconds = max(float(times[1] - times[0]), 1e-3)
-        self.cameras = following_cameras(seen, frame_seconds, MARGIN * self.scene.scale, width / height, forward)
-        self.corner = self._free_corner(seen)
-        self.shown: tuple[object, Image] | None = None
 
-    def picture(self, number: int) -> Image:
-        """Frame ``number`` of this flight."""
-        step, camera = self.steps[number], self.cameras[number]
-        key = step, camera.eye.round(3).tolist()
-        if self.shown is None or self.shown[0] != key:
-            lines, font_size = [self._caption(step)], max(12, round(self.height / 26))
-            self.shown = key, with_header(self._draw(step, camera), self.recording.name, lines, self.colour, font_size)
-        return self.shown[1]
+def _draw(
+    recording: Recording, step: int, scene: Scene, camera: Camera, width: int, height: int, close_up: tuple[int, int, int]
+) -> Image:
+    """A picture of one step, with the vehicle from near in the square ``close_up`` where it is small."""
+    path = recording.state.position
+    scene.place([recording.pose(step)], recording.state.target[[step]])
+    trail = Overlay(path[: step + 1 : 2], to_rgb(recording.colour), 0.75, width=0.03 * scene.scale)
+    pixels = scene.picture(camera, width, height, [trail])
+    if scene.span < SMALL * float((path[step] - camera.eye) @ camera.axes[0]) * camera.slope:
+        near = framing_camera(path[[step]], 1.15 * scene.span, 1.0, camera.axes[0])
+        left, top, side = close_up
+        pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
+        pixels[top : top + side, left : left + side] = scene.picture(near, side, side, [trail])
+    return pixels
 
-    def _draw(self, step: int, camera: Camera) -> Image:
-        scene, side, position = self.scene, self.side, self.recording.state.position
-        scene.place([self.recording.pose(step)], self.recording.state.target[[step]])
-        trail = Overlay(position[: step + 1 : 2], to_rgb(self.colour), 0.75, width=0.03 * scene.scale)
-        pixels = scene.picture(camera, self.width, self.height, [trail])
-        if scene.span < SMALL * float((position[step] - camera.eye) @ camera.axes[0]) * camera.slope:
-            near = framing_camera(position[[step]], 1.15 * scene.span, 1.0, self.forward)
-            left, top = self.corner
-            pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
-            pixels[top : top + side, left : left + side] = scene.picture(near, side, side, [trail])
-        return pixels
 
-    def _free_corner(self, seen: Sequence[FloatArray]) -> tuple[int, int]:
-        """Left and top of the close-up, in the corner in which vehicle and target are seen least."""
-        pairs = zip(self.cameras, seen, strict=True)
-        spots = np.concatenate([camera.project(points, self.width, self.height)[:, :2] for camera, points in pairs])
-        right, bottom, half = self.width - self.side - GAP, self.height - self.side - GAP, self.side / 2
-        corners = [(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)]
-        return min(corners, key=lambda corner: int((np.abs(spots - corner - half) < half + GAP).all(axis=1).sum()))
+def _free_corner(cameras: Sequence[Camera], seen: Sequence[FloatArray], width: int, height: int) -> tuple[int, int, int]:
+    """Left, top and side of a square in the corner in which the points that are ``seen`` are least."""
+    spots = np.concatenate(
+        [camera.project(points, width, height)[:, :2] for camera, points in zip(cameras, seen, strict=True)]
+    )
+    side = round(CLOSE_UP * min(width, height))
+    right, bottom, half = width - side - GAP, height - side - GAP, side / 2
+    corners = [(GAP, bottom, side), (right, bottom, side), (GAP, GAP, side), (right, GAP, side)]
+    return min(corners, key=lambda corner: int((np.abs(spots - corner[:2] - half) < half + GAP).all(axis=1).sum()))
 
-    def _caption(self, step: int) -> str:
-        recording = self.recording
-        seconds, lost = f"{recording.times[step]:5.2f} s", recording.lost
-        if step == len(recording.times) - 1 and lost:
-            return f"{seconds}   {lost}"
-        force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
-        push = f"   force {force:.1f} N" if force else ""
-        return (
-            f"{seconds}   {recording.state.distance[step]:.2f} m from target"
-            f"   {recording.state.position[step, 2]:.1f} m high{push}"
-        )
+
+def _caption(recording: Recording, step: int) -> str:
+    seconds = f"{recording.times[step]:5.2f} s"
+    if step == len(recording.times) - 1 and recording.lost:
+        return f"{seconds}   {recording.lost}"
+    force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
+    push = f"   force {force:.1f} N" if force else ""
+    height = recording.state.position[step, 2]
+    return f"{seconds}   {recording.state.distance[step]:.2f} m from target   {height:.1f} m high{push}"

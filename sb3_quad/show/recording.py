@@ -1,20 +1,16 @@
-"""One flight as it is shown: every control step, flown in the reference environment by any controller."""
+"""One flight as it is shown: every control step of it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose
-from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
-from sb3_quad.experts.controller import observation_function
-from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 
@@ -23,6 +19,7 @@ class Recording:
     """A flight of T control steps."""
 
     name: str
+    colour: str  # of its trail and its heading, #rrggbb
     vehicle: Vehicle
     times: FloatArray  # (T + 1,), s since the start
     state: QuadcopterState  # the true state at each of them
@@ -68,42 +65,3 @@ class Recording:
     def pose(self, step: int, seconds: float = 0.4) -> Pose:
         """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
         return Pose(self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step])
-
-
-def record(
-    name: str, controller: Any, settings: FlightSettings, seed: int, plan: Plan | None = None, deterministic: bool = True
-) -> Recording:
-    """Fly one episode on PyBullet and write it all down.
-
-    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
-    :param plan: what happens whoever flies; of one episode.
-    :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
-    :raises ConfigError: a controller that cannot be asked, settings that the environment refuses.
-    :raises ControllerError: a controller that fails in flight.
-    """
-    plan = plan or Plan()
-    flown = controller if deterministic or not hasattr(controller, "predict") else observation_function(controller, False)
-    every = _EveryStep()
-    flights = fly_settings(flown, settings, [seed], "pybullet", (), [every], plan)
-    wrench = np.zeros((len(every.states), WRENCH_SIZE))
-    for first, values in sorted(plan.wrenches.items()):
-        wrench[first + 1 :] = values
-    return Recording(
-        name=name,
-        vehicle=every.vehicle,
-        times=np.arange(len(every.states), dtype=np.float64) * every.vehicle.control_step,
-        state=QuadcopterState.concatenate(every.states),
-        wrench=wrench,
-        reward=float(flights.reward[0]),
-        lost="" if flights.success[0] else "collision" if flights.collision[0] else "out of range",
-    )
-
-
-class _EveryStep(Hook):
-    """Keeps the state after every control step of a flight, and before the first."""
-
-    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        self.vehicle, self.states = vehicle, [state.copy()]
-
-    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
-        self.states.append(state.copy())

@@ -4,31 +4,34 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.colors import to_rgb
 
 from sb3_quad.base.bullet import p
 from sb3_quad.drawing.camera import broadside, following_cameras
-from sb3_quad.drawing.labels import colours_of
 from sb3_quad.drawing.scene import Scene
-from sb3_quad.drawing.window import disconnect, furnish_window, open_window, point_window, start_drawing
+from sb3_quad.drawing.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.film import FPS, MARGIN, frame_times
 from sb3_quad.show.recording import Recording
 
 WINDOW_FIELD_OF_VIEW = math.radians(60.0)  # PyBullet's, vertical
 
 
-def show_in_window(episodes: Iterable[Sequence[Recording]], width: int, height: int, speed: float) -> None:
+def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float) -> None:
     """Show episodes one after the other, until the window is shut; flights of one start together.
 
     :raises ConfigError: the window cannot be opened.
     """
     client = open_window(width, height)
     try:
+        n = len(episodes[0])
+        scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
+        start_drawing(client)
         for recordings in episodes:
-            _show(client, recordings, width / height, speed)
+            p.removeAllUserDebugItems(physicsClientId=client)
+            _play(scene, recordings, width / height, speed)
     except p.error:
         if p.isConnected(client):  # else the window has been shut
             raise
@@ -36,19 +39,12 @@ def show_in_window(episodes: Iterable[Sequence[Recording]], width: int, height: 
         disconnect(client)
 
 
-def _show(client: int, recordings: Sequence[Recording], aspect: float, speed: float) -> None:
-    p.resetSimulation(physicsClientId=client)
-    p.removeAllUserDebugItems(physicsClientId=client)
-    furnish_window(client)
-    n = len(recordings)
-    scene = Scene(recordings[0].vehicle, client, n_vehicles=n, n_targets=n)
-    start_drawing(client)
-    times = frame_times(recordings, speed)
+def _play(scene: Scene, recordings: Sequence[Recording], aspect: float, speed: float) -> None:
+    times, client = frame_times(recordings, speed), scene.client
     seen = [np.concatenate([each.vehicle_and_target(each.at(seconds)) for each in recordings]) for seconds in times]
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
     cameras = following_cameras(seen, speed / FPS, MARGIN * scene.scale, aspect, forward, WINDOW_FIELD_OF_VIEW)
-    colours = colours_of([recording.name for recording in recordings])
-    drawn_to, labels = [0] * n, [-1] * n
+    drawn_to, labels = [0] * len(recordings), [-1] * len(recordings)
     begun, number = time.perf_counter(), 0
     while number < len(times):
         now = [(recording, recording.at(times[number])) for recording in recordings]
@@ -56,7 +52,7 @@ def _show(client: int, recordings: Sequence[Recording], aspect: float, speed: fl
         scene.place([recording.pose(step) for recording, step in now], targets)
         for k, (recording, step) in enumerate(now):
             if step > drawn_to[k]:
-                ends, colour = recording.state.position[[drawn_to[k], step]], to_rgb(colours[recording.name])
+                ends, colour = recording.state.position[[drawn_to[k], step]], to_rgb(recording.colour)
                 p.addUserDebugLine(*ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client)
                 above = (ends[1] + (0.0, 0.0, 0.6 * scene.scale)).tolist()
                 look = {"textColorRGB": colour, "textSize": 1.2, "replaceItemUniqueId": labels[k]}

@@ -23,7 +23,7 @@ from sb3_quad.evaluation.controllers import build, parse_controllers
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.episodes import Agent, Setting, find_agent, fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.episodes import Setting, find_agent, fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, write_film
 from sb3_quad.show.recording import Recording
 from sb3_quad.show.sequence import sequence
@@ -63,14 +63,15 @@ def known_environment(options: argparse.Namespace) -> str:
     return str(env_id)
 
 
-def chosen_agent(options: argparse.Namespace) -> Agent:
+def chosen_agent(options: argparse.Namespace) -> tuple[str, Path, FlightSettings]:
     """The agent of record-video's ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
+    :return: a label, its zip, and the settings that it was judged with.
     :raises ConfigError: there is no such run or agent.
     """
     if options.trained_agent is not None:
         path = Path(options.trained_agent)
-        return Agent(path.stem, path, FlightSettings())
+        return path.stem, path, FlightSettings()
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # says so if there is none of that name
     return find_agent(options.folder, options.algo, known_environment(options), options.exp_id, options.which)
@@ -114,15 +115,16 @@ def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
         setting = scenario_setting(options.scenario)
     else:
         named = {"task": options.task} if options.task else {}
-        kept = agent.settings.given() if agent else {}
+        kept = agent[2].given() if agent else {}
         settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **given})
         setting = fixed_setting(settings, options.target, push)
     controllers: dict[str, Any] = {}
     if agent:
-        print(f"agent: {agent.path}")
-        controllers[agent.label] = load_model(agent.path)
+        label, path, _ = agent
+        print(f"agent: {path}")
+        controllers[label] = load_model(path)
     for spec in parse_controllers(options.controllers):
-        controllers[spec.label] = build(spec, setting.settings.vehicle)
+        controllers[spec.label] = build(spec, setting.vehicle)
     return setting, controllers
 
 
