@@ -13,9 +13,8 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.envs.bullet import BulletBody
+from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.in_flight import InFlight
-from sb3_quad.envs.rendering import RENDER_MODES, Renderer
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.checks import check_size, parse_options
 from sb3_quad.simulation.engine.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
@@ -168,8 +167,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.render_mode = render_mode
-        if render_mode is not None:
-            self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height
         self._open()
 

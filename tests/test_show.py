@@ -17,7 +17,7 @@ from PIL import Image
 
 from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
-from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
+from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
 from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay, draw_overlays
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
@@ -105,11 +105,11 @@ def test_a_course_has_all_its_targets():
 
 
 def looking_along_x():
-    return Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), 0.5)
+    return Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), Lens(80, 40, 0.5))
 
 
 def test_points_are_seen_where_they_are():
-    columns, rows, depth = looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]]), 80, 40).T
+    columns, rows, depth = looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]])).T
     np.testing.assert_allclose(columns, [40, 60, 40, 40])
     np.testing.assert_allclose(rows, [20, 20, 0, 20])
     np.testing.assert_allclose(depth, [4, 4, 4, 2])
@@ -133,17 +133,17 @@ clouds = st.lists(st.tuples(coordinates, coordinates, st.floats(10, 40)), min_si
 @settings(max_examples=50)
 def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(points, aspect, course):
     ahead = np.array([np.cos(course), np.sin(course), 0.0])
-    camera = framing_camera(points, 1.0, aspect, ahead)
-    forward, right, up = ((points - camera.eye) @ camera.axes.T).T
-    filled = np.stack([(np.abs(right) + 1.0) / (camera.slope * aspect), (np.abs(up) + 1.0) / camera.slope]) / forward
+    camera = framing_camera(points, 1.0, ahead, Lens(round(200 * aspect), 200))
+    forward, *across = ((points - camera.eye) @ camera.axes.T).T
+    filled = (np.abs(across) + 1.0) / camera.lens.slopes[:, None] / forward
     assert filled.max() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_following_camera_never_loses_what_it_follows(fall):
     points = [fall.state.array[:, step][np.array([[0, 1, 2], [17, 18, 19]])] for step in range(0, len(fall.times), 4)]
-    cameras = following_cameras(points, 0.04, 0.9, 1.0, np.array([0.0, 1.0, 0.0]))
+    cameras = following_cameras(points, 0.04, 0.9, np.array([0.0, 1.0, 0.0]), Lens(100, 100))
     for camera, each in zip(cameras, points, strict=True):
-        columns, rows, _ = camera.project(each, 100, 100).T
+        columns, rows, _ = camera.project(each).T
         assert ((columns > 0) & (columns < 100) & (rows > 0) & (rows < 100)).all()
     eyes = np.array([camera.eye for camera in cameras])
     assert np.abs(np.diff(eyes, n=2, axis=0)).max() < 0.6  # m per frame²: no jolts

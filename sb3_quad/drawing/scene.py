@@ -70,15 +70,15 @@ class Scene:
         shadows = [[*positions[-1, :2], self.span]]  # all of them would blacken the ground
         self._shadows = np.array(shadows + [[*target[:2], RING * self.scale] for target in targets])
 
-    def picture(self, camera: Camera, width: int, height: int, trails: Sequence[Overlay] = ()) -> Image:
+    def picture(self, camera: Camera, trails: Sequence[Overlay] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""
-        wide, high = SUPERSAMPLING * width, SUPERSAMPLING * height
+        wide, high = SUPERSAMPLING * camera.lens.width, SUPERSAMPLING * camera.lens.height
         forward, _, up = camera.axes
         _, _, pixels, buffer, names = p.getCameraImage(
             wide,
             high,
             p.computeViewMatrix(camera.eye.tolist(), (camera.eye + forward).tolist(), up.tolist()),
-            p.computeProjectionMatrixFOV(2.0 * math.degrees(math.atan(camera.slope)), wide / high, NEAR, FAR),
+            p.computeProjectionMatrixFOV(2.0 * math.degrees(math.atan(camera.lens.slope)), wide / high, NEAR, FAR),
             lightDirection=(np.array([1.2, 0.6, 6.0]) - 3.0 * forward).tolist(),
             shadow=0,
             lightAmbientCoeff=0.62,
@@ -94,7 +94,7 @@ class Scene:
         discs = sorted(self._discs, key=lambda disc: -float(np.linalg.norm(disc.points.mean(axis=0) - camera.eye)))
         both = Pillow.alpha_composite(Pillow.fromarray(bodies), draw_overlays([*discs, *trails], camera, depth))
         small = np.asarray(both.reduce(SUPERSAMPLING), dtype=np.float32)
-        behind = 255.0 * backdrop(camera, width, height, self._shadows)
+        behind = 255.0 * backdrop(camera, self._shadows)
         return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
 
     def close(self) -> None:

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.extras import require
 from sb3_quad.base.files import write_bytes
-from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
+from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
 from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
@@ -78,53 +77,47 @@ def film_frames(recordings: Sequence[Recording], width: int, height: int, speed:
     """
     times = frame_times(recordings, speed)
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    panels = [_panel(recording, times, forward, width, height) for recording in recordings]
+    panels = [_panel(recording, times, forward, Lens(width, height)) for recording in recordings]
     for pictures in zip(*panels, strict=True):
         yield side_by_side(pictures, PANELS_ABREAST)
 
 
-def _panel(recording: Recording, times: FloatArray, forward: FloatArray, width: int, height: int) -> Iterator[Image]:
+def _panel(recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens) -> Iterator[Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
     steps = [recording.at(seconds) for seconds in times]
     seen = [recording.vehicle_and_target(step) for step in steps]
-    frame_seconds, font_size = max(float(times[1] - times[0]), 1e-3), max(12, round(height / 26))
+    frame_seconds, font_size = max(float(times[1] - times[0]), 1e-3), max(12, round(lens.height / 26))
+    side = round(CLOSE_UP * min(lens.width, lens.height))
     with closing(Scene(recording.vehicle)) as scene:
-        cameras = following_cameras(seen, frame_seconds, MARGIN * scene.scale, width / height, forward)
-        close_up = _free_corner(cameras, seen, width, height)
+        cameras = following_cameras(seen, frame_seconds, MARGIN * scene.scale, forward, lens)
+        corner = _free_corner(cameras, seen, side)
         shown = None
         for step, camera in zip(steps, cameras, strict=True):
             if shown != (key := (step, camera.eye.round(3).tolist())):
-                shown = key
-                pixels = _draw(recording, step, scene, camera, width, height, close_up)
+                shown, pixels = key, _draw(recording, step, scene, camera, corner, side)
                 picture = with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
             yield picture
 
 
-def _draw(
-    recording: Recording, step: int, scene: Scene, camera: Camera, width: int, height: int, close_up: tuple[int, int, int]
-) -> Image:
-    """A picture of one step, with the vehicle from near in the square ``close_up`` where it is small."""
-    path = recording.state.position
+def _draw(recording: Recording, step: int, scene: Scene, camera: Camera, corner: tuple[int, int], side: int) -> Image:
+    """A picture of one step; where the vehicle is small, with a close-up in a corner."""
+    path, (left, top) = recording.state.position, corner
     scene.place([recording.pose(step)], recording.state.target[[step]])
-    trail = Overlay(path[: step + 1 : 2], to_rgb(recording.colour), 0.75, width=0.03 * scene.scale)
-    pixels = scene.picture(camera, width, height, [trail])
-    if scene.span < SMALL * float((path[step] - camera.eye) @ camera.axes[0]) * camera.slope:
-        near = framing_camera(path[[step]], 1.15 * scene.span, 1.0, camera.axes[0])
-        left, top, side = close_up
+    trail = Overlay(path[: step + 1 : 2], recording.colour, 0.75, width=0.03 * scene.scale)
+    pixels = scene.picture(camera, [trail])
+    if scene.span < SMALL * float((path[step] - camera.eye) @ camera.axes[0]) * camera.lens.slope:
+        near = framing_camera(path[[step]], 1.15 * scene.span, camera.axes[0], Lens(side, side))
         pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
-        pixels[top : top + side, left : left + side] = scene.picture(near, side, side, [trail])
+        pixels[top : top + side, left : left + side] = scene.picture(near, [trail])
     return pixels
 
 
-def _free_corner(cameras: Sequence[Camera], seen: Sequence[FloatArray], width: int, height: int) -> tuple[int, int, int]:
-    """Left, top and side of a square in the corner in which the points that are ``seen`` are least."""
-    spots = np.concatenate(
-        [camera.project(points, width, height)[:, :2] for camera, points in zip(cameras, seen, strict=True)]
-    )
-    side = round(CLOSE_UP * min(width, height))
-    right, bottom, half = width - side - GAP, height - side - GAP, side / 2
-    corners = [(GAP, bottom, side), (right, bottom, side), (GAP, GAP, side), (right, GAP, side)]
-    return min(corners, key=lambda corner: int((np.abs(spots - corner[:2] - half) < half + GAP).all(axis=1).sum()))
+def _free_corner(cameras: Sequence[Camera], seen: Sequence[FloatArray], side: int) -> tuple[int, int]:
+    """Left and top of a close-up, in the corner in which the points that are ``seen`` are least."""
+    spots = np.concatenate([camera.project(points)[:, :2] for camera, points in zip(cameras, seen, strict=True)])
+    right, bottom, half = cameras[0].lens.width - side - GAP, cameras[0].lens.height - side - GAP, side / 2
+    corners = [(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)]
+    return min(corners, key=lambda corner: int((np.abs(spots - corner - half) < half + GAP).all(axis=1).sum()))
 
 
 def _caption(recording: Recording, step: int) -> str:

@@ -7,10 +7,9 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
-from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import BoolArray, FloatArray, Image
-from sb3_quad.drawing.camera import Camera, broadside, framing_camera
+from sb3_quad.drawing.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_tags
 from sb3_quad.drawing.models import span
 from sb3_quad.drawing.picture import Overlay
@@ -29,15 +28,13 @@ class _View:
     """How all panels of a sequence are seen."""
 
     camera: Camera
-    width: int
-    height: int
     size: float  # how much larger than life vehicles are drawn
     breadth: float  # of a drawn vehicle, m
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where points, (n, 3), are in the picture, (n, 2), and how broad vehicles are there, (n,); pixels."""
-        screen = self.camera.project(points, self.width, self.height)
-        return screen[:, :2], self.breadth * self.height / (2.0 * self.camera.slope * screen[:, 2])
+        screen, lens = self.camera.project(points), self.camera.lens
+        return screen[:, :2], self.breadth * lens.height / (2.0 * lens.slope * screen[:, 2])
 
 
 def sequence(
@@ -68,15 +65,15 @@ def _view(recordings: Sequence[Recording], ends: Sequence[int], size: tuple[int,
     paths = [recording.state.position[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
     points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
     forward = broadside(points)
-    width, height = size or _proportions(points, forward)
+    lens = Lens(*(size or _proportions(points, forward)))
     breadth = 2.0 * span(recordings[0].vehicle)
     enlarged = 1.0
     for _ in range(20):  # a larger vehicle needs a camera farther away
-        camera = framing_camera(points, 0.6 * enlarged * breadth, width / height, forward)
+        camera = framing_camera(points, 0.6 * enlarged * breadth, forward, lens)
         depth = float(np.median((points - camera.eye) @ camera.axes[0]))
-        wanted = VEHICLE_SHARE * 2.0 * camera.slope * depth / breadth
+        wanted = VEHICLE_SHARE * 2.0 * lens.slope * depth / breadth
         enlarged = float(np.clip(0.5 * (enlarged + wanted), 1.0, LARGEST))
-    return _View(camera, width, height, enlarged, enlarged * breadth)
+    return _View(camera, enlarged, enlarged * breadth)
 
 
 def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
@@ -105,11 +102,11 @@ def _apart(recording: Recording, end: int, view: _View) -> list[int]:
 
 
 def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) -> Image:
-    trail = Overlay(recording.state.position[: end + 1], to_rgb(recording.colour), 0.85, width=0.05 * view.breadth)
+    trail = Overlay(recording.state.position[: end + 1], recording.colour, 0.85, width=0.05 * view.breadth)
     with closing(Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
-        pixels = scene.picture(view.camera, view.width, view.height, [trail])
-    size = max(12, round(view.height / 34))
+        pixels = scene.picture(view.camera, [trail])
+    size = max(12, round(view.camera.lens.height / 34))
     tag = round(0.92 * size)
     pixels = with_tags(pixels, _time_tags(recording, steps, view, tag), tag)
     if recording.lost:
@@ -136,7 +133,7 @@ def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: in
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array(tag_size(text, size))
         around = place + sides * (reach + 0.4 * size + half)
-        free = (around >= half).all(axis=1) & (around <= (view.width, view.height) - half).all(axis=1)
+        free = (around >= half).all(axis=1) & (around <= view.camera.lens[:2] - half).all(axis=1)
         for centre, other in taken:
             free &= (np.abs(around - centre) >= half + other).any(axis=1)
         chosen = around[int(np.argmax(free))]

@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.colors import to_rgb
 
 from sb3_quad.base.bullet import p
-from sb3_quad.drawing.camera import broadside, following_cameras
+from sb3_quad.drawing.camera import Lens, broadside, following_cameras
 from sb3_quad.drawing.scene import Scene
 from sb3_quad.drawing.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.film import FPS, MARGIN, frame_times
 from sb3_quad.show.recording import Recording
 
-WINDOW_FIELD_OF_VIEW = math.radians(60.0)  # PyBullet's, vertical
+WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 
 
 def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float) -> None:
@@ -31,7 +31,7 @@ def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: 
         start_drawing(client)
         for recordings in episodes:
             p.removeAllUserDebugItems(physicsClientId=client)
-            _play(scene, recordings, width / height, speed)
+            _play(scene, recordings, Lens(width, height, WINDOW_SLOPE), speed)
     except p.error:
         if p.isConnected(client):  # else the window has been shut
             raise
@@ -39,11 +39,11 @@ def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: 
         disconnect(client)
 
 
-def _play(scene: Scene, recordings: Sequence[Recording], aspect: float, speed: float) -> None:
+def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times, client = frame_times(recordings, speed), scene.client
     seen = [np.concatenate([each.vehicle_and_target(each.at(seconds)) for each in recordings]) for seconds in times]
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    cameras = following_cameras(seen, speed / FPS, MARGIN * scene.scale, aspect, forward, WINDOW_FIELD_OF_VIEW)
+    cameras = following_cameras(seen, speed / FPS, MARGIN * scene.scale, forward, lens)
     drawn_to, labels = [0] * len(recordings), [-1] * len(recordings)
     begun, number = time.perf_counter(), 0
     while number < len(times):
