@@ -15,7 +15,7 @@ from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose, Scene
 from sb3_quad.drawing.window import disconnect, has_display, open_window, point_window, start_drawing
 from sb3_quad.simulation.engine.rotors import write_body
-from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, TARGET, QuadcopterState
+from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
@@ -102,13 +102,11 @@ class Renderer:
     def __init__(self, vehicle: Vehicle, body: BulletBody, width: int, height: int) -> None:
         self.vehicle, self.client = vehicle, body.client
         self.size, self.human = (width, height), body.has_window
-        self.rotor_angles = np.zeros(4)
-        self.shown_at = time.perf_counter()
-        self.frames_due = 1.0
+        self.shown_at, self.frames_due = time.perf_counter(), 1.0
         # PyBullet would draw the collision sphere.
         p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
         self.scene = Scene(vehicle, self.client)
-        self.chase = ChaseCamera(self.scene.scale, *self.size)
+        self.reset(np.zeros(STATE_SIZE))
         if self.human:
             start_drawing(self.client)
 

@@ -11,7 +11,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.state import POSITION, TARGET
 
-SLOPE = math.tan(math.radians(15.0))  # of half the vertical field of view; small, so that near and far are nearly of one size
+SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that near and far are nearly of one size
 CHASE_SLOPE = math.tan(math.radians(27.0))
 ELEVATIONS = math.radians(-45.0), math.radians(52.0)  # of a chasing camera
 ELEVATION_AT_TARGET = math.radians(-8.0)

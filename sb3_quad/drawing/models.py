@@ -59,7 +59,7 @@ def add_mesh(mesh: Mesh, colour: Colour, client: int) -> int:
     return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
 
 
-def move_body(body: int, position: Sequence[float], quaternion: Sequence[float], client: int) -> None:
+def move_body(client: int, body: int, position: Sequence[float], quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
     """Move a body; the quaternion is (x, y, z, w), as PyBullet's are."""
     p.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
 

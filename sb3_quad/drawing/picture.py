@@ -80,9 +80,8 @@ def draw_overlays(overlays: Sequence[Overlay], camera: Camera, depth: Float32Arr
     for overlay in overlays:
         screen = larger.project(overlay.points)
         if overlay.width is None:
-            polygons = np.stack(
-                [np.broadcast_to(screen.mean(axis=0), screen.shape), screen, np.roll(screen, 1, axis=0)], axis=1
-            )
+            centre = np.broadcast_to(screen.mean(axis=0), screen.shape)
+            polygons = np.stack([centre, screen, np.roll(screen, 1, axis=0)], axis=1)
         else:
             polygons = _ribbon(screen, overlay.width * high / (2.0 * camera.lens.slope))
         colour = tuple(round(255 * part) for part in (*to_rgb(overlay.colour), overlay.opacity))

@@ -24,7 +24,6 @@ FORCE: Colour = (0.86, 0.10, 0.14, 1.0)
 TORQUE: Colour = (0.55, 0.15, 0.75, 1.0)
 REFERENCE_ARM = 0.24  # of the default vehicle, m
 RING = 0.42  # radius of the rings around a target, m, for a vehicle of the default one's size
-LEVEL = (0.0, 0.0, 0.0, 1.0)
 
 
 class Pose(NamedTuple):
@@ -65,8 +64,8 @@ class Scene:
         self._discs = [disc for pose, vehicle in zip(poses, self._vehicles, strict=True) for disc in vehicle.place(pose)]
         for target, ball, rings in zip(targets, self._balls, self._rings, strict=True):
             hidden = (np.linalg.norm(positions - target, axis=1) < 0.7 * self.scale).any()  # where it would hide a vehicle
-            move_body(ball, NOWHERE if hidden else target.tolist(), LEVEL, self.client)
-            move_body(rings, target.tolist(), LEVEL, self.client)
+            move_body(self.client, ball, NOWHERE if hidden else target.tolist())
+            move_body(self.client, rings, target.tolist())
         shadows = [[*positions[-1, :2], self.span]]  # all of them would blacken the ground
         self._shadows = np.array(shadows + [[*target[:2], RING * self.scale] for target in targets])
 
@@ -125,14 +124,14 @@ class _VehicleBodies:
         position, (w, x, y, z) = pose.state[POSITION].tolist(), pose.state[QUATERNION].tolist()
         rotation = QuadcopterState(pose.state[:, None]).rotation[0]
         for body in self.frame:
-            move_body(body, position, (x, y, z, w), self.client)
+            move_body(self.client, body, position, (x, y, z, w))
         for body, centre, angle in zip(self.rotors, self.centres.tolist(), pose.rotor_angles.tolist(), strict=True):
             turned = p.getQuaternionFromEuler((0.0, 0.0, angle))
             at, attitude = p.multiplyTransforms(position, (x, y, z, w), centre, turned)
-            move_body(body, at, attitude, self.client)
+            move_body(self.client, body, at, attitude)
         for body, (in_world, in_body) in zip((self.force, self.torque), pose.wrench.reshape(2, 2, 3), strict=True):
             x, y, z = (in_world + rotation @ in_body).tolist()
             along = p.getQuaternionFromEuler((0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)))
-            move_body(body, position if any((x, y, z)) else NOWHERE, along, self.client)
+            move_body(self.client, body, position if any((x, y, z)) else NOWHERE, along)
         rims = position + self.rims @ rotation.T
         return [Overlay(rim, colour, 0.24) for rim, colour in zip(rims, self.colours, strict=True)]

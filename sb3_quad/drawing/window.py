@@ -33,8 +33,7 @@ def open_window(width: int, height: int) -> int:
         raise ConfigError("render_mode 'human': PyBullet opens one window per process, and one is open already") from None
     if client < 0:
         raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
-    hidden = (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS)
-    for option in hidden:
+    for option in (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS):
         p.configureDebugVisualizer(option, 0, physicsClientId=client)
     plane = f"{pybullet_data.getDataPath()}/plane.urdf"
     ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)

@@ -1,16 +1,20 @@
-"""Recorded flights as a film: a panel for each, its camera following vehicle and target; and the file it is written to."""
+"""Recorded flights in motion: a film with a panel for each, or PyBullet's window with all vehicles together, in real time."""
 
 from __future__ import annotations
 
+import math
 import tempfile
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import FloatArray, Image
+from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.extras import require
 from sb3_quad.base.files import write_bytes
@@ -18,6 +22,7 @@ from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, 
 from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
+from sb3_quad.drawing.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.recording import Recording
 
 FPS = 25
@@ -26,6 +31,7 @@ MARGIN = 0.9  # around vehicle and target, m, for a vehicle of the default one's
 PANELS_ABREAST = 3
 SMALL = 0.2  # a vehicle whose breadth is less of the picture's height is shown from near as well
 CLOSE_UP, GAP = 0.34, 8  # side of that picture, of the panel's; its distance from the edges, pixels
+WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
 FORMATS = (".mp4", ".gif")
 
@@ -128,3 +134,47 @@ def _caption(recording: Recording, step: int) -> str:
     push = f"   force {force:.1f} N" if force else ""
     height = recording.state.position[step, 2]
     return f"{seconds}   {recording.state.distance[step]:.2f} m from target   {height:.1f} m high{push}"
+
+
+def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float) -> None:
+    """Show episodes one after the other, until the window is shut; flights of one start together.
+
+    :raises ConfigError: the window cannot be opened.
+    """
+    client = open_window(width, height)
+    try:
+        n = len(episodes[0])
+        scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
+        start_drawing(client)
+        for recordings in episodes:
+            p.removeAllUserDebugItems(physicsClientId=client)
+            _play(scene, recordings, Lens(width, height, WINDOW_SLOPE), speed)
+    except p.error:
+        if p.isConnected(client):  # else the window has been shut
+            raise
+    finally:
+        disconnect(client)
+
+
+def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
+    times, client = frame_times(recordings, speed), scene.client
+    seen = [np.concatenate([each.vehicle_and_target(each.at(seconds)) for each in recordings]) for seconds in times]
+    forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
+    cameras = following_cameras(seen, speed / FPS, MARGIN * scene.scale, forward, lens)
+    drawn_to, labels = [0] * len(recordings), [-1] * len(recordings)
+    begun, number = time.perf_counter(), 0
+    while number < len(times):
+        now = [(recording, recording.at(times[number])) for recording in recordings]
+        targets = np.stack([recording.state.target[step] for recording, step in now])
+        scene.place([recording.pose(step) for recording, step in now], targets)
+        for k, (recording, step) in enumerate(now):
+            if step > drawn_to[k]:
+                ends, colour = recording.state.position[[drawn_to[k], step]], to_rgb(recording.colour)
+                p.addUserDebugLine(*ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client)
+                above = (ends[1] + (0.0, 0.0, 0.6 * scene.scale)).tolist()
+                look = {"textColorRGB": colour, "textSize": 1.2, "replaceItemUniqueId": labels[k]}
+                labels[k] = p.addUserDebugText(recording.name, above, physicsClientId=client, **look)
+                drawn_to[k] = step
+        point_window(client, cameras[number], seen[number].mean(axis=0))
+        number = max(number + 1, int((time.perf_counter() - begun) * FPS))  # frames that come too late are left out
+        time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,8 +23,7 @@ LARGEST = 6.0  # how much larger than life it is drawn at most
 APART = 0.8  # least distance between poses in the picture, in the vehicle's drawn breadth
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
+class _View(NamedTuple):
     """How all panels of a sequence are seen."""
 
     camera: Camera

@@ -24,10 +24,9 @@ from sb3_quad.experts.models import load_model
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.episodes import Setting, find_agent, fixed_setting, fly_all, scenario_setting
-from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, write_film
+from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
 from sb3_quad.show.recording import Recording
 from sb3_quad.show.sequence import sequence
-from sb3_quad.show.window import show_in_window
 from sb3_quad.simulation.checks import check_size
 
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
