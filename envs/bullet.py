@@ -1,20 +1,25 @@
-"""One quadcopter's rigid body in a PyBullet simulation of its own."""
+"""PyBullet's part of ``QuadcopterEnv``: the rigid body, and pictures of its flight."""
 
 from __future__ import annotations
 
 import sys
+import time
 import weakref
 
 import numpy as np
-import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
-from sb3_quad.drawing.window import has_display, open_window
+from sb3_quad.drawing.camera import ChaseCamera
+from sb3_quad.drawing.models import rotor_turning
+from sb3_quad.drawing.scene import Pose, Scene
+from sb3_quad.drawing.window import disconnect, has_display, open_window, point_window, start_drawing
 from sb3_quad.simulation.engine.rotors import write_body
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
-FloatArray = npt.NDArray[np.float64]
+RENDER_MODES = ("human", "rgb_array")
+WINDOW_FPS = 25.0  # frames a second; PyBullet's window lets the simulation wait for each
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
@@ -37,7 +42,7 @@ class BulletBody:
             print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
         self.client = open_window(*window) if window is not None and self.has_window else int(p.connect(p.DIRECT))
         # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's clients are limited.
-        self._close = weakref.finalize(self, _disconnect, self.client)
+        self._close = weakref.finalize(self, disconnect, self.client)
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
         p.setPhysicsEngineParameter(fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client)
         ball = p.createCollisionShape(p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client)
@@ -51,33 +56,30 @@ class BulletBody:
         """Whether the simulation is still there: neither closed nor its window shut."""
         return self._close.alive and bool(p.isConnected(self.client))
 
-    def place(self, state: FloatArray) -> None:
-        """Put the body where column 0 of ``state``, (STATE_SIZE, n), says."""
-        first = QuadcopterState(state[:, :1])
-        w, x, y, z = first.quaternion[0].tolist()
-        rates = first.rotation[0] @ first.body_rates[0]
-        p.resetBasePositionAndOrientation(self.body, first.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
-        p.resetBaseVelocity(self.body, first.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
+    def place(self, state: QuadcopterState) -> None:
+        """Put the body where the first vehicle of ``state`` is."""
+        w, x, y, z = state.quaternion[0].tolist()
+        rates = state.rotation[0] @ state.body_rates[0]
+        p.resetBasePositionAndOrientation(self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
+        p.resetBaseVelocity(self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
 
-    def fly(self, wrenches: FloatArray) -> None:
-        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame."""
-        client, body, frame = self.client, self.body, p.LINK_FRAME
-        push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
-        for force, torque in wrenches.tolist():
-            push(body, -1, force, _ORIGIN, frame, physicsClientId=client)
-            twist(body, -1, torque, frame, physicsClientId=client)
-            step(physicsClientId=client)
+    def fly(self, wrenches: FloatArray, world: FloatArray | None = None) -> None:
+        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame.
 
-    def fly_pushed(self, wrenches: FloatArray, world_force: FloatArray, world_torque: FloatArray) -> None:
-        """As :meth:`fly`, with a force and a torque in the world frame, (3,) each, besides."""
+        :param world: a force and a torque in the world frame that act besides, (2, 3); None: none.
+        """
         client, body = self.client, self.body
-        outer_force, outer_torque = world_force.tolist(), world_torque.tolist()
-        for wrench in wrenches:
-            # A world-frame force acts at a point of the world: the centre of mass, where it is now.
-            position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
-            p.applyExternalForce(body, -1, outer_force, position, p.WORLD_FRAME, physicsClientId=client)
-            p.applyExternalTorque(body, -1, outer_torque, p.WORLD_FRAME, physicsClientId=client)
-            self.fly(wrench[None])
+        push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
+        world_force, world_torque = ((), ()) if world is None else world.tolist()
+        for force, torque in wrenches.tolist():
+            if world is not None:
+                # A world-frame force acts at a point of the world: the centre of mass, where it is now.
+                position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
+                push(body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client)
+                twist(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+            push(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
+            twist(body, -1, torque, p.LINK_FRAME, physicsClientId=client)
+            step(physicsClientId=client)
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
@@ -90,6 +92,53 @@ class BulletBody:
         self._close()
 
 
-def _disconnect(client: int) -> None:
-    if p.isConnected(client):
-        p.disconnect(physicsClientId=client)
+class Renderer:
+    """Draws one vehicle, its target and the wrench that acts on it; the flight is the same with and without it.
+
+    :param body: the simulation. If it has a window, that is drawn into, in real time.
+    :param width: of the pictures, pixels; ``height`` likewise.
+    """
+
+    def __init__(self, vehicle: Vehicle, body: BulletBody, width: int, height: int) -> None:
+        self.vehicle, self.client = vehicle, body.client
+        self.size, self.human = (width, height), body.has_window
+        self.shown_at, self.frames_due = time.perf_counter(), 1.0
+        # PyBullet would draw the collision sphere.
+        p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
+        self.scene = Scene(vehicle, self.client)
+        self.reset(np.zeros(STATE_SIZE))
+        if self.human:
+            start_drawing(self.client)
+
+    def reset(self, state: FloatArray) -> None:
+        """A new episode: the camera jumps to where ``state``, (STATE_SIZE,), says."""
+        self.rotor_angles = np.zeros(4)
+        self.chase = ChaseCamera(self.scene.scale, *self.size)
+        self.chase.follow(state, 1.0)
+
+    def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
+        """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,); once for each control step.
+
+        :return: uint8 (height, width, 3). None if there is a window: it is drawn WINDOW_FPS times a second, and this call
+            waits until real time has caught up.
+        """
+        camera = self.chase.follow(state, 0.04)
+        self.rotor_angles += rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * self.vehicle.control_step
+        if not self.human:
+            self._place(state, wrench)
+            return self.scene.picture(camera)
+        self.frames_due += WINDOW_FPS * self.vehicle.control_step
+        if self.frames_due >= 1.0:
+            self.frames_due %= 1.0
+            self._place(state, wrench)
+            point_window(self.client, camera, state[POSITION])
+        self.shown_at += self.vehicle.control_step
+        ahead = self.shown_at - time.perf_counter()
+        if ahead > 0:
+            time.sleep(ahead)
+        else:
+            self.shown_at -= ahead  # too slow for real time: do not hurry afterwards
+        return None
+
+    def _place(self, state: FloatArray, wrench: FloatArray) -> None:
+        self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])

@@ -12,28 +12,24 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
+from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.in_flight import InFlight
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
 
-BoolArray = npt.NDArray[np.bool_]
-Observations = npt.NDArray[np.float32]
 
-
-class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.NDArray[Any]]):
+class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
     """The batched environment for users outside Stable-Baselines3.
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8, vectorization_mode="vector_entry_point")`` makes one. The
-    learning problem and the arguments are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i of
+    learning problem, the arguments and the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i of
     ``reset(seed=s)`` flies as that environment does after ``reset(seed=s + i)``.
 
     Autoreset is ``SAME_STEP``: a row that ends returns the first observation of its next episode, and the infos hold the last
     one in ``final_obs[i]`` and ``is_success``, ``distance``, ``collision`` and ``out_of_range`` in ``final_info``, each with
-    the mask ``_final_obs``, ``_final_info`` and so on. Steps that end nowhere have empty infos.
-
-    The setters of the arguments are those of :attr:`batch`, a :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
+    the mask ``_final_obs``, ``_final_info`` and so on. Where no episode ends, infos are empty.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
@@ -50,7 +46,6 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
             raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
         self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords)
         self.num_envs = self.batch.n
-        self.render_mode = None
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -58,28 +53,27 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
 
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Begin new episodes in all rows, or where ``options["reset_mask"]``, bool (n,), says so.
 
         :param seed: row i begins the stream of ``seed + i``, or of its own number; None: the next episode of its stream.
         """
-        seeds = [None] * self.num_envs if seed is None else seed
-        seeds = [seeds + row for row in range(self.num_envs)] if isinstance(seeds, (int, np.integer)) else list(seeds)
-        if len(seeds) != self.num_envs:
-            raise ConfigError(f"seed: {len(seeds)} numbers for {self.num_envs} environments; give one, or one for each")
-        mask = np.ones(self.num_envs, dtype=np.bool_)
-        for key, value in (options or {}).items():
-            if key != "reset_mask":
-                raise ConfigError(f"reset option {key!r}: the only one is 'reset_mask', bool of shape ({self.num_envs},)")
-            mask = np.asarray(value)
-        if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
-            raise ConfigError(f"reset_mask: must be bool of shape ({self.num_envs},)")
+        n, options = self.num_envs, dict(options or {})
+        seeds = [None] * n if seed is None else seed
+        seeds = [seeds + row for row in range(n)] if isinstance(seeds, (int, np.integer)) else list(seeds)
+        if len(seeds) != n:
+            raise ConfigError(f"seed: {len(seeds)} numbers for {n} environments; give one, or one for each")
+        mask = np.asarray(options.pop("reset_mask", np.ones(n, dtype=np.bool_)))
+        for key in options:
+            raise ConfigError(f"reset option {key!r}: the only one is 'reset_mask', bool of shape ({n},)")
+        if mask.shape != (n,) or mask.dtype != np.bool_:
+            raise ConfigError(f"reset_mask: must be bool of shape ({n},)")
         seeded = [row for row in np.flatnonzero(mask).tolist() if seeds[row] is not None]
         if seeded:
             self.batch.seed([seeds[row] for row in seeded], seeded)
         return self.batch.reset(mask), {}
 
-    def step(self, actions: npt.NDArray[Any]) -> tuple[Observations, npt.NDArray[Any], BoolArray, BoolArray, dict[str, Any]]:
+    def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
         """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos."""
         outcome = self.batch.outcome
         observations, rewards, done = self.batch.step(actions)
@@ -98,7 +92,3 @@ class QuadcopterVectorEnv(VectorEnv[Observations, npt.NDArray[np.float32], npt.N
             info |= {f"_{key}": done.copy() for key in info}
             infos = {"final_obs": final, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}
         return observations, rewards, done & ~truncated, truncated, infos
-
-    def true_state(self) -> QuadcopterState:
-        """The true state of all rows, a live view."""
-        return self.batch.true_state()

@@ -13,20 +13,19 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.envs.bullet import BulletBody
-from sb3_quad.envs.rendering import RENDER_MODES, Renderer
+from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
+from sb3_quad.envs.in_flight import InFlight
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.checks import check_size, parse_options
 from sb3_quad.simulation.engine.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD, QuadcopterState
+from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD
 from sb3_quad.simulation.tasks import TaskSpec
-from sb3_quad.vehicles.vehicle import Vehicle
 
 _NO_LIMIT = 2**62  # TimeLimit truncates
 
 
-class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
+class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     """
     ## Description
 
@@ -60,7 +59,7 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
 
     ## Observation Space
 
-    `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, drawn afresh every control step, then
+    `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every control step, then
     `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2).
 
     | Num | Feature | Frame | Unit | std |
@@ -83,7 +82,7 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
     | Key | Meaning |
     |-----|---------|
     | `target` | r_T, (3,), world frame, m |
-    | `state` | any of the four below; what is left out is drawn as ever |
+    | `state` | any of the four below; what is left out is sampled |
 
     | Key of `state` | Meaning |
     |----------------|---------|
@@ -162,14 +161,13 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
         check_size(render_width, render_height)
         # One row of the batched environment, whose body PyBullet moves.
         keywords.setdefault("max_episode_steps", _NO_LIMIT)
-        self._row = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
+        self.batch = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
-        self._seeded = self._ready = False
+        self._ready = False
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
         self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
         self.render_mode = render_mode
-        if render_mode is not None:
-            self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height
         self._open()
 
@@ -188,22 +186,22 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
         """
         super().reset(seed=seed)
         fixed = parse_options(options, self.vehicle)
-        row = self._row
-        if seed is not None or not self._seeded:
-            row.set_streams([self.np_random])
-            self._seeded = True
-        row.reset()
+        batch = self.batch
+        if seed is not None:
+            batch.set_streams([self.np_random])
+        batch.reset()
         for rows, values in fixed:
-            row.state[rows, 0] = values
+            batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
-        self._body.place(row.state)
+        self._body.place(self.true_state())
         self._ready = True
         if self._renderer is not None:
-            self._renderer.reset(row.state)
-            self._show()
-        self._row.outcome[:] = 0  # only the end of a control step is judged
-        self._row.outcome["truncated"], self._row.outcome["distance"] = True, self.true_state().distance
+            self._renderer.reset(batch.state[:, 0])
+        if self.render_mode == "human":
+            self._draw()
+        batch.outcome[:] = 0  # only the end of a control step is judged
+        batch.outcome["truncated"], batch.outcome["distance"] = True, self.true_state().distance
         return self.observe(), self._info()
 
     def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
@@ -217,24 +215,22 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
             raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        row, body, wrenches = self._row, self._body, self._wrenches
+        batch, wrenches = self.batch, self._wrenches
         step = self.vehicle.physics_step
-        kind = rotor_wrenches(row.state, row.queue, array, row.wrench, row.vehicles, step, wrenches)
+        kind = rotor_wrenches(batch.state, batch.queue, array, batch.wrench, batch.vehicles, step, wrenches)
         if kind == NOT_FINITE:
             raise ValueError(f"action {array.tolist()}: every number must be finite")
-        if kind == WORLD_FRAME_TOO:
-            body.fly_pushed(wrenches, row.wrench[FORCE_WORLD, 0], row.wrench[TORQUE_WORLD, 0])
-        else:
-            body.fly(wrenches)
-        body.read(row.state)
-        observations, _, _ = row.score()
+        world = np.stack([self.wrench[FORCE_WORLD], self.wrench[TORQUE_WORLD]]) if kind == WORLD_FRAME_TOO else None
+        self._body.fly(wrenches, world)
+        self._body.read(batch.state)
+        observations, _, _ = batch.score()
         if self.render_mode == "human":
-            self._show()
+            self._draw()
         info = self._info()
-        return observations[0], float(row.outcome["reward"][0]), not info["is_success"], False, info
+        return observations[0], float(batch.outcome["reward"][0]), not info["is_success"], False, info
 
     def _info(self) -> dict[str, Any]:
-        ended = self._row.outcome[0]
+        ended = self.batch.outcome[0]
         info = {"is_success": bool(ended["truncated"]), "distance": float(ended["distance"])}
         return info | {name: bool(ended[name]) for name in ("collision", "out_of_range")}
 
@@ -242,13 +238,10 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""
         if self.render_mode is None:
             gymnasium.logger.warn("render() does nothing without a render_mode; pass render_mode='rgb_array' to make()")
-        if self._renderer is None or self.render_mode == "human":
-            return None
-        return self._renderer.render(self._row.state, self._row.wrench)
+        return self._draw() if self.render_mode == "rgb_array" else None
 
-    def _show(self) -> None:
-        if self._renderer is not None and self.render_mode == "human":
-            self._renderer.render(self._row.state, self._row.wrench)
+    def _draw(self) -> Image | None:
+        return None if self._renderer is None else self._renderer.render(self.batch.state[:, 0], self.wrench)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
@@ -257,62 +250,12 @@ class QuadcopterEnv(gymnasium.Env[Float32Array, Float32Array]):
 
     def observe(self) -> Float32Array:
         """The present observation, (18,); the same numbers until the next step, unless something was set meanwhile."""
-        return np.asarray(self._row.observe()[0])
-
-    def true_state(self) -> QuadcopterState:
-        """The true state, a live view of one row."""
-        return self._row.true_state()
-
-    @property
-    def vehicle(self) -> Vehicle:
-        """The vehicle's parameters."""
-        return self._row.vehicle_list[0]
-
-    @property
-    def target(self) -> FloatArray:
-        """r_T, (3,), world frame, m."""
-        return np.array(self.true_state().target[0])
-
-    @property
-    def noise(self) -> float:
-        """Relative standard deviation of the observation noise."""
-        return float(self._row.noise_level[0])
-
-    @property
-    def observation_mean(self) -> FloatArray:
-        """μ of Eq. 3.16, (18,)."""
-        return self._row.mean[:, 0].copy()
-
-    @property
-    def observation_std(self) -> FloatArray:
-        """σ of Eq. 3.16, (18,)."""
-        return self._row.std[:, 0].copy()
+        return np.asarray(self.batch.observe()[0])
 
     @property
     def wrench(self) -> FloatArray:
         """What :meth:`set_wrench` has set, (12,), a live view: force world, force body, torque world, torque body; N, N m."""
-        return self._row.wrench[:, 0]
+        return self.batch.wrench[:, 0]
 
-    def set_target(self, position: npt.ArrayLike) -> None:
-        """Move the target, (3,), world frame, m; until the next reset."""
-        self._row.set_target(position)
-
-    def set_wrench(self, *arguments: Any, **keywords: Any) -> None:
-        """Apply an external force (N) and torque (N m), (3,) each, at the centre of mass until set anew.
-
-        The arguments are ``force``, ``torque``, ``force_frame`` ("world") and ``torque_frame`` ("body"), as of
-        :meth:`~sb3_quad.simulation.batch.QuadcopterBatch.set_wrench`.
-        """
-        self._row.set_wrench(*arguments, **keywords)
-
-    def set_noise(self, level: float) -> None:
-        """Set the relative standard deviation of the observation noise; 0: none."""
-        self._row.set_noise(level)
-
-    def set_observation_scaling(self, mean: npt.ArrayLike | None = None, std: npt.ArrayLike | None = None) -> None:
-        """Set μ and σ of Eq. 3.16, (18,) each; None leaves one as it is."""
-        self._row.set_observation_scaling(mean, std)
-
-    def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> None:
-        """Set the task of all episodes that begin from now on."""
-        self._row.set_task(task, task_kwargs)
+    def _by_row(self, columns: FloatArray) -> FloatArray:
+        return np.asarray(super()._by_row(columns)[0])

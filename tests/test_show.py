@@ -17,61 +17,65 @@ from PIL import Image
 
 from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
-from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
-from sb3_quad.drawing.labels import header_height, side_by_side, with_header
+from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
+from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay, draw_overlays
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.settings.config import load_config
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show import sequence
-from sb3_quad.show.episodes import Setting, fly_all
-from sb3_quad.show.film import FPS, HOLD, film_frames, frame_times
-from sb3_quad.show.recording import record
-from sb3_quad.show.video import write_video
+from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.film import FPS, HOLD, film_frames, frame_times, write_film
 from sb3_quad.simulation.state import POSITION, TARGET
 from sb3_quad.training.runs import claim_run
 
-HIT = Wrench(start=0.1, duration=0.02, force=(-20, -20, 0), torque=(-5, -5, -5))
+HIT = {"start": 0.1, "duration": 0.02, "force": (-20, -20, 0), "torque": (-5, -5, -5)}
 VIDEO = importlib.util.find_spec("imageio_ffmpeg") is not None
+
+
+def flown(setting, n_timesteps=None):
+    """The first episode of a setting, flown by the PID expert."""
+    ((recording,),) = fly_all({"pid": PIDExpert()}, setting, 0, n_timesteps)
+    return recording
 
 
 @pytest.fixture(scope="module")
 def fall():
     """An upside-down start that the PID expert does not survive."""
-    plan = Setting.of_scenario("thesis:recovery_s1")
-    return plan.fly("pid", PIDExpert(), 0, 1500, True)
+    return flown(scenario_setting("thesis:recovery_s1"))
 
 
 @pytest.fixture(scope="module")
 def hit():
     """A hit on the way to a target."""
-    setting = Setting.fixed(FlightSettings(task="target_tracking", noise=0.0), target=(3, 0, 16), wrench=HIT)
-    return setting.fly("pid", PIDExpert(), 0, 60, True)
+    settings = FlightSettings(task="target_tracking", noise=0.0)
+    return flown(fixed_setting(settings, target=(3, 0, 16), push=HIT), 60)
 
 
 def test_a_recording_is_the_flight_of_the_environment():
     expert = PIDExpert()
-    recording = record("pid", expert, FlightSettings(task="state_recovery", max_episode_steps=40), seed=3)
+    setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=40))
+    ((recording,),) = fly_all({"pid": expert}, setting, 3, None)
     env = QuadcopterEnv(task="state_recovery")
     env.reset(seed=3)
     total = 0.0
     for step in range(40):
-        np.testing.assert_array_equal(recording.state[:, step], env.true_state().array[:, 0])
+        np.testing.assert_array_equal(recording.state.array[:, step], env.true_state().array[:, 0])
         total += env.step(expert.actions(env.true_state())[0])[1]
-    np.testing.assert_array_equal(recording.state[:, 40], env.true_state().array[:, 0])
+    np.testing.assert_array_equal(recording.state.array[:, 40], env.true_state().array[:, 0])
     assert recording.reward == pytest.approx(total) and recording.lost == ""
     env.close()
 
 
 def test_a_lost_flight_ends_where_it_was_lost(fall):
-    assert fall.lost == "collision" and fall.path[-1, 2] <= fall.vehicle.collision_radius < fall.path[-2, 2]
+    assert fall.lost == "collision"
+    assert fall.state.position[-1, 2] <= fall.vehicle.collision_radius < fall.state.position[-2, 2]
     assert fall.times[-1] == pytest.approx(1.78, abs=0.02)  # the specification's expert: 1.78 s
 
 
 def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
-    acting = np.flatnonzero(hit.wrench.any(axis=0))
+    acting = np.flatnonzero(hit.wrench.any(axis=1))
     np.testing.assert_array_equal(acting, [11, 12])  # during the steps that begin at 0.10 and 0.11 s
     assert hit.pushes == [11]
     np.testing.assert_array_equal(hit.wrench_around(40)[:3], [-20, -20, 0])
@@ -80,32 +84,32 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
 
 
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
-    setting = Setting.fixed(FlightSettings(task="state_recovery", max_episode_steps=20))
-    episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50, True))
+    setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=20))
+    episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50))
     assert [len(a.times) - 1 for a, _ in episodes] == [20, 20, 10]
     for first, second in episodes:
-        np.testing.assert_array_equal(first.state[:, 0], second.state[:, 0])
-        assert not np.array_equal(first.state[:, -1], second.state[:, -1])
-    assert not np.array_equal(episodes[0][0].state[:, 0], episodes[1][0].state[:, 0])
+        np.testing.assert_array_equal(first.state.array[:, 0], second.state.array[:, 0])
+        assert not np.array_equal(first.state.array[:, -1], second.state.array[:, -1])
+    assert not np.array_equal(episodes[0][0].state.array[:, 0], episodes[1][0].state.array[:, 0])
 
 
 def test_a_controller_that_fails_is_named():
-    setting = Setting.fixed(FlightSettings(task="state_recovery"))
+    setting = fixed_setting(FlightSettings(task="state_recovery"))
     with pytest.raises(ControllerError, match=r"controller odd: .*shape"):
-        list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5, True))
+        list(fly_all({"odd": lambda observation: np.zeros((1, 3))}, setting, 0, 5))
 
 
 def test_a_course_has_all_its_targets():
-    recording = Setting.of_scenario("thesis:waypoints_plane").fly("pid", PIDExpert(), 0, 900, True)
+    recording = flown(scenario_setting("thesis:waypoints_plane"), 900)
     np.testing.assert_array_equal(recording.targets[:2], [[0, 10, 25], [0, 20, 15]])
 
 
 def looking_along_x():
-    return Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), 0.5)
+    return Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), Lens(80, 40, 0.5))
 
 
 def test_points_are_seen_where_they_are():
-    columns, rows, depth = looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]]), 80, 40).T
+    columns, rows, depth = looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]])).T
     np.testing.assert_allclose(columns, [40, 60, 40, 40])
     np.testing.assert_allclose(rows, [20, 20, 0, 20])
     np.testing.assert_allclose(depth, [4, 4, 4, 2])
@@ -129,17 +133,17 @@ clouds = st.lists(st.tuples(coordinates, coordinates, st.floats(10, 40)), min_si
 @settings(max_examples=50)
 def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(points, aspect, course):
     ahead = np.array([np.cos(course), np.sin(course), 0.0])
-    camera = framing_camera(points, 1.0, aspect, ahead)
-    forward, right, up = ((points - camera.eye) @ camera.axes.T).T
-    filled = np.stack([(np.abs(right) + 1.0) / (camera.slope * aspect), (np.abs(up) + 1.0) / camera.slope]) / forward
+    camera = framing_camera(points, 1.0, ahead, Lens(round(200 * aspect), 200))
+    forward, *across = ((points - camera.eye) @ camera.axes.T).T
+    filled = (np.abs(across) + 1.0) / camera.lens.slopes[:, None] / forward
     assert filled.max() == pytest.approx(1.0, abs=1e-6)
 
 
 def test_a_following_camera_never_loses_what_it_follows(fall):
-    points = [fall.state[:, step][np.array([[0, 1, 2], [17, 18, 19]])] for step in range(0, len(fall.times), 4)]
-    cameras = following_cameras(points, 0.04, 0.9, 1.0, np.array([0.0, 1.0, 0.0]))
+    points = [fall.state.array[:, step][np.array([[0, 1, 2], [17, 18, 19]])] for step in range(0, len(fall.times), 4)]
+    cameras = following_cameras(points, 0.04, 0.9, np.array([0.0, 1.0, 0.0]), Lens(100, 100))
     for camera, each in zip(cameras, points, strict=True):
-        columns, rows, _ = camera.project(each, 100, 100).T
+        columns, rows, _ = camera.project(each).T
         assert ((columns > 0) & (columns < 100) & (rows > 0) & (rows < 100)).all()
     eyes = np.array([camera.eye for camera in cameras])
     assert np.abs(np.diff(eyes, n=2, axis=0)).max() < 0.6  # m per frame²: no jolts
@@ -154,7 +158,7 @@ def test_sheets_suit_video_codecs():
     panels = [np.zeros((31, 41, 3), np.uint8)] * 4
     sheet = side_by_side(panels, columns=3)
     assert sheet.shape[0] % 2 == sheet.shape[1] % 2 == 0 and sheet.shape[0] >= 62 and sheet.shape[1] >= 123
-    assert with_header(panels[0], "pid", ["a", "b"], "#010203", 10).shape == (31 + header_height(2, 10), 41, 3)
+    assert with_header(panels[0], "pid", ["a", "b"], "#010203", 10).shape == (31 + 46, 41, 3)
 
 
 def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
@@ -175,7 +179,7 @@ def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
     view = sequence._view([fall, hit], [len(fall.times) - 1, 60], (300, 400))
     poses = sequence._apart(fall, len(fall.times) - 1, view)
     assert poses[0] == 0 and poses[-1] == len(fall.times) - 1 and len(poses) > 4
-    places, breadth = view.project(fall.path[poses])
+    places, breadth = view.project(fall.state.position[poses])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(len(poses), 1)]
     assert gaps.min() > 0.7 * breadth.min()
     assert hit.pushes[0] in sequence._apart(hit, 60, view)
@@ -189,7 +193,7 @@ def test_videos_hold_every_frame(tmp_path, name):
     import imageio.v2 as imageio
 
     frames = [np.full((48, 64, 3), 30 * k, np.uint8) for k in range(6)]
-    write_video(tmp_path / name, frames, 25)
+    write_film(tmp_path / name, frames)
     read = [np.asarray(frame) for frame in imageio.get_reader(tmp_path / name)]
     assert [frame.shape[:2] for frame in read] == [(48, 64)] * 6
     np.testing.assert_allclose([frame.mean() for frame in read], [30 * k for k in range(6)], atol=6)
@@ -204,7 +208,7 @@ def test_an_interrupted_video_leaves_what_was_there(tmp_path):
 
     (tmp_path / "film.mp4").write_bytes(b"earlier")
     with pytest.raises(KeyboardInterrupt):
-        write_video(tmp_path / "film.mp4", frames(), 25)
+        write_film(tmp_path / "film.mp4", frames())
     assert [entry.name for entry in tmp_path.iterdir()] == ["film.mp4"]
     assert (tmp_path / "film.mp4").read_bytes() == b"earlier"
 
@@ -321,8 +325,8 @@ def test_flights_are_shown_in_a_window():
 
 
 def test_targets_and_positions_are_where_the_pictures_look_for_them(hit):
-    np.testing.assert_array_equal(hit.state[np.r_[POSITION], 0], hit.path[0])
-    np.testing.assert_array_equal(hit.state[np.r_[TARGET], 0], hit.targets[0])
+    np.testing.assert_array_equal(hit.state.array[np.r_[POSITION], 0], hit.vehicle_and_target(0)[0])
+    np.testing.assert_array_equal(hit.state.array[np.r_[TARGET], 0], hit.vehicle_and_target(0)[1])
 
 
 @pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
@@ -349,12 +353,12 @@ def test_record_video_films_the_agent_of_a_run(run_folder, tmp_path, capsys):
 
 
 def test_episodes_side_by_side_have_one_seed_after_the_other():
-    setting = Setting.fixed(FlightSettings(task="state_recovery", max_episode_steps=5))
-    abreast = list(fly_all({"pid": PIDExpert()}, setting, 5, 10, True, n_envs=2))
-    alone = list(fly_all({"pid": PIDExpert()}, setting, 5, 20, True))
+    setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=5))
+    abreast = list(fly_all({"pid": PIDExpert()}, setting, 5, 10, n_envs=2))
+    alone = list(fly_all({"pid": PIDExpert()}, setting, 5, 20))
     assert [len(episode) for episode in abreast] == [2, 2]
     for ours, theirs in zip([each for episode in abreast for each in episode], alone, strict=True):
-        np.testing.assert_array_equal(ours.state, theirs[0].state)
+        np.testing.assert_array_equal(ours.state.array, theirs[0].state.array)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Text in pictures, in the font that comes with matplotlib."""
+"""Words in pictures, in the font that comes with matplotlib, and the colours that tell controllers apart."""
 
 from __future__ import annotations
 
@@ -13,10 +13,19 @@ from PIL import ImageDraw, ImageFont
 
 from sb3_quad.base.arrays import Image
 
+# Okabe and Ito's palette, which the colour-blind can read, less its black and its yellow, which drown on dark and on light
+# paper; a few moved.
+COLOURS = ("#1B7EC2", "#D55E00", "#009E73", "#B8548A", "#C88A00", "#3E9BD6", "#7A5BC0", "#7F7F7F")
 INK = (24, 32, 44)
 PLATE = (255, 255, 255, 205)
 STEP = 1.3  # between lines of text, in font sizes
 SMALLER = 0.88  # font size of what stands below a heading
+GAP = 4  # between pictures side by side, pixels
+
+
+def colours_of(names: Sequence[str]) -> dict[str, str]:
+    """A colour, as ``#rrggbb``, for each name, by its place: the same in every picture; after eight they repeat."""
+    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
 @cache
@@ -48,9 +57,8 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
 
     :param colour: as ``#rrggbb``.
     :param size: of the font, pixels.
-    :return: uint8; as wide, and higher by :func:`header_height`.
     """
-    band, bar = header_height(len(lines), size), 0.45 * size
+    band, bar = round((0.7 + STEP * (1 + len(lines))) * size), 0.45 * size
     image = Pillow.new("RGB", (pixels.shape[1], band + pixels.shape[0]), "white")
     image.paste(Pillow.fromarray(pixels), (0, band))
     draw = ImageDraw.Draw(image)
@@ -61,18 +69,13 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
     return np.asarray(image)
 
 
-def header_height(n_lines: int, size: int) -> int:
-    """The height of the band of :func:`with_header`, pixels."""
-    return round((0.7 + STEP * (1 + n_lines)) * size)
-
-
-def side_by_side(pictures: Sequence[Image], columns: int, gap: int = 4) -> Image:
+def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
     """Pictures of one size in rows of ``columns``, on white; even in width and height, as video codecs ask for."""
     height, width = pictures[0].shape[:2]
     rows, columns = -(-len(pictures) // columns), min(columns, len(pictures))
-    high, wide = rows * (height + gap) - gap, columns * (width + gap) - gap
+    high, wide = rows * (height + GAP) - GAP, columns * (width + GAP) - GAP
     sheet = np.full((high + high % 2, wide + wide % 2, 3), 255, dtype=np.uint8)
     for number, picture in enumerate(pictures):
-        top, left = (number // columns) * (height + gap), (number % columns) * (width + gap)
+        top, left = (number // columns) * (height + GAP), (number % columns) * (width + GAP)
         sheet[top : top + height, left : left + width] = picture
     return sheet

@@ -11,7 +11,6 @@ import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.bullet import p
-from sb3_quad.simulation.state import ROTOR_SPEEDS
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector: TypeAlias = tuple[float, float, float]
@@ -23,7 +22,6 @@ GREY: Colour = (0.55, 0.58, 0.62, 1.0)
 BLUE: Colour = (0.10, 0.36, 0.75, 1.0)
 FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
 WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
-REFERENCE_ARM = 0.24
 SLOWED = 12.0  # the drawn rotors turn that much slower than real ones, which would seem to stand or turn backwards in a film
 NOWHERE: Vector = (0.0, 0.0, -1000.0)
 
@@ -61,7 +59,7 @@ def add_mesh(mesh: Mesh, colour: Colour, client: int) -> int:
     return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
 
 
-def move_body(body: int, position: Sequence[float], quaternion: Sequence[float], client: int) -> None:
+def move_body(client: int, body: int, position: Sequence[float], quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
     """Move a body; the quaternion is (x, y, z, w), as PyBullet's are."""
     p.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
 
@@ -81,14 +79,9 @@ def span(vehicle: Vehicle) -> float:
     return arm_length(vehicle) + rotor_radius(vehicle)
 
 
-def scale_of(vehicle: Vehicle) -> float:
-    """The vehicle's size, in that of the default one; distances in pictures are multiples of it."""
-    return arm_length(vehicle) / REFERENCE_ARM
-
-
-def rotor_turning(vehicle: Vehicle, state: FloatArray) -> FloatArray:
-    """How fast the drawn rotors turn about body z, for the columns of ``state``, (STATE_SIZE, n): (4, n), rad/s."""
-    return np.asarray(-np.sign(vehicle.rotor_directions)[:, None] * state[ROTOR_SPEEDS] / SLOWED)
+def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
+    """How fast the drawn rotors turn about body z, from rotor speeds of any shape (..., 4), rad/s."""
+    return np.asarray(-np.sign(vehicle.rotor_directions) * speeds / SLOWED)
 
 
 def frame(arm: float, foot: float, centres: FloatArray) -> dict[Colour, list[Part]]:

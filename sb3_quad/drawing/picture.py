@@ -1,21 +1,20 @@
-"""Pictures of a PyBullet client: its software renderer before sky and ground, trails and turning rotors laid over it.
+"""What PyBullet does not draw: sky and ground behind its bodies, trails and turning rotors laid over them.
 
 Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its top.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from matplotlib.colors import to_rgb
 from PIL import Image as Pillow
 from PIL import ImageDraw
 
-from sb3_quad.base.arrays import Float32Array, FloatArray, Image
-from sb3_quad.base.bullet import p
-from sb3_quad.drawing.camera import Camera
+from sb3_quad.base.arrays import Float32Array, FloatArray
+from sb3_quad.drawing.camera import Camera, Lens
 
 NEAR, FAR = 0.05, 120.0
 SUPERSAMPLING = 2  # PyBullet's software renderer draws hard edges
@@ -33,49 +32,19 @@ class Overlay(NamedTuple):
     """What is laid over a picture: a line through points, or with no width the flat shape that they surround."""
 
     points: FloatArray  # (n, 3)
-    colour: Sequence[float]
+    colour: Any  # as matplotlib takes it
     opacity: float
     width: float | None = None  # m
 
 
-def take_picture(
-    client: int, camera: Camera, width: int, height: int, shadows: FloatArray, overlays: Sequence[Overlay]
-) -> Image:
-    """Draw everything in a client: uint8 (height, width, 3).
+def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
+    """Sky, and chequered ground with shadows and haze, (height, width, 3).
 
     :param shadows: centre x, y and radius of each shadow on the ground, (k, 3).
-    :param overlays: are drawn in this order, each hidden by the bodies before it.
     """
-    wide, high = SUPERSAMPLING * width, SUPERSAMPLING * height
-    forward, _, up = camera.axes
-    _, _, pixels, buffer, names = p.getCameraImage(
-        wide,
-        high,
-        p.computeViewMatrix(camera.eye.tolist(), (camera.eye + forward).tolist(), up.tolist()),
-        p.computeProjectionMatrixFOV(2.0 * math.degrees(math.atan(camera.slope)), wide / high, NEAR, FAR),
-        lightDirection=(np.array([1.2, 0.6, 6.0]) - 3.0 * forward).tolist(),
-        shadow=0,
-        lightAmbientCoeff=0.62,
-        lightDiffuseCoeff=0.45,
-        lightSpecularCoeff=0.08,
-        renderer=p.ER_TINY_RENDERER,
-        physicsClientId=client,
-    )
-    # Without numpy at PyBullet's build time these are flat tuples.
-    drawn = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
-    drawn[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
-    depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
-    both = Pillow.alpha_composite(Pillow.fromarray(drawn), draw_overlays(overlays, camera, depth))
-    small = np.asarray(both.reduce(SUPERSAMPLING), dtype=np.float32)
-    behind = 255.0 * backdrop(camera, width, height, shadows)
-    return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
-
-
-def backdrop(camera: Camera, width: int, height: int, shadows: FloatArray) -> Float32Array:
-    """Sky, and chequered ground with shadows and haze, (height, width, 3); the arguments as of :func:`take_picture`."""
-    axes = camera.axes.astype(np.float32)
-    x = np.float32(camera.slope / height) * (2.0 * np.arange(width, dtype=np.float32) + 1.0 - width)
-    y = np.float32(camera.slope / height) * (height - 1.0 - 2.0 * np.arange(height, dtype=np.float32))
+    axes, (width, height, slope) = camera.axes.astype(np.float32), camera.lens
+    x = np.float32(slope / height) * (2.0 * np.arange(width, dtype=np.float32) + 1.0 - width)
+    y = np.float32(slope / height) * (height - 1.0 - 2.0 * np.arange(height, dtype=np.float32))
     rise = axes[0, 2] + y * axes[2, 2]  # of a row's rays, whose part along forward is 1; a camera without roll
     share = np.clip(1.6 * rise / np.sqrt(1.0 + y * y), 0.0, 1.0)
     picture = np.repeat((SKY_HORIZON + share[:, None] * (SKY_ZENITH - SKY_HORIZON))[:, None], width, axis=1)
@@ -88,7 +57,7 @@ def backdrop(camera: Camera, width: int, height: int, shadows: FloatArray) -> Fl
     north = eye_y + along * (axes[0, 1] + x * axes[1, 1] + y * axes[2, 1])
     distance = along * np.sqrt(1.0 + x * x + y * y)
     # What a pixel covers of the ground, in squares; finer squares blur into their mean instead of flickering.
-    footprint = along * along * (2.0 * camera.slope / height / eye_z / SQUARE)
+    footprint = along * along * (2.0 * slope / height / eye_z / SQUARE)
     soft = np.maximum(0.5 * np.pi * footprint, 0.02)
     wave = np.clip(np.sin(np.pi / SQUARE * east) / soft, -1.0, 1.0) * np.clip(np.sin(np.pi / SQUARE * north) / soft, -1.0, 1.0)
     dark = 0.5 + 0.5 * wave * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
@@ -107,15 +76,15 @@ def draw_overlays(overlays: Sequence[Overlay], camera: Camera, depth: Float32Arr
     high, wide = depth.shape
     picture, away = Pillow.new("RGBA", (wide, high)), Pillow.new("F", (wide, high), np.inf)
     draw, draw_away = ImageDraw.Draw(picture), ImageDraw.Draw(away)
+    larger = camera._replace(lens=Lens(wide, high, camera.lens.slope))
     for overlay in overlays:
-        screen = camera.project(overlay.points, wide, high)
+        screen = larger.project(overlay.points)
         if overlay.width is None:
-            polygons = np.stack(
-                [np.broadcast_to(screen.mean(axis=0), screen.shape), screen, np.roll(screen, 1, axis=0)], axis=1
-            )
+            centre = np.broadcast_to(screen.mean(axis=0), screen.shape)
+            polygons = np.stack([centre, screen, np.roll(screen, 1, axis=0)], axis=1)
         else:
-            polygons = _ribbon(screen, overlay.width * high / (2.0 * camera.slope))
-        colour = tuple(round(255 * part) for part in (*overlay.colour[:3], overlay.opacity))
+            polygons = _ribbon(screen, overlay.width * high / (2.0 * camera.lens.slope))
+        colour = tuple(round(255 * part) for part in (*to_rgb(overlay.colour), overlay.opacity))
         for polygon in polygons[(polygons[:, :, 2] > NEAR).all(axis=1)]:
             corners = polygon[:, :2].clip(-1e4, 1e4).ravel().tolist()
             draw.polygon(corners, fill=colour)

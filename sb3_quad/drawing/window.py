@@ -21,8 +21,9 @@ def has_display() -> bool:
 
 
 def open_window(width: int, height: int) -> int:
-    """Open PyBullet's window, of ``width`` and ``height`` pixels; its client.
+    """Open PyBullet's window, with a ground and without controls; it draws nothing until :func:`start_drawing`.
 
+    :return: its client.
     :raises ConfigError: there is one already in this process, or it cannot be opened.
     """
     sky = "--background_color_red=0.70 --background_color_green=0.82 --background_color_blue=0.93"
@@ -32,22 +33,17 @@ def open_window(width: int, height: int) -> int:
         raise ConfigError("render_mode 'human': PyBullet opens one window per process, and one is open already") from None
     if client < 0:
         raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
-    return client
-
-
-def furnish_window(client: int) -> None:
-    """Give a window a ground, and hide its controls; it does not draw until :func:`start_drawing`."""
-    hidden = (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS)
-    for option in hidden:
+    for option in (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS):
         p.configureDebugVisualizer(option, 0, physicsClientId=client)
     plane = f"{pybullet_data.getDataPath()}/plane.urdf"
     ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)
     p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=client)
     p.changeVisualShape(ground, -1, specularColor=(0.1, 0.1, 0.1), physicsClientId=client)
+    return client
 
 
 def start_drawing(client: int) -> None:
-    """Let a furnished window show what is in it."""
+    """Let a window show what is in it."""
     p.configureDebugVisualizer(p.COV_ENABLE_RENDERING, 1, physicsClientId=client)
 
 
@@ -63,3 +59,9 @@ def point_window(client: int, camera: Camera, towards: FloatArray) -> None:
         physicsClientId=client,
     )
     p.configureDebugVisualizer(p.COV_ENABLE_SINGLE_STEP_RENDERING, 1, physicsClientId=client)
+
+
+def disconnect(client: int) -> None:
+    """Close a window or another client, unless that has been done, as by shutting the window."""
+    if p.isConnected(client):
+        p.disconnect(client)

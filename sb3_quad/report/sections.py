@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_quad.drawing.palette import colours_of
+from sb3_quad.drawing.labels import colours_of
 from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, measured_cells, metric_rows, reference_cells, scenario_groups
 from sb3_quad.evaluation.records import Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table

@@ -1,88 +1,94 @@
-"""What is flown to be shown: episodes that are the same for all controllers."""
+"""What is flown to be shown, by whom, and how it is recorded: the same episodes for all controllers, on PyBullet."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
+from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
-from sb3_quad.evaluation.flights import Plan
+from sb3_quad.drawing.labels import COLOURS
+from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
 from sb3_quad.evaluation.scenario_flights import flown_as
+from sb3_quad.experts.controller import observation_function
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.scenarios.parts import Wrench
 from sb3_quad.scenarios.sample import Generators, sample_episodes, sample_wrenches
-from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.recording import Recording, record
+from sb3_quad.show.recording import Recording
 from sb3_quad.simulation.checks import vector
+from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
+from sb3_quad.training.runs import find_run
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
-@dataclass(frozen=True, eq=False)
-class Setting:
-    """What all controllers fly: some settings with a fixed target and wrench, or a scenario."""
+def find_agent(
+    log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None
+) -> tuple[str, Path, FlightSettings]:
+    """The agent of a run, by rl-zoo's names: a label, its zip, and the settings that it was judged with.
 
-    settings: FlightSettings
-    plan: Plan = field(default_factory=Plan)
-    scenario: Scenario | None = None
-
-    @staticmethod
-    def fixed(settings: FlightSettings, target: Sequence[float] | None = None, wrench: Wrench | None = None) -> Setting:
-        """Episodes of some settings.
-
-        :param target: r_T, (3,), m; None: the episode's own.
-        :raises ConfigError: an unknown vehicle, a target that is none.
-        """
-        vehicle = load_vehicle(settings.vehicle)
-        start = {} if target is None else {"target": _target(target, vehicle)[None]}
-        wrenches = [] if wrench is None else [wrench]
-        return Setting(settings, Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0]))))
-
-    @staticmethod
-    def of_scenario(text: str) -> Setting:
-        """A scenario by ``suite:name``.
-
-        :raises ConfigError: an unknown suite or name.
-        """
-        suite, colon, name = text.rpartition(":")
-        if not colon:
-            raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
-        scenario = load_suite(suite).scenario(name)
-        n_steps = round(scenario.duration / scenario.flown_vehicle().control_step)
-        settings = FlightSettings(vehicle=scenario.vehicle, max_episode_steps=n_steps)
-        return Setting(settings, scenario=scenario)
-
-    def fly(self, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:
-        """One episode.
-
-        :param n_steps: control steps, at most.
-        :raises ConfigError: settings that the environment refuses.
-        :raises ControllerError: a controller that fails in flight.
-        """
-        settings, plan = self.settings, self.plan
-        if self.scenario is not None:
-            settings, plan = flown_as(sample_episodes(self.scenario, [seed]))
-        return record(name, controller, settings.with_changes(max_episode_steps=n_steps), seed, plan, deterministic)
-
-
-def make_wrench(
-    force: Sequence[float] | None, torque: Sequence[float] | None, start: float, duration: float | None
-) -> Wrench | None:
-    """A push; None if neither force nor torque is given.
-
-    :param force: world frame, N; ``torque``: body frame, N m.
-    :param start: s; ``duration``: s, None: to the end.
-    :raises ConfigError: a value that is none.
+    :param exp_id: number of the run; 0: the latest.
+    :param which: ``best``, ``last checkpoint``, or the timesteps of a checkpoint; None: trimmed, else best, else last.
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
     """
-    if force is None and torque is None:
-        return None
-    given = {"start": start, "duration": duration, "force": force or (0.0, 0.0, 0.0), "torque": torque or (0.0, 0.0, 0.0)}
-    return validate(Wrench, given, "the push")
+    run = find_run(log_folder, algo, env_id, exp_id)
+    if isinstance(which, int):
+        path = run.checkpoint(which)
+    elif which == "last checkpoint":
+        path = run.latest_checkpoint()
+    else:
+        path = run.best_model if which == "best" else run.result
+    if not path.is_file():
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
+    settings, _ = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
+    return f"{algo} {run.path.name}", path, run.flight_settings()
+
+
+class Setting(NamedTuple):
+    """What all controllers fly."""
+
+    vehicle: Any  # that experts are made for; in a scenario another one may fly
+    episode: Callable[[int], tuple[FlightSettings, Plan]]  # by seed: how it is flown, and what happens in it
+
+
+def fixed_setting(
+    settings: FlightSettings, target: Sequence[float] | None = None, push: Mapping[str, Any] | None = None
+) -> Setting:
+    """Episodes of some settings, all with the same target and the same push.
+
+    :param target: r_T, (3,), m; None: the episode's own.
+    :param push: fields of a :class:`~sb3_quad.scenarios.parts.Wrench`; none: there is no push.
+    :raises ConfigError: an unknown vehicle, a target below ground, a push that is none.
+    """
+    vehicle = load_vehicle(settings.vehicle)
+    start = {}
+    if target is not None:
+        start["target"] = vector("--target", target, 3)[None]
+        if target[2] <= vehicle.collision_radius:
+            raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
+    wrenches = [validate(Wrench, push, "the push")] if push else []
+    plan = Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0])))
+    return Setting(settings.vehicle, lambda seed: (settings, plan))
+
+
+def scenario_setting(text: str) -> Setting:
+    """Episodes of a scenario, named by ``suite:name``.
+
+    :raises ConfigError: an unknown suite or name.
+    """
+    suite, colon, name = text.rpartition(":")
+    if not colon:
+        raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
+    scenario = load_suite(suite).scenario(name)
+    return Setting(scenario.vehicle, lambda seed: flown_as(sample_episodes(scenario, [seed])))
 
 
 def fly_all(
@@ -90,40 +96,67 @@ def fly_all(
     setting: Setting,
     seed: int,
     n_timesteps: int | None,
-    deterministic: bool,
+    deterministic: bool = True,
     n_envs: int = 1,
 ) -> Iterator[list[Recording]]:
     """Episodes one after the other, each flown by all controllers.
 
+    :param controllers: by label; each as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param seed: of the first episode; the next has the next one.
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
     :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
-    :raises ConfigError: a number of steps or of episodes below one, keywords that the environment refuses.
+    :raises ConfigError: a number of steps or of episodes below one, settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
-    left = setting.settings.max_episode_steps if n_timesteps is None else n_timesteps
-    if left < 1:
-        raise ConfigError(f"--n-timesteps {left}: must be at least 1")
-    if n_envs < 1:
-        raise ConfigError(f"--n-envs {n_envs}: must be at least 1")
-    number = 0
-    while left > 0 and (number == 0 or n_timesteps is not None):
-        steps = min(left, setting.settings.max_episode_steps)
-        episode = []
+    longest = setting.episode(seed)[0].max_episode_steps
+    left = longest if n_timesteps is None else n_timesteps
+    for flag, number in (("--n-timesteps", left), ("--n-envs", n_envs)):
+        if number < 1:
+            raise ConfigError(f"{flag} {number}: must be at least 1")
+    while left > 0:
+        together: list[Recording] = []
         for name, controller in controllers.items():
-            for each in range(seed + number, seed + number + n_envs):
-                label = name if n_envs == 1 else f"seed {each}, {name}"
+            sampling = hasattr(controller, "predict") and not deterministic
+            flown = observation_function(controller, deterministic=False) if sampling else controller
+            for each in range(seed, seed + n_envs):
+                label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
+                settings, plan = setting.episode(each)
                 try:
-                    episode.append(setting.fly(label, controller, each, steps, deterministic))
+                    settings = settings.with_changes(max_episode_steps=min(left, longest))
+                    together.append(_record(label, colour, flown, settings, plan, each))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
-        yield episode
-        left -= max(len(recording.times) - 1 for recording in episode)
-        number += n_envs
+        yield together
+        if n_timesteps is None:
+            return
+        left -= max(len(recording.times) - 1 for recording in together)
+        seed += n_envs
 
 
-def _target(target: Sequence[float], vehicle: Vehicle) -> npt.NDArray[np.float64]:
-    position = vector("--target", target, 3)
-    if position[2] <= vehicle.collision_radius:
-        raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
-    return np.asarray(position)
+def _record(name: str, colour: str, controller: Any, settings: FlightSettings, plan: Plan, seed: int) -> Recording:
+    every = _EveryStep()
+    flights = fly_settings(controller, settings, [seed], "pybullet", (), [every], plan)
+    wrench = np.zeros((len(every.states), WRENCH_SIZE))
+    for first, values in sorted(plan.wrenches.items()):
+        wrench[first + 1 :] = values
+    return Recording(
+        name=name,
+        colour=colour,
+        vehicle=every.vehicle,
+        times=np.arange(len(every.states), dtype=np.float64) * every.vehicle.control_step,
+        state=QuadcopterState.concatenate(every.states),
+        wrench=wrench,
+        reward=float(flights.reward[0]),
+        lost="" if flights.success[0] else "collision" if flights.collision[0] else "out of range",
+    )
+
+
+class _EveryStep(Hook):
+    """Keeps the state after every control step of a flight, and before the first."""
+
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self.vehicle, self.states = vehicle, [state.copy()]
+
+    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+        self.states.append(state.copy())

@@ -1,19 +1,29 @@
-"""Recorded flights as the frames of a film: a panel for each, its camera following vehicle and target."""
+"""Recorded flights in motion: a film with a panel for each, or PyBullet's window with all vehicles together, in real time."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+import tempfile
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.colors import to_rgb
 
 from sb3_quad.base.arrays import FloatArray, Image
-from sb3_quad.drawing.camera import Camera, broadside, following_cameras, framing_camera
+from sb3_quad.base.bullet import p
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.extras import require
+from sb3_quad.base.files import write_bytes
+from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
 from sb3_quad.drawing.labels import side_by_side, with_header
-from sb3_quad.drawing.palette import colours_of, rgb
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
+from sb3_quad.drawing.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.recording import Recording
-from sb3_quad.simulation.state import TARGET
 
 FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s
@@ -21,6 +31,41 @@ MARGIN = 0.9  # around vehicle and target, m, for a vehicle of the default one's
 PANELS_ABREAST = 3
 SMALL = 0.2  # a vehicle whose breadth is less of the picture's height is shown from near as well
 CLOSE_UP, GAP = 0.34, 8  # side of that picture, of the panel's; its distance from the edges, pixels
+WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
+MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+FORMATS = (".mp4", ".gif")
+
+
+def check_film(path: Path) -> Any:
+    """See whether a film can be written, before anything is flown; the package that writes it.
+
+    :raises ConfigError: the suffix is not one of FORMATS, or the packages that write videos are missing.
+    """
+    if path.suffix.lower() not in FORMATS:
+        raise ConfigError(f"{path}: must end in {' or '.join(FORMATS)}")
+    require("imageio_ffmpeg", "video", "a video")
+    return require("imageio.v2", "video", "a video")
+
+
+def write_film(path: Path, frames: Iterable[Image]) -> None:
+    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves what was there before.
+
+    :raises ConfigError: a folder that cannot be written, a full disk, missing packages.
+    """
+    imageio = check_film(path)
+    suffix = path.suffix.lower()
+    options = {"fps": FPS, **MP4} if suffix == ".mp4" else {"duration": 1000 / FPS, "loop": 0}
+    # Not beside the file: when it is interrupted, the encoder may still be writing for a moment.
+    with tempfile.TemporaryDirectory(prefix="sb3_quad_", ignore_cleanup_errors=True) as folder:
+        draft = Path(folder, f"film{suffix}")
+        try:
+            with imageio.get_writer(draft, **options) as writer:
+                for frame in frames:
+                    writer.append_data(frame)
+            content = draft.read_bytes()
+        except OSError as error:
+            raise ConfigError(f"{path}: cannot be encoded ({error.strerror or error})") from error
+    write_bytes(path, content)
 
 
 def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
@@ -38,68 +83,98 @@ def film_frames(recordings: Sequence[Recording], width: int, height: int, speed:
     """
     times = frame_times(recordings, speed)
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    colours = colours_of([recording.name for recording in recordings])
-    panels = [_Panel(each, times, forward, colours[each.name], width, height) for each in recordings]
+    panels = [_panel(recording, times, forward, Lens(width, height)) for recording in recordings]
+    for pictures in zip(*panels, strict=True):
+        yield side_by_side(pictures, PANELS_ABREAST)
+
+
+def _panel(recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens) -> Iterator[Image]:
+    """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
+    steps = [recording.at(seconds) for seconds in times]
+    seen = [recording.vehicle_and_target(step) for step in steps]
+    frame_seconds, font_size = max(float(times[1] - times[0]), 1e-3), max(12, round(lens.height / 26))
+    side = round(CLOSE_UP * min(lens.width, lens.height))
+    with closing(Scene(recording.vehicle)) as scene:
+        cameras = following_cameras(seen, frame_seconds, MARGIN * scene.scale, forward, lens)
+        corner = _free_corner(cameras, seen, side)
+        shown = None
+        for step, camera in zip(steps, cameras, strict=True):
+            if shown != (key := (step, camera.eye.round(3).tolist())):
+                shown, pixels = key, _draw(recording, step, scene, camera, corner, side)
+                picture = with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
+            yield picture
+
+
+def _draw(recording: Recording, step: int, scene: Scene, camera: Camera, corner: tuple[int, int], side: int) -> Image:
+    """A picture of one step; where the vehicle is small, with a close-up in a corner."""
+    path, (left, top) = recording.state.position, corner
+    scene.place([recording.pose(step)], recording.state.target[[step]])
+    trail = Overlay(path[: step + 1 : 2], recording.colour, 0.75, width=0.03 * scene.scale)
+    pixels = scene.picture(camera, [trail])
+    if scene.span < SMALL * float((path[step] - camera.eye) @ camera.axes[0]) * camera.lens.slope:
+        near = framing_camera(path[[step]], 1.15 * scene.span, camera.axes[0], Lens(side, side))
+        pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
+        pixels[top : top + side, left : left + side] = scene.picture(near, [trail])
+    return pixels
+
+
+def _free_corner(cameras: Sequence[Camera], seen: Sequence[FloatArray], side: int) -> tuple[int, int]:
+    """Left and top of a close-up, in the corner in which the points that are ``seen`` are least."""
+    spots = np.concatenate([camera.project(points)[:, :2] for camera, points in zip(cameras, seen, strict=True)])
+    right, bottom, half = cameras[0].lens.width - side - GAP, cameras[0].lens.height - side - GAP, side / 2
+    corners = [(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)]
+    return min(corners, key=lambda corner: int((np.abs(spots - corner - half) < half + GAP).all(axis=1).sum()))
+
+
+def _caption(recording: Recording, step: int) -> str:
+    seconds = f"{recording.times[step]:5.2f} s"
+    if step == len(recording.times) - 1 and recording.lost:
+        return f"{seconds}   {recording.lost}"
+    force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
+    push = f"   force {force:.1f} N" if force else ""
+    height = recording.state.position[step, 2]
+    return f"{seconds}   {recording.state.distance[step]:.2f} m from target   {height:.1f} m high{push}"
+
+
+def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float) -> None:
+    """Show episodes one after the other, until the window is shut; flights of one start together.
+
+    :raises ConfigError: the window cannot be opened.
+    """
+    client = open_window(width, height)
     try:
-        for number in range(len(times)):
-            yield side_by_side([panel.picture(number) for panel in panels], PANELS_ABREAST)
+        n = len(episodes[0])
+        scene = Scene(episodes[0][0].vehicle, client, n_vehicles=n, n_targets=n)
+        start_drawing(client)
+        for recordings in episodes:
+            p.removeAllUserDebugItems(physicsClientId=client)
+            _play(scene, recordings, Lens(width, height, WINDOW_SLOPE), speed)
+    except p.error:
+        if p.isConnected(client):  # else the window has been shut
+            raise
     finally:
-        for panel in panels:
-            panel.scene.close()
+        disconnect(client)
 
 
-class _Panel:
-    """One flight of a film, at the given times (s) of its frames, seen along ``forward``, (3,)."""
-
-    def __init__(
-        self, recording: Recording, times: FloatArray, forward: FloatArray, colour: str, width: int, height: int
-    ) -> None:
-        self.recording, self.colour, self.forward = recording, colour, forward
-        self.width, self.height, self.side = width, height, round(CLOSE_UP * min(width, height))
-        self.steps = [recording.at(seconds) for seconds in times]
-        self.scene = Scene(recording.vehicle)
-        seen = [recording.vehicle_and_target(step) for step in self.steps]
-        frame_seconds = max(float(times[1] - times[0]), 1e-3)
-        self.cameras = following_cameras(seen, frame_seconds, MARGIN * self.scene.scale, width / height, forward)
-        self.corner = self._free_corner(seen)
-        self.shown: tuple[object, Image] | None = None
-
-    def picture(self, number: int) -> Image:
-        """Frame ``number`` of this flight."""
-        step, camera = self.steps[number], self.cameras[number]
-        key = step, camera.eye.round(3).tolist()
-        if self.shown is None or self.shown[0] != key:
-            lines = [self._caption(step)]
-            font_size = max(12, round(self.height / 26))
-            self.shown = key, with_header(self._draw(step, camera), self.recording.name, lines, self.colour, font_size)
-        return self.shown[1]
-
-    def _draw(self, step: int, camera: Camera) -> Image:
-        recording, scene, side = self.recording, self.scene, self.side
-        scene.place([recording.pose(step)], recording.state[None, TARGET, step])
-        trail = Overlay(recording.path[: step + 1 : 2], rgb(self.colour), 0.75, width=0.03 * scene.scale)
-        pixels = scene.picture(camera, self.width, self.height, [trail])
-        position = recording.path[step]
-        if scene.span < SMALL * float((position - camera.eye) @ camera.axes[0]) * camera.slope:
-            near = framing_camera(position[None], 1.15 * scene.span, 1.0, self.forward)
-            left, top = self.corner
-            pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
-            pixels[top : top + side, left : left + side] = scene.picture(near, side, side, [trail])
-        return pixels
-
-    def _free_corner(self, seen: Sequence[FloatArray]) -> tuple[int, int]:
-        """Left and top of the close-up, in the corner in which vehicle and target are seen least."""
-        pairs = zip(self.cameras, seen, strict=True)
-        spots = np.concatenate([camera.project(points, self.width, self.height)[:, :2] for camera, points in pairs])
-        right, bottom, half = self.width - self.side - GAP, self.height - self.side - GAP, self.side / 2
-        corners = [(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)]
-        return min(corners, key=lambda corner: int((np.abs(spots - corner - half) < half + GAP).all(axis=1).sum()))
-
-    def _caption(self, step: int) -> str:
-        recording = self.recording
-        if step == len(recording.times) - 1 and recording.lost:
-            return f"{recording.times[-1]:5.2f} s   {recording.lost}"
-        force = float(np.linalg.norm(recording.wrench_around(step)[:6]))
-        push = f"   force {force:.1f} N" if force else ""
-        height = recording.path[step, 2]
-        return f"{recording.times[step]:5.2f} s   {recording.error[step]:.2f} m from target   {height:.1f} m high{push}"
+def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
+    times, client = frame_times(recordings, speed), scene.client
+    seen = [np.concatenate([each.vehicle_and_target(each.at(seconds)) for each in recordings]) for seconds in times]
+    forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
+    cameras = following_cameras(seen, speed / FPS, MARGIN * scene.scale, forward, lens)
+    drawn_to, labels = [0] * len(recordings), [-1] * len(recordings)
+    begun, number = time.perf_counter(), 0
+    while number < len(times):
+        now = [(recording, recording.at(times[number])) for recording in recordings]
+        targets = np.stack([recording.state.target[step] for recording, step in now])
+        scene.place([recording.pose(step) for recording, step in now], targets)
+        for k, (recording, step) in enumerate(now):
+            if step > drawn_to[k]:
+                ends, colour = recording.state.position[[drawn_to[k], step]], to_rgb(recording.colour)
+                p.addUserDebugLine(*ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client)
+                above = (ends[1] + (0.0, 0.0, 0.6 * scene.scale)).tolist()
+                look = {"textColorRGB": colour, "textSize": 1.2, "replaceItemUniqueId": labels[k]}
+                labels[k] = p.addUserDebugText(recording.name, above, physicsClientId=client, **look)
+                drawn_to[k] = step
+        point_window(client, cameras[number], seen[number].mean(axis=0))
+        number = max(number + 1, int((time.perf_counter() - begun) * FPS))  # frames that come too late are left out
+        time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import closing
+from typing import NamedTuple
 
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, FloatArray, Image
-from sb3_quad.drawing.camera import Camera, broadside, framing_camera
+from sb3_quad.drawing.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_tags
 from sb3_quad.drawing.models import span
-from sb3_quad.drawing.palette import colours_of, rgb
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
 from sb3_quad.show.recording import Recording
@@ -23,20 +23,17 @@ LARGEST = 6.0  # how much larger than life it is drawn at most
 APART = 0.8  # least distance between poses in the picture, in the vehicle's drawn breadth
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
+class _View(NamedTuple):
     """How all panels of a sequence are seen."""
 
     camera: Camera
-    width: int
-    height: int
     size: float  # how much larger than life vehicles are drawn
     breadth: float  # of a drawn vehicle, m
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Where points, (n, 3), are in the picture, (n, 2), and how broad vehicles are there, (n,); pixels."""
-        screen = self.camera.project(points, self.width, self.height)
-        return screen[:, :2], self.breadth * self.height / (2.0 * self.camera.slope * screen[:, 2])
+        screen, lens = self.camera.project(points), self.camera.lens
+        return screen[:, :2], self.breadth * lens.height / (2.0 * lens.slope * screen[:, 2])
 
 
 def sequence(
@@ -50,33 +47,32 @@ def sequence(
     """
     ends = [_end(recording) if times is None else recording.at(max(times)) for recording in recordings]
     view = _view(recordings, ends, size)
-    colours = colours_of([recording.name for recording in recordings])
     panels = []
     for recording, end in zip(recordings, ends, strict=True):
         steps = _apart(recording, end, view) if times is None else sorted({recording.at(seconds) for seconds in times})
-        panels.append(_panel(recording, steps, end, view, colours[recording.name]))
+        panels.append(_panel(recording, steps, end, view))
     return side_by_side(panels, columns=len(panels))
 
 
 def _end(recording: Recording) -> int:
     """The step after which the vehicle stays at its target, or the last one."""
-    away = np.flatnonzero(recording.error > SETTLED)
+    away = np.flatnonzero(recording.state.distance > SETTLED)
     return min(int(away[-1]) + 1 if away.size else 0, len(recording.times) - 1)
 
 
 def _view(recordings: Sequence[Recording], ends: Sequence[int], size: tuple[int, int] | None) -> _View:
-    paths = [recording.path[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
+    paths = [recording.state.position[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
     points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
     forward = broadside(points)
-    width, height = size or _proportions(points, forward)
+    lens = Lens(*(size or _proportions(points, forward)))
     breadth = 2.0 * span(recordings[0].vehicle)
     enlarged = 1.0
     for _ in range(20):  # a larger vehicle needs a camera farther away
-        camera = framing_camera(points, 0.6 * enlarged * breadth, width / height, forward)
+        camera = framing_camera(points, 0.6 * enlarged * breadth, forward, lens)
         depth = float(np.median((points - camera.eye) @ camera.axes[0]))
-        wanted = VEHICLE_SHARE * 2.0 * camera.slope * depth / breadth
+        wanted = VEHICLE_SHARE * 2.0 * lens.slope * depth / breadth
         enlarged = float(np.clip(0.5 * (enlarged + wanted), 1.0, LARGEST))
-    return _View(camera, width, height, enlarged, enlarged * breadth)
+    return _View(camera, enlarged, enlarged * breadth)
 
 
 def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
@@ -89,7 +85,7 @@ def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
 
 def _apart(recording: Recording, end: int, view: _View) -> list[int]:
     """Steps whose poses do not hide one another: each is the first that is clear of those before it."""
-    places, breadth = view.project(recording.path[: end + 1])
+    places, breadth = view.project(recording.state.position[: end + 1])
 
     def clear_of(steps: Sequence[int], step: int) -> BoolArray:
         return np.asarray(np.linalg.norm(places[steps] - places[step], axis=1) > APART * breadth[step])
@@ -104,47 +100,42 @@ def _apart(recording: Recording, end: int, view: _View) -> list[int]:
     return chosen
 
 
-def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View, colour: str) -> Image:
-    scene = Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)
-    scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
-    trail = Overlay(recording.path[: end + 1], rgb(colour), 0.85, width=0.05 * view.breadth)
-    pixels = scene.picture(view.camera, view.width, view.height, [trail])
-    scene.close()
-    size = max(12, round(view.height / 34))
+def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) -> Image:
+    trail = Overlay(recording.state.position[: end + 1], recording.colour, 0.85, width=0.05 * view.breadth)
+    with closing(Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)) as scene:
+        scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
+        pixels = scene.picture(view.camera, [trail])
+    size = max(12, round(view.camera.lens.height / 34))
     tag = round(0.92 * size)
     pixels = with_tags(pixels, _time_tags(recording, steps, view, tag), tag)
-    lines = [_outcome(recording, end)]
+    if recording.lost:
+        lines = [f"{recording.lost} after {recording.times[-1]:.2f} s"]
+    elif end < len(recording.times) - 1:
+        lines = [f"within {SETTLED:g} m of its target from {recording.times[end]:.2f} s on"]
+    else:
+        lines = [f"{recording.state.distance[end]:.2f} m from its target after {recording.times[end]:.2f} s"]
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
-    return with_header(pixels, recording.name, lines, colour, size)
+    return with_header(pixels, recording.name, lines, recording.colour, size)
 
 
 def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
     """The time of each pose and where it is written: at the first place beside it that is inside the picture and free."""
-    places, breadth = view.project(recording.path[list(steps)])
-    centres, halves = list(places), [np.full(2, 0.35 * each) for each in breadth]  # of what must not be hidden
+    places, breadth = view.project(recording.state.position[list(steps)])
     # Left of a steep path, above a level one, else around the pose from there.
     turns = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
     angles = turns + (np.pi if np.ptp(places[:, 1]) > np.ptp(places[:, 0]) else -np.pi / 2)
     sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    taken = [(place, np.full(2, 0.35 * each)) for place, each in zip(places, breadth, strict=True)]  # centre, half the size
     tags = []
     for step, place, reach in zip(steps, places, 0.5 * breadth, strict=True):
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array(tag_size(text, size))
         around = place + sides * (reach + 0.4 * size + half)
-        free = (around >= half).all(axis=1) & (around <= (view.width, view.height) - half).all(axis=1)
-        for centre, other in zip(centres, halves, strict=True):
+        free = (around >= half).all(axis=1) & (around <= view.camera.lens[:2] - half).all(axis=1)
+        for centre, other in taken:
             free &= (np.abs(around - centre) >= half + other).any(axis=1)
         chosen = around[int(np.argmax(free))]
-        centres.append(chosen)
-        halves.append(half)
+        taken.append((chosen, half))
         tags.append((text, (float(chosen[0]), float(chosen[1]))))
     return tags
-
-
-def _outcome(recording: Recording, end: int) -> str:
-    if recording.lost:
-        return f"{recording.lost} after {recording.times[-1]:.2f} s"
-    if end < len(recording.times) - 1:
-        return f"within {SETTLED:g} m of its target from {recording.times[end]:.2f} s on"
-    return f"{recording.error[end]:.2f} m from its target after {recording.times[end]:.2f} s"

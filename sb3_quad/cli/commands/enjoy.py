@@ -23,13 +23,10 @@ from sb3_quad.evaluation.controllers import build, parse_controllers
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.agents import Agent, find_agent
-from sb3_quad.show.episodes import Setting, fly_all, make_wrench
-from sb3_quad.show.film import FPS, film_frames, frame_times
+from sb3_quad.show.episodes import Setting, find_agent, fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
 from sb3_quad.show.recording import Recording
 from sb3_quad.show.sequence import sequence
-from sb3_quad.show.video import check_video, write_video
-from sb3_quad.show.window import show_in_window
 from sb3_quad.simulation.checks import check_size
 
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
@@ -65,14 +62,15 @@ def known_environment(options: argparse.Namespace) -> str:
     return str(env_id)
 
 
-def chosen_agent(options: argparse.Namespace) -> Agent:
+def chosen_agent(options: argparse.Namespace) -> tuple[str, Path, FlightSettings]:
     """The agent of record-video's ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
+    :return: a label, its zip, and the settings that it was judged with.
     :raises ConfigError: there is no such run or agent.
     """
     if options.trained_agent is not None:
         path = Path(options.trained_agent)
-        return Agent(path.stem, path, FlightSettings())
+        return path.stem, path, FlightSettings()
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # says so if there is none of that name
     return find_agent(options.folder, options.algo, known_environment(options), options.exp_id, options.which)
@@ -93,7 +91,7 @@ def _check(options: argparse.Namespace, window: bool) -> None:
     if options.times is not None and min(options.times) < 0:
         raise ConfigError("--times: must not be negative")
     if options.record:
-        check_video(Path(options.record))
+        check_film(Path(options.record))
         refuse_existing(options.record, options.overwrite)
     if options.sequence:
         if Path(options.sequence).suffix.lower() != ".png":
@@ -108,22 +106,24 @@ def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
     env_id = known_environment(options)
     given = pairs(options.env_kwargs, "--env-kwargs")
     agent = chosen_agent(options) if options.algo or options.trained_agent else None
-    wrench = make_wrench(options.force, options.torque, options.at or 0.0, options.lasting)
+    push = {"force": options.force, "torque": options.torque, "start": options.at, "duration": options.lasting}
+    push = {name: value for name, value in push.items() if value is not None}
     if options.scenario is not None:
-        if given or options.target or wrench is not None:
+        if given or options.target or push:
             raise ConfigError("--scenario says all about a flight; leave --env-kwargs, --target, --force and --torque away")
-        setting = Setting.of_scenario(options.scenario)
+        setting = scenario_setting(options.scenario)
     else:
         named = {"task": options.task} if options.task else {}
-        kept = agent.settings.given() if agent else {}
+        kept = agent[2].given() if agent else {}
         settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **given})
-        setting = Setting.fixed(settings, options.target, wrench)
+        setting = fixed_setting(settings, options.target, push)
     controllers: dict[str, Any] = {}
     if agent:
-        print(f"agent: {agent.path}")
-        controllers[agent.label] = load_model(agent.path)
+        label, path, _ = agent
+        print(f"agent: {path}")
+        controllers[label] = load_model(path)
     for spec in parse_controllers(options.controllers):
-        controllers[spec.label] = build(spec, setting.settings.vehicle)
+        controllers[spec.label] = build(spec, setting.vehicle)
     return setting, controllers
 
 
@@ -140,14 +140,14 @@ def _write_film(path: Path, episodes: Sequence[Sequence[Recording]], size: tuple
     """Draw flights and write them as a film, with a progress bar; ``size`` of a panel, pixels."""
     total = sum(len(frame_times(episode, speed)) for episode in episodes)
     frames = (frame for episode in episodes for frame in film_frames(episode, *size, speed))
-    write_video(path, track(frames, "drawing", total, console=Console(file=sys.stderr), transient=True), FPS)
+    write_film(path, track(frames, "drawing", total, console=Console(file=sys.stderr), transient=True))
     print(f"saved {path}, {total / FPS:.1f} s")
 
 
 def _print_outcomes(episodes: Sequence[Sequence[Recording]]) -> None:
     for number, episode in enumerate(episodes, 1):
         for recording in episode:
-            how = recording.lost or f"{recording.error[-1]:.3f} m from its target"
+            how = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
             head = f"episode {number}, {recording.name}" if len(episodes) > 1 else recording.name
             print(f"{head}: {how} after {recording.times[-1]:.2f} s, reward {recording.reward:.2f}")
 
