@@ -40,4 +40,4 @@ def find_agent(log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: 
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
         if settings.get(key):
             raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    return Agent(f"{algo} {run.path.name}", path, run.flight_settings())
+    return Agent(f"{algo} {run.path.name}", path, FlightSettings.beside(path)[0])

@@ -18,7 +18,6 @@ resume.npz, dataset.npz     an interrupted run's random numbers, environments an
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 import uuid
@@ -30,7 +29,6 @@ import yaml
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.base.yaml_files import parse_mapping_file
-from sb3_quad.settings.flight import FlightSettings, flight_settings
 from sb3_quad.settings.literals import ZooLoader
 
 
@@ -68,10 +66,11 @@ class RunFolder:
 
         :raises ConfigError: there is none.
         """
-        steps = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
+        names = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
+        steps = [int(name) for name in names if name.isdigit()]
         if not steps:
             raise ConfigError(f"{self.path}: holds no checkpoint; train with --save-freq to have some")
-        return self.checkpoint(max(int(step) for step in steps if step.isdigit()))
+        return self.checkpoint(max(steps))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
         """Write config.yml, args.yml and command.txt."""
@@ -88,13 +87,6 @@ class RunFolder:
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
         return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
-
-    def flight_settings(self) -> FlightSettings:
-        """How the run's agent was judged, and is to be flown.
-
-        :raises ConfigError: as :meth:`read_yaml`; or values that do not fit.
-        """
-        return flight_settings(*self.read_yaml(), str(self.config))
 
 
 def file_name(env_id: str) -> str:
@@ -119,11 +111,11 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     """
     try:
         parent.mkdir(parents=True, exist_ok=True)
-        number = latest_run(parent, name) + 1
+        number = max(_runs(parent, name), default=0) + 1
         while True:
             path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
             try:
-                os.mkdir(path)  # fails if another run was quicker
+                path.mkdir()  # fails if another run was quicker
                 return path
             except FileExistsError:
                 number += 1
@@ -132,14 +124,10 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
         raise ConfigError(f"log folder {parent}: cannot be written ({reason}); give another with -f") from None
 
 
-def latest_run(parent: Path, name: str) -> int:
-    """The greatest run number in a folder, 0 if there is none."""
-    numbers = [0]
-    for entry in parent.glob(f"{name}_*"):
-        number = entry.name.removeprefix(f"{name}_").split("_")[0]
-        if number.isdigit():
-            numbers.append(int(number))
-    return max(numbers)
+def _runs(parent: Path, name: str) -> dict[int, Path]:
+    """The folders ``<parent>/<name>_<number>…`` by their numbers."""
+    entries = {entry: entry.name.removeprefix(f"{name}_").split("_")[0] for entry in sorted(parent.glob(f"{name}_*"))}
+    return {int(number): entry for entry, number in entries.items() if number.isdigit()}
 
 
 def open_run(path: str | Path) -> RunFolder:
@@ -163,11 +151,10 @@ def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) ->
     :raises ConfigError: there is no such run; the message names those there are.
     """
     parent, name = Path(log_folder) / algo, file_name(env_id)
-    number = exp_id if exp_id > 0 else latest_run(parent, name)
-    found = sorted(entry for entry in parent.glob(f"{name}_*") if entry.is_dir())
-    for entry in found:
-        if entry.name.removeprefix(f"{name}_").split("_")[0] == str(number):
-            return RunFolder(entry, name)
-    there = ", ".join(entry.name for entry in found) or "no run of this environment"
+    runs = _runs(parent, name)
+    number = exp_id if exp_id > 0 else max(runs, default=0)
+    if number in runs:
+        return RunFolder(runs[number], name)
+    there = ", ".join(entry.name for entry in runs.values()) or "no run of this environment"
     wanted = f"{name}_{number}" if number else name
     raise ConfigError(f"{parent}: there is no run {wanted}, but {there}; give another with --env, --algo, -f or --exp-id")
