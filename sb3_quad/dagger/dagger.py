@@ -148,7 +148,6 @@ class DAgger(OnPolicyAlgorithm):
             seed=seed,
             device=device,
             _init_setup_model=False,
-            supported_action_spaces=(spaces.Box,),
         )
         self.batch_size = batch_size
         self.n_epochs = n_epochs
@@ -162,7 +161,6 @@ class DAgger(OnPolicyAlgorithm):
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
         self.expert: Any = None
-        self._labeller: Controller | None = None
         self._n_rollouts = 0
         self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
 
@@ -178,12 +176,12 @@ class DAgger(OnPolicyAlgorithm):
             raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        dtype = self.observation_space.dtype
+        dtype = self.rollout_buffer.observations.dtype
         self.dataset = AggregatedDataset(
             self.dataset_capacity or self.n_steps * self.n_envs,
             self.rollout_buffer.obs_shape,
             self.rollout_buffer.action_dim,
-            np.float32 if dtype is None or np.issubdtype(dtype, np.floating) else dtype,
+            np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
 
     def _check_arguments(self) -> None:
@@ -196,7 +194,7 @@ class DAgger(OnPolicyAlgorithm):
             raise ConfigError(f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1")
         if isinstance(self.clip_range_vf, (float, int)) and self.clip_range_vf <= 0:
             raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
-        if (self.policy_kwargs or {}).get("use_sde"):
+        if self.policy_kwargs.get("use_sde"):
             raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
         if self.bc_loss not in CLONING_LOSSES:
             raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
@@ -210,7 +208,7 @@ class DAgger(OnPolicyAlgorithm):
         :raises ExpertError: an expert that does not fit the environment
         """
         if self.env is not None:
-            self._labeller = Controller.for_env(expert, self.env)
+            Controller.for_env(expert, self.env)
         self.expert = expert
 
     @property
@@ -239,9 +237,8 @@ class DAgger(OnPolicyAlgorithm):
         Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The critic evaluates the
         whole rollout at the end, since it does not change before.
         """
-        assert self._labeller is not None and self._last_obs is not None
         self.policy.set_training_mode(False)
-        rng = self._generator(0)
+        labeller, rng = Controller.for_env(self.expert, env), self._generator(0)
         beta = self.current_beta
         n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
@@ -256,7 +253,7 @@ class DAgger(OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
-            labels[step] = self._labeller.labels(observations)  # of the state before the step
+            labels[step] = labeller.labels(observations)  # of the state before the step
             with th.no_grad():
                 means = actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
@@ -394,4 +391,4 @@ class DAgger(OnPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
-        return [*super()._excluded_save_params(), "expert", "_labeller", "dataset"]
+        return [*super()._excluded_save_params(), "expert", "dataset"]

@@ -31,6 +31,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.report.curves import read_curve
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
+from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train
@@ -121,10 +122,9 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
     stages = []
     for stage in pipeline.stages:
         settings = {**stage.settings, **changes}
-        if "env_kwargs" in stage.settings and "env_kwargs" in changes:
-            settings["env_kwargs"] = {**stage.settings["env_kwargs"], **changes["env_kwargs"]}
-        if "env_kwargs" in settings:
-            settings["env_kwargs"] = with_vehicle_path(settings["env_kwargs"])
+        parts = [parse_mapping(given.get("env_kwargs"), f"{stage.name}: env_kwargs") for given in (stage.settings, changes)]
+        if any(parts):
+            settings["env_kwargs"] = with_vehicle_path({**parts[0], **parts[1]})
         stages.append(stage.model_copy(update={"settings": settings}))
     return Pipeline(stages=tuple(stages))
 

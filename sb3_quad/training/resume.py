@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
-from sb3_quad.callbacks.last_good import ENVIRONMENT, Snapshot, set_random_state
+from sb3_quad.callbacks.interruption import ENVIRONMENT, Snapshot, set_random_state
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 

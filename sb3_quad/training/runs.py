@@ -1,20 +1,4 @@
-"""Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``.
-
-==========================  =========================================================================
-file                        what
-==========================  =========================================================================
-<Env>.zip                   the model at the end, or where it was interrupted
-best_model.zip              the best of the evaluations: by success, then by mean reward
-trimmed_model.zip           the same after trimming, where a pipeline does that
-rl_model_<N>_steps.zip      checkpoints (``--save-freq``)
-evaluations.npz             every evaluation, as SB3's EvalCallback writes it
-0.monitor.csv               every training episode, as SB3's Monitor writes it
-<Env>/config.yml            the settings
-<Env>/args.yml              the command line's arguments; as env_kwargs what the agent is judged with, for rl_zoo3's enjoy
-<Env>/command.txt           what was typed
-resume.npz, dataset.npz     an interrupted run's random numbers, environments and dataset (``--resume``)
-==========================  =========================================================================
-"""
+"""Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``."""
 
 from __future__ import annotations
 
@@ -33,7 +17,7 @@ from sb3_quad.settings.literals import ZooLoader
 
 
 class RunFolder:
-    """The files of one run; see the table of this module.
+    """The files of one run. There are also ``rl_model_<N>_steps.zip``, its checkpoints.
 
     :param path: the folder.
     :param name: the environment id, as file names take it.
@@ -41,16 +25,16 @@ class RunFolder:
 
     def __init__(self, path: Path, name: str) -> None:
         self.path, self.name = path, name
-        self.model = path / f"{name}.zip"
-        self.best_model = path / "best_model.zip"
-        self.trimmed_model = path / "trimmed_model.zip"
-        self.evaluations = path / "evaluations.npz"
-        self.episodes = path / "0.monitor.csv"
-        self.dataset = path / "dataset.npz"
-        self.resume_state = path / "resume.npz"
-        self.config = path / name / "config.yml"
-        self.arguments = path / name / "args.yml"
-        self.command = path / name / "command.txt"
+        self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
+        self.best_model = path / "best_model.zip"  # of the evaluations: by success, then by mean reward
+        self.trimmed_model = path / "trimmed_model.zip"  # the same after trimming, where a pipeline does that
+        self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
+        self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
+        self.resume_state = path / "resume.npz"  # of an interrupted run: random numbers and environments
+        self.dataset = path / "dataset.npz"  # of an interrupted run
+        self.config = path / name / "config.yml"  # the settings
+        self.arguments = path / name / "args.yml"  # of the command line; env_kwargs: what the agent is judged with
+        self.command = path / name / "command.txt"  # what was typed
 
     @property
     def result(self) -> Path:

@@ -19,9 +19,9 @@ from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episode_log import EpisodeLog
+from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.last_good import LastGoodModel
+from sb3_quad.callbacks.interruption import LastGoodModel
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
