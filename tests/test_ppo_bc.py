@@ -15,8 +15,7 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
-from sb3_quad.common.forward import evaluate_actions
-from sb3_quad.common.losses import CLONING_LOSSES
+from sb3_quad.common import CLONING_LOSSES, evaluate_actions
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.settings.algorithms import constructor_parameters
 

@@ -21,10 +21,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad import common
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
-from sb3_quad.common.forward import actor_mean, critic_values
-from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss, cloning_errors, gaussian_entropy, l2_loss, value_loss
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
 
@@ -108,7 +107,7 @@ class DAgger(OnPolicyAlgorithm):
         beta: float = 0.5,
         beta_decay: float = 0.001,
         beta_final: float = 0.3,
-        bc_loss: CloningLoss = "mse",
+        bc_loss: common.CloningLoss = "mse",
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
         dataset_capacity: int = 1_500_000,
@@ -156,7 +155,7 @@ class DAgger(OnPolicyAlgorithm):
         self.beta = beta
         self.beta_decay = beta_decay
         self.beta_final = beta_final
-        self.bc_loss: CloningLoss = bc_loss
+        self.bc_loss: common.CloningLoss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
@@ -196,8 +195,8 @@ class DAgger(OnPolicyAlgorithm):
             raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
         if self.policy_kwargs.get("use_sde"):
             raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        if self.bc_loss not in common.CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, common.CLONING_LOSSES))
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
@@ -255,7 +254,7 @@ class DAgger(OnPolicyAlgorithm):
             observations: Any = self._last_obs
             labels[step] = labeller.labels(observations)  # of the state before the step
             with th.no_grad():
-                means = actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
+                means = common.actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta
             actions = np.where(by_expert[:, None], labels[step], sampled)
@@ -302,7 +301,7 @@ class DAgger(OnPolicyAlgorithm):
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
         with th.no_grad():
             chunks = th.split(th.as_tensor(observations, device=self.device), _VALUE_CHUNK)
-            return np.asarray(th.cat([critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
+            return np.asarray(th.cat([common.critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
@@ -328,13 +327,13 @@ class DAgger(OnPolicyAlgorithm):
 
         for i, index in enumerate(critic_batches):
             observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
-            mean, log_std = actor_mean(self.policy, observations), self.policy.log_std
-            bc = cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
-            entropy_loss = -gaussian_entropy(log_std)
-            l2 = l2_loss(self.policy)
+            mean, log_std = common.actor_mean(self.policy, observations), self.policy.log_std
+            bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
+            entropy_loss = -common.gaussian_entropy(log_std)
+            l2 = common.l2_loss(self.policy)
 
-            values = critic_values(self.policy, flown[index].to(self.device))
-            v_loss = value_loss(values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf)
+            states, old, goals = (part[index].to(self.device) for part in (flown, old_values, returns))
+            v_loss = common.value_loss(common.critic_values(self.policy, states), old, goals, clip_range_vf)
 
             loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
             terms[i] = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()

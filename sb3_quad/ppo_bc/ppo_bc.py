@@ -17,10 +17,8 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
+from sb3_quad import common
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.common.forward import evaluate_actions
-from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss, cloning_errors, l2_loss
-from sb3_quad.common.losses import value_loss as max_clipped_value_loss
 from sb3_quad.experts.controller import Controller
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
 
@@ -70,7 +68,7 @@ class PPOBC(PPO):
         *args: Any,
         expert: Any = None,
         bc_coef: float | Schedule = 0.005,
-        bc_loss: CloningLoss = "nll",
+        bc_loss: common.CloningLoss = "nll",
         bc_filter: str = "none",
         l2_coef: float = 0.0,
         max_clipped_value: bool = True,
@@ -79,8 +77,8 @@ class PPOBC(PPO):
         **kwargs: Any,
     ):
         super().__init__(*args, _init_setup_model=False, **kwargs)  # type: ignore[misc]
-        if bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
+        if bc_loss not in common.CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", bc_loss, common.CLONING_LOSSES))
         if bc_filter not in BC_FILTERS:
             raise ConfigError(unknown("bc_filter", bc_filter, BC_FILTERS))
         if not l2_coef >= 0:
@@ -89,7 +87,7 @@ class PPOBC(PPO):
             raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss: CloningLoss = bc_loss
+        self.bc_loss: common.CloningLoss = bc_loss
         self.bc_filter = bc_filter
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
@@ -213,7 +211,7 @@ class PPOBC(PPO):
 
                 entropy: th.Tensor | None
                 if adds:  # + in less time, and with the mean action
-                    values, log_prob, entropy, mean = evaluate_actions(self.policy, samples.observations, actions)
+                    values, log_prob, entropy, mean = common.evaluate_actions(self.policy, samples.observations, actions)
                 else:
                     try:
                         values, log_prob, entropy = self.policy.evaluate_actions(samples.observations, actions)
@@ -234,7 +232,7 @@ class PPOBC(PPO):
                 if clip_range_vf is None:
                     value_loss = F.mse_loss(samples.returns, values)
                 elif self.max_clipped_value:  # + Eq. 3.8
-                    value_loss = max_clipped_value_loss(values, samples.old_values, samples.returns, clip_range_vf)
+                    value_loss = common.value_loss(values, samples.old_values, samples.returns, clip_range_vf)
                 else:
                     change = (values - samples.old_values).clamp(-clip_range_vf, clip_range_vf)
                     value_loss = F.mse_loss(samples.returns, samples.old_values + change)
@@ -258,7 +256,7 @@ class PPOBC(PPO):
                     logged["bc_loss"] = self._bc_loss(mean, expert_actions, samples.advantages)
                     terms["bc"] = bc_coef * logged["bc_loss"]
                 if self.l2_coef > 0.0:  # +
-                    logged["l2_loss"] = l2_loss(self.policy)
+                    logged["l2_loss"] = common.l2_loss(self.policy)
                     terms["l2"] = self.l2_coef * logged["l2_loss"]
                 loss = terms["value"] if warming_up else th.stack(list(terms.values())).sum()  # + warming_up
                 monitored.append({name: value.detach() for name, value in {"loss": loss, **logged}.items()})
@@ -309,7 +307,7 @@ class PPOBC(PPO):
         :param mean: the policy's mean actions, (batch_size, action_dim), as the expert's.
         :param advantages: (batch_size,), before they are normalised.
         """
-        errors = cloning_errors(self.bc_loss, mean, self.policy.log_std, expert_actions)
+        errors = common.cloning_errors(self.bc_loss, mean, self.policy.log_std, expert_actions)
         if self.bc_loss == "nll":
             errors = errors / expert_actions.shape[1]
         if self.bc_filter == "negative_advantage":

@@ -17,6 +17,7 @@ import gymnasium
 import numba
 import numpy as np
 import torch
+from gymnasium.wrappers import Autoreset
 from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_quad
@@ -46,17 +47,9 @@ class Measurement:
 
 def single(seconds: float) -> Measurement:
     """One PyBullet environment behind ``gymnasium.make``, random actions, resets where episodes end."""
-    with closing(gymnasium.make(ENV_ID)) as env:
+    with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
         env.reset(seed=0)
-        actions = np.random.default_rng(0).uniform(-1, 1, (64, 4)).astype(np.float32)
-
-        def fly(steps: int) -> None:
-            for step in range(steps):
-                _, _, terminated, truncated, _ = env.step(actions[step % 64])
-                if terminated or truncated:
-                    env.reset()
-
-        return _measure("PyBullet, one environment", 1, fly, seconds)
+        return _measure("PyBullet, one environment", 1, env.step, (4,), seconds)
 
 
 def vectorised(kind: str, n_envs: int, seconds: float) -> Measurement:
@@ -64,13 +57,26 @@ def vectorised(kind: str, n_envs: int, seconds: float) -> Measurement:
     config = build_config("ppo", ENV_ID, {"n_timesteps": 1, "vec_env": kind})
     with closing(make_environments(config, n_envs, 0)) as env:
         env.reset()
-        actions = np.random.default_rng(0).uniform(-1, 1, (16, n_envs, 4)).astype(np.float32)
+        return _measure(NAMES[kind], n_envs, env.step, (n_envs, 4), seconds)
 
-        def fly(steps: int) -> None:
-            for step in range(steps):
-                env.step(actions[step % 16])
 
-        return _measure(NAMES[kind], n_envs, fly, seconds)
+def _measure(name: str, n_envs: int, step: Callable[[Any], Any], shape: tuple[int, ...], seconds: float) -> Measurement:
+    actions = np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32)
+
+    def fly(steps: int) -> float:
+        start = time.perf_counter()
+        for number in range(steps):
+            step(actions[number % 16])
+        return time.perf_counter() - start
+
+    fly(3)  # compiles, fills caches
+    steps, elapsed = 1, 0.0
+    while elapsed < seconds / 20:  # how many steps a repetition takes
+        steps *= 2
+        elapsed = fly(steps)
+    steps = max(1, round(steps * seconds / REPETITIONS / elapsed))
+    rates = [steps * n_envs / fly(steps) for _ in range(REPETITIONS)]
+    return Measurement(name, n_envs, float(np.median(rates)), rates)
 
 
 def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> list[Measurement]:
@@ -121,20 +127,3 @@ def machine() -> dict[str, Any]:
 def as_dict(measurements: list[Measurement]) -> dict[str, Any]:
     """What ``--output`` writes."""
     return {"machine": machine(), "results": [asdict(measurement) for measurement in measurements]}
-
-
-def _measure(name: str, n_envs: int, fly: Callable[[int], None], seconds: float) -> Measurement:
-    fly(3)  # compiles, fills caches
-    steps, elapsed = 1, 0.0
-    while elapsed < seconds / 20:  # how many steps a repetition takes
-        steps *= 2
-        elapsed = _time(fly, steps)
-    steps = max(1, round(steps * seconds / REPETITIONS / elapsed))
-    rates = [steps * n_envs / _time(fly, steps) for _ in range(REPETITIONS)]
-    return Measurement(name, n_envs, float(np.median(rates)), rates)
-
-
-def _time(fly: Callable[[int], None], steps: int) -> float:
-    start = time.perf_counter()
-    fly(steps)
-    return time.perf_counter() - start
