@@ -9,23 +9,23 @@ from sb3_quad.base.lazy import lazy_names
 if TYPE_CHECKING:
     from sb3_quad.callbacks.best_model import BestModel as BestModel
     from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule as CoefficientSchedule
-    from sb3_quad.callbacks.episode_log import EpisodeLog as EpisodeLog
+    from sb3_quad.callbacks.episodes import EpisodeLog as EpisodeLog
+    from sb3_quad.callbacks.episodes import FlightMetrics as FlightMetrics
     from sb3_quad.callbacks.every import Checkpoint as Checkpoint
-    from sb3_quad.callbacks.flight_metrics import FlightMetrics as FlightMetrics
-    from sb3_quad.callbacks.last_good import LastGoodModel as LastGoodModel
+    from sb3_quad.callbacks.interruption import LastGoodModel as LastGoodModel
+    from sb3_quad.callbacks.interruption import StopOnSignal as StopOnSignal
     from sb3_quad.callbacks.observation_statistics import ObservationStatistics as ObservationStatistics
-    from sb3_quad.callbacks.stop import StopOnSignal as StopOnSignal
     from sb3_quad.callbacks.trajectory_plots import TrajectoryPlots as TrajectoryPlots
 
 _LAZY = {  # imported on first use: naming one waits for none of the others
     "BestModel": "sb3_quad.callbacks.best_model",
     "Checkpoint": "sb3_quad.callbacks.every",
     "CoefficientSchedule": "sb3_quad.callbacks.coefficient_schedule",
-    "EpisodeLog": "sb3_quad.callbacks.episode_log",
-    "FlightMetrics": "sb3_quad.callbacks.flight_metrics",
-    "LastGoodModel": "sb3_quad.callbacks.last_good",
+    "EpisodeLog": "sb3_quad.callbacks.episodes",
+    "FlightMetrics": "sb3_quad.callbacks.episodes",
+    "LastGoodModel": "sb3_quad.callbacks.interruption",
     "ObservationStatistics": "sb3_quad.callbacks.observation_statistics",
-    "StopOnSignal": "sb3_quad.callbacks.stop",
+    "StopOnSignal": "sb3_quad.callbacks.interruption",
     "TrajectoryPlots": "sb3_quad.callbacks.trajectory_plots",
 }
 __all__ = list(_LAZY)

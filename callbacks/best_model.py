@@ -79,7 +79,7 @@ class BestModel(EveryTimesteps):
         # By the group of the log: the environments, the file, its rows and the expert's mean reward; the first group decides.
         self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
         self._paths = {"eval": path} | {f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others}
-        self._rows: dict[str, dict[str, list[Any]]] = {group: {key: [] for key in KEYS} for group in self._envs}
+        self._rows: dict[str, dict[str, Any]] = {group: {key: [] for key in KEYS} for group in self._envs}
         self._expert_rewards: dict[str, float] = {}
         self._start = 0.0
         self.stopped = False  # by ``should_continue``
@@ -126,8 +126,7 @@ class BestModel(EveryTimesteps):
         rewards, lengths = self._evaluate(self.model, env, note)
         for key, value in zip(KEYS, (self.num_timesteps, rewards, lengths, successes, seconds), strict=True):
             rows[key].append(value)
-        arrays: dict[str, Any] = {key: np.array(values) for key, values in rows.items()}
-        write_arrays(self._paths[group], **arrays)
+        write_arrays(self._paths[group], **rows)
         success, reward = score = _score(successes, rewards)
         self.logger.record(f"{group}/success_rate", success)
         self.logger.record(f"{group}/mean_reward", reward)

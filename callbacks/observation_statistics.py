@@ -15,9 +15,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays, refuse_existing, write_arrays, write_text
 from sb3_quad.base.yaml_files import SUFFIXES, parse_mapping_file
 from sb3_quad.callbacks.every import EveryTimesteps
-from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, FEATURES, GROUPS, OBSERVATION_SIZE
-
-UNITS = {feature.name: feature.unit for feature in FEATURES}
+from sb3_quad.simulation.observation import FEATURE_NAMES, FEATURES, GROUPS, OBSERVATION_SIZE
 
 
 class ObservationStatistics(EveryTimesteps):
@@ -86,9 +84,8 @@ class ObservationStatistics(EveryTimesteps):
     def table(self) -> str:
         """σ of each group, beside that of Table A.2 where there is one."""
         lines = [f"{'group':<10} {'sigma':>10}" + ("  Table A.2" if self._quadcopter else "")]
-        for name, sigma in self.groups().items():
-            printed = f"  {DEFAULT_STD[GROUPS[name]][0]:9.3f} {UNITS[name]}" if self._quadcopter else ""
-            lines.append(f"{name:<10} {sigma:10.3f}{printed}")
+        printed = {each.name: f"  {each.std:9.3f} {each.unit}" for each in FEATURES if self._quadcopter}
+        lines += [f"{name:<10} {sigma:10.3f}{printed.get(name, '')}" for name, sigma in self.groups().items()]
         return "\n".join(lines)
 
     def _on_training_start(self) -> None:
@@ -98,6 +95,8 @@ class ObservationStatistics(EveryTimesteps):
             raise ConfigError(f"ObservationStatistics: observation space {env.observation_space}: must be a Box")
         size = int(np.prod(env.observation_space.shape))
         self._quadcopter = size == OBSERVATION_SIZE and env.has_attr("observation_std") and env.has_attr("observation_mean")
+        scaling = [env.get_attr(f"observation_{name}") for name in ("std", "mean")] if self._quadcopter else [1.0, 0.0]
+        self._scale, self._offset = map(np.array, scaling)
         resumed = self.num_timesteps > 0
         if self._path is not None and not resumed:
             refuse_existing(self._path, overwrite=False)
@@ -106,16 +105,11 @@ class ObservationStatistics(EveryTimesteps):
             if self._path is not None and self._path.is_file():
                 _read(self._path, self._moments)
 
-    def _on_rollout_start(self) -> None:
-        if self._quadcopter:
-            env = self.training_env
-            self._scale, self._offset = np.array(env.get_attr("observation_std")), np.array(env.get_attr("observation_mean"))
-
     def _on_step(self) -> bool:
         normalised = self.model.get_vec_normalize_env()
         observations: Any = self.locals["new_obs"] if normalised is None else normalised.get_original_obs()
         features = np.asarray(observations, dtype=np.float64).reshape(self.training_env.num_envs, -1)
-        self._moments.update(features * self._scale + self._offset if self._quadcopter else features)
+        self._moments.update(features * self._scale + self._offset)
         return super()._on_step()
 
     def _on_event(self) -> bool:

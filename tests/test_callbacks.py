@@ -18,10 +18,9 @@ from stable_baselines3.common.results_plotter import load_results
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.callbacks import best_model
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episode_log import EpisodeLog
+from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.last_good import LastGoodModel, random_state, set_random_state
-from sb3_quad.callbacks.stop import StopOnSignal
+from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal, random_state, set_random_state
 
 
 class Walk(gymnasium.Env):

@@ -72,7 +72,7 @@ def settings_file(tmp_path):
 
 def job(tmp_path, algo="dagger", **changes):
     settings = {**(SMALL_DAGGER if algo == "dagger" else SMALL), **changes}
-    return TrainingJob(build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0)
+    return TrainingJob(config=build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0)
 
 
 def one_line_of_error(capsys) -> str:
@@ -198,7 +198,7 @@ def test_pybullet_gives_the_same_run_as_the_batch(tmp_path, vec_env):
 def test_other_environments_train_too(tmp_path):
     settings = {"n_timesteps": 128, "n_envs": 2, "n_steps": 32, "batch_size": 32}
     config = build_config("ppo", "Pendulum-v1", settings)
-    result = train(TrainingJob(config, log_folder=str(tmp_path), eval_episodes=1), report=lambda line: None)
+    result = train(TrainingJob(config=config, log_folder=str(tmp_path), eval_episodes=1), report=lambda line: None)
     assert PPO.load(result.run.model).num_timesteps == 128
     assert result.run.best_model.is_file()
 
@@ -284,15 +284,14 @@ def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo)
 def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
     quiet = {"report": lambda line: None}
     first = train(job(tmp_path, n_timesteps=400), **quiet)
+    start = {"trained_agent": str(first.run.model)}
     small = {"n_timesteps": 400, "learning_rate": 0.0}
-    start = TrainingJob(job(tmp_path, "ppo", **small).config, log_folder=str(tmp_path), trained_agent=str(first.run.model))
-    second = train(start, **quiet)
+    second = train(job(tmp_path, "ppo", **small).model_copy(update=start), **quiet)
     ours, theirs = second.model.policy.state_dict(), first.model.policy.state_dict()
     assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
     assert second.model.num_timesteps == 400
     fixed = {**small, "policy_kwargs": {"net_arch": [8], "log_std_init": -1.25}}
-    start = TrainingJob(job(tmp_path, "ppo", **fixed).config, log_folder=str(tmp_path), trained_agent=str(first.run.model))
-    third = train(start, **quiet).model.policy
+    third = train(job(tmp_path, "ppo", **fixed).model_copy(update=start), **quiet).model.policy
     assert torch.equal(third.log_std.data, torch.full((4,), -1.25))
     assert torch.equal(third.action_net.weight, first.model.policy.action_net.weight)
 
@@ -320,7 +319,7 @@ def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_w
         seen.append(observation.copy())
         return np.zeros((len(observation), 4), dtype=np.float32)
 
-    job = TrainingJob(config)
+    job = TrainingJob(config=config)
     compare.agent_and_expert(job, agent)
     assert np.allclose(seen[0][:, 12:], -2.5)  # an episode begins at rest: (0 - 5) / 2
     seen.clear()

@@ -134,7 +134,9 @@ def test_a_run_of_a_configuration_file_follows_the_reward_against_the_expert(tmp
         "callback": [{"sb3_quad.callbacks.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
     }
     config = build_config("dagger", "QuadTargetTracking-v0", settings)
-    result = train(TrainingJob(config, str(tmp_path), eval_freq=200, eval_episodes=2), report=lambda line: None)
+    result = train(
+        TrainingJob(config=config, log_folder=str(tmp_path), eval_freq=200, eval_episodes=2), report=lambda line: None
+    )
     assert result.model.current_beta == 0.25
     for wrong, message in (("yes", "true or false"), (True, "learns from no expert")):
         with pytest.raises(ConfigError, match=message):

@@ -15,7 +15,7 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
-from sb3_quad.training.pipeline import load_pipeline, make_jobs, run_pipeline, with_settings
+from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trim import scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
@@ -43,17 +43,17 @@ def policy(path):
 def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
     stages = [STAGES[0], {**STAGES[1], "settings": {"learning_rate": 0.0, "n_epochs": 1}}]
     pipeline = with_settings(load_pipeline(write(tmp_path, stages)), {**TINY, "policy_kwargs": {"net_arch": [8, 8]}})
-    result = run_pipeline(pipeline, make_jobs(pipeline, job), "stages", lambda line: None)
-    one, two = (policy(entry.agent) for entry in result.stages)
+    result = run_pipeline(pipeline, job, "stages", lambda line: None)
+    one, two = (policy(entry.agent) for entry in result.stages.values())
     assert result.exit_code == 0 and all(np.array_equal(one[key], two[key]) for key in one if key != "log_std")
     status = yaml.safe_load((result.folder / "pipeline.yml").read_text(encoding="utf-8"))
-    assert [entry["run"] for entry in status["done"]] == [str(entry.run.path) for entry in result.stages]
+    assert [entry["run"] for entry in status["done"]] == [entry.run for entry in result.stages.values()]
 
 
 def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
     pipeline = with_settings(load_pipeline(write(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]])), TINY)
     with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward 1.*logs/dagger"):
-        run_pipeline(pipeline, make_jobs(pipeline, job), "stages", lambda line: None)
+        run_pipeline(pipeline, job, "stages", lambda line: None)
     assert not (tmp_path / "logs" / "ppo_bc").exists()
 
 
@@ -108,7 +108,7 @@ def test_trimming_cancels_the_offset_of_a_trained_agent():
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
     result = trim(model)
-    assert result.offset_before > 0.4 and result.offset_after < 0.05 and result.scale <= 1.0
+    assert result.before > 0.4 and result.after < 0.05 and result.scale <= 1.0
 
 
 def test_scaling_the_position_is_seen_by_the_actor_as_a_longer_way():

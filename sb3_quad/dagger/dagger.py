@@ -21,10 +21,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad import common
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
-from sb3_quad.common.forward import actor_mean, critic_values
-from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss, cloning_errors, gaussian_entropy, l2_loss, value_loss
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
 
@@ -108,7 +107,7 @@ class DAgger(OnPolicyAlgorithm):
         beta: float = 0.5,
         beta_decay: float = 0.001,
         beta_final: float = 0.3,
-        bc_loss: CloningLoss = "mse",
+        bc_loss: common.CloningLoss = "mse",
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
         dataset_capacity: int = 1_500_000,
@@ -148,7 +147,6 @@ class DAgger(OnPolicyAlgorithm):
             seed=seed,
             device=device,
             _init_setup_model=False,
-            supported_action_spaces=(spaces.Box,),
         )
         self.batch_size = batch_size
         self.n_epochs = n_epochs
@@ -157,12 +155,11 @@ class DAgger(OnPolicyAlgorithm):
         self.beta = beta
         self.beta_decay = beta_decay
         self.beta_final = beta_final
-        self.bc_loss: CloningLoss = bc_loss
+        self.bc_loss: common.CloningLoss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
         self.expert: Any = None
-        self._labeller: Controller | None = None
         self._n_rollouts = 0
         self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
 
@@ -178,12 +175,12 @@ class DAgger(OnPolicyAlgorithm):
             raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        dtype = self.observation_space.dtype
+        dtype = self.rollout_buffer.observations.dtype
         self.dataset = AggregatedDataset(
             self.dataset_capacity or self.n_steps * self.n_envs,
             self.rollout_buffer.obs_shape,
             self.rollout_buffer.action_dim,
-            np.float32 if dtype is None or np.issubdtype(dtype, np.floating) else dtype,
+            np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
 
     def _check_arguments(self) -> None:
@@ -196,10 +193,10 @@ class DAgger(OnPolicyAlgorithm):
             raise ConfigError(f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1")
         if isinstance(self.clip_range_vf, (float, int)) and self.clip_range_vf <= 0:
             raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
-        if (self.policy_kwargs or {}).get("use_sde"):
+        if self.policy_kwargs.get("use_sde"):
             raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        if self.bc_loss not in common.CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, common.CLONING_LOSSES))
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
@@ -210,7 +207,7 @@ class DAgger(OnPolicyAlgorithm):
         :raises ExpertError: an expert that does not fit the environment
         """
         if self.env is not None:
-            self._labeller = Controller.for_env(expert, self.env)
+            Controller.for_env(expert, self.env)
         self.expert = expert
 
     @property
@@ -239,9 +236,8 @@ class DAgger(OnPolicyAlgorithm):
         Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The critic evaluates the
         whole rollout at the end, since it does not change before.
         """
-        assert self._labeller is not None and self._last_obs is not None
         self.policy.set_training_mode(False)
-        rng = self._generator(0)
+        labeller, rng = Controller.for_env(self.expert, env), self._generator(0)
         beta = self.current_beta
         n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
@@ -256,9 +252,9 @@ class DAgger(OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
-            labels[step] = self._labeller.labels(observations)  # of the state before the step
+            labels[step] = labeller.labels(observations)  # of the state before the step
             with th.no_grad():
-                means = actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
+                means = common.actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta
             actions = np.where(by_expert[:, None], labels[step], sampled)
@@ -305,7 +301,7 @@ class DAgger(OnPolicyAlgorithm):
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
         with th.no_grad():
             chunks = th.split(th.as_tensor(observations, device=self.device), _VALUE_CHUNK)
-            return np.asarray(th.cat([critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
+            return np.asarray(th.cat([common.critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
@@ -331,13 +327,13 @@ class DAgger(OnPolicyAlgorithm):
 
         for i, index in enumerate(critic_batches):
             observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
-            mean, log_std = actor_mean(self.policy, observations), self.policy.log_std
-            bc = cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
-            entropy_loss = -gaussian_entropy(log_std)
-            l2 = l2_loss(self.policy)
+            mean, log_std = common.actor_mean(self.policy, observations), self.policy.log_std
+            bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
+            entropy_loss = -common.gaussian_entropy(log_std)
+            l2 = common.l2_loss(self.policy)
 
-            values = critic_values(self.policy, flown[index].to(self.device))
-            v_loss = value_loss(values, old_values[index].to(self.device), returns[index].to(self.device), clip_range_vf)
+            states, old, goals = (part[index].to(self.device) for part in (flown, old_values, returns))
+            v_loss = common.value_loss(common.critic_values(self.policy, states), old, goals, clip_range_vf)
 
             loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
             terms[i] = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()
@@ -394,4 +390,4 @@ class DAgger(OnPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
-        return [*super()._excluded_save_params(), "expert", "_labeller", "dataset"]
+        return [*super()._excluded_save_params(), "expert", "dataset"]

@@ -43,15 +43,11 @@ class AggregatedDataset:
     def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
         observations, actions = observations[-self.capacity :], actions[-self.capacity :]
-        n = len(observations)
-        start = (self._oldest + self._size) % self.capacity
-        head = min(n, self.capacity - start)  # the rest wraps round to the beginning
-        for store, rows in ((self._observations, observations), (self._actions, actions)):
-            array = store.numpy()
-            array[start : start + head] = rows[:head]
-            array[: n - head] = rows[head:]
-        overwritten = max(0, self._size + n - self.capacity)
-        self._size = self._size + n - overwritten
+        rows = (self._oldest + self._size + np.arange(len(actions))) % self.capacity
+        self._observations.numpy()[rows] = observations
+        self._actions.numpy()[rows] = actions
+        overwritten = max(0, self._size + len(actions) - self.capacity)
+        self._size += len(actions) - overwritten
         self._oldest = (self._oldest + overwritten) % self.capacity
 
     def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:

@@ -17,12 +17,10 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from torch.nn import functional as F
 
+from sb3_quad import common
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
-from sb3_quad.common.forward import evaluate_actions
-from sb3_quad.common.losses import CLONING_LOSSES, CloningLoss, cloning_errors, l2_loss
-from sb3_quad.common.losses import value_loss as max_clipped_value_loss
 from sb3_quad.experts.controller import Controller
-from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer, ExpertRolloutBufferSamples
+from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -70,7 +68,7 @@ class PPOBC(PPO):
         *args: Any,
         expert: Any = None,
         bc_coef: float | Schedule = 0.005,
-        bc_loss: CloningLoss = "nll",
+        bc_loss: common.CloningLoss = "nll",
         bc_filter: str = "none",
         l2_coef: float = 0.0,
         max_clipped_value: bool = True,
@@ -79,8 +77,8 @@ class PPOBC(PPO):
         **kwargs: Any,
     ):
         super().__init__(*args, _init_setup_model=False, **kwargs)  # type: ignore[misc]
-        if bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
+        if bc_loss not in common.CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", bc_loss, common.CLONING_LOSSES))
         if bc_filter not in BC_FILTERS:
             raise ConfigError(unknown("bc_filter", bc_filter, BC_FILTERS))
         if not l2_coef >= 0:
@@ -89,7 +87,7 @@ class PPOBC(PPO):
             raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
         self.expert = expert
         self.bc_coef = bc_coef
-        self.bc_loss: CloningLoss = bc_loss
+        self.bc_loss: common.CloningLoss = bc_loss
         self.bc_filter = bc_filter
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
@@ -115,17 +113,16 @@ class PPOBC(PPO):
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
         self.bc_coef = FloatSchedule(self.bc_coef)
-        if self._will_clone():
-            self._check_distribution()
+        if self.expert is not None and self._will_clone():
+            self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
         own = ["expert", "_labeller", "_labels", "rollout_buffer_class", "rollout_buffer_kwargs"]
         return [*super()._excluded_save_params(), *own]
 
     def set_expert(self, expert: Any) -> None:
-        """Give the expert to a model that was loaded without one."""
+        """Clone ``expert`` from the next rollout on, as a model must that was loaded without one."""
         self.expert = expert
-        self._labeller = None
 
     def set_bc_coef(self, bc_coef: float) -> None:
         """Weigh the cloning term with ``bc_coef`` from the next rollout on, instead of the schedule given before.
@@ -136,31 +133,25 @@ class PPOBC(PPO):
         if not 0.0 <= bc_coef < float("inf"):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if bc_coef > 0.0:
-            self._check_expert()
+            self._check_cloning()
         self._next_bc_coef = float(bc_coef)  # not now: the rollout that is under way was labelled, or not, by the old one
 
     def _will_clone(self) -> bool:
         """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell."""
         return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())  # type: ignore[operator]
 
-    def _check_expert(self) -> None:
+    def _check_cloning(self) -> None:
         if self.expert is None:
             raise ExpertError(
                 "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
             )
-
-    def _check_distribution(self) -> None:
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         if self._will_clone():
-            self._check_expert()
-        result = super()._setup_learn(*args, **kwargs)
-        if self.expert is not None:
-            assert self.env is not None
-            self._labeller = Controller.for_env(self.expert, self.env)
-        return result
+            self._check_cloning()
+        return super()._setup_learn(*args, **kwargs)
 
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
@@ -171,9 +162,8 @@ class PPOBC(PPO):
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
         if self._rollout_bc_coef != 0.0:
-            self._check_expert()
-            self._check_distribution()
-            assert self._labeller is not None
+            self._check_cloning()
+            self._labeller = Controller.for_env(self.expert, env)
             if self._labeller.needs_state:
                 observation: Any = self._last_obs
                 self._labels = self._labeller.labels(observation)  # the first step's state, before it
@@ -214,14 +204,14 @@ class PPOBC(PPO):
 
         for epoch in range(self.n_epochs):
             first = len(monitored)
-            for samples in cast(ExpertRolloutBuffer, self.rollout_buffer).get(self.batch_size):
+            for samples, expert_actions in cast(ExpertRolloutBuffer, self.rollout_buffer).get(self.batch_size):
                 actions = samples.actions
                 if isinstance(self.action_space, spaces.Discrete):
                     actions = actions.long().flatten()
 
                 entropy: th.Tensor | None
                 if adds:  # + in less time, and with the mean action
-                    values, log_prob, entropy, mean = evaluate_actions(self.policy, samples.observations, actions)
+                    values, log_prob, entropy, mean = common.evaluate_actions(self.policy, samples.observations, actions)
                 else:
                     try:
                         values, log_prob, entropy = self.policy.evaluate_actions(samples.observations, actions)
@@ -242,7 +232,7 @@ class PPOBC(PPO):
                 if clip_range_vf is None:
                     value_loss = F.mse_loss(samples.returns, values)
                 elif self.max_clipped_value:  # + Eq. 3.8
-                    value_loss = max_clipped_value_loss(values, samples.old_values, samples.returns, clip_range_vf)
+                    value_loss = common.value_loss(values, samples.old_values, samples.returns, clip_range_vf)
                 else:
                     change = (values - samples.old_values).clamp(-clip_range_vf, clip_range_vf)
                     value_loss = F.mse_loss(samples.returns, samples.old_values + change)
@@ -263,10 +253,10 @@ class PPOBC(PPO):
                     "clip_fraction": clip_fraction,
                 }
                 if bc_coef != 0.0:  # +
-                    logged["bc_loss"] = self._bc_loss(mean, samples)
+                    logged["bc_loss"] = self._bc_loss(mean, expert_actions, samples.advantages)
                     terms["bc"] = bc_coef * logged["bc_loss"]
                 if self.l2_coef > 0.0:  # +
-                    logged["l2_loss"] = l2_loss(self.policy)
+                    logged["l2_loss"] = common.l2_loss(self.policy)
                     terms["l2"] = self.l2_coef * logged["l2_loss"]
                 loss = terms["value"] if warming_up else th.stack(list(terms.values())).sum()  # + warming_up
                 monitored.append({name: value.detach() for name, value in {"loss": loss, **logged}.items()})
@@ -311,18 +301,19 @@ class PPOBC(PPO):
         advice = "try a smaller learning_rate or bc_coef, and check the expert's actions"
         return TrainingError(f"{what} after {self.num_timesteps} timesteps: {advice}")
 
-    def _bc_loss(self, mean: th.Tensor, samples: ExpertRolloutBufferSamples) -> th.Tensor:
+    def _bc_loss(self, mean: th.Tensor, expert_actions: th.Tensor, advantages: th.Tensor) -> th.Tensor:
         """L_BC of Eq. 3.12 over the mini-batch, a scalar; rows that the filter leaves out count as zero.
 
-        :param mean: the policy's mean actions, (batch_size, action_dim).
+        :param mean: the policy's mean actions, (batch_size, action_dim), as the expert's.
+        :param advantages: (batch_size,), before they are normalised.
         """
-        errors = cloning_errors(self.bc_loss, mean, self.policy.log_std, samples.expert_actions)
+        errors = common.cloning_errors(self.bc_loss, mean, self.policy.log_std, expert_actions)
         if self.bc_loss == "nll":
-            errors = errors / samples.expert_actions.shape[1]
+            errors = errors / expert_actions.shape[1]
         if self.bc_filter == "negative_advantage":
-            errors = errors * (samples.advantages < 0)  # their sign before they are normalised
+            errors = errors * (advantages < 0)
         elif self.bc_filter == "agreement":
-            errors = errors * ((mean - samples.expert_actions).square().mean(dim=1) < AGREEMENT**2)
+            errors = errors * ((mean - expert_actions).square().mean(dim=1) < AGREEMENT**2)
         return errors.mean()
 
     def learn(

@@ -49,7 +49,7 @@ def find_agent(
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
         if settings.get(key):
             raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    return f"{algo} {run.path.name}", path, run.flight_settings()
+    return f"{algo} {run.path.name}", path, FlightSettings.beside(path)[0]
 
 
 class Setting(NamedTuple):

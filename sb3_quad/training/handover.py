@@ -20,19 +20,15 @@ def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
 
     :raises ConfigError: a zip that cannot be read, or whose layers differ; the message names the first that does.
     """
-    theirs = read_policy(path)
-    ours = model.policy.state_dict()
-    for layer in sorted(ours, key=lambda name: name == "log_std"):  # the network's own layers say more
-        if layer not in theirs:
-            raise ConfigError(f"{path}: has no layer {layer}, which this {type(model).__name__} needs (policy_kwargs differ)")
-        if theirs[layer].shape != ours[layer].shape:
-            raise ConfigError(
-                f"{path}: layer {layer} has shape {tuple(theirs[layer].shape)}, here it is {tuple(ours[layer].shape)}; "
-                "environment spaces and policy_kwargs must be the same"
-            )
-    for layer in theirs:
-        if layer not in ours:
-            raise ConfigError(f"{path}: has a layer {layer} that this {type(model).__name__} lacks (policy_kwargs differ)")
+    theirs, ours = read_policy(path), model.policy.state_dict()
+    for layer in sorted({**ours, **theirs}, key=lambda name: name == "log_std"):  # the network's own layers say more
+        if layer not in ours or layer not in theirs:
+            only = "the zip" if layer in theirs else f"this {type(model).__name__}"
+            raise ConfigError(f"{path}: layer {layer} is in {only} only (policy_kwargs differ)")
+        there, here = tuple(theirs[layer].shape), tuple(ours[layer].shape)
+        if there != here:
+            advice = "environment spaces and policy_kwargs must be the same"
+            raise ConfigError(f"{path}: layer {layer} has shape {there}, here it is {here}; {advice}")
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:
         theirs = {**theirs, "log_std": ours["log_std"]}
     model.policy.load_state_dict(theirs)

@@ -2,59 +2,34 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from sb3_quad.base.errors import ConfigError, unknown
+from pydantic import AfterValidator, Field, PositiveInt
+
 from sb3_quad.base.seeds import check_seed
+from sb3_quad.base.validate import Frozen
 from sb3_quad.settings.config import TrainingConfig
 from sb3_quad.settings.flight import FlightSettings
 
 
-@dataclass(frozen=True)
-class TrainingJob:
-    """One run of the trainer.
+class TrainingJob(Frozen):
+    """One run of the trainer. Environment number i is seeded with ``seed + i``."""
 
-    :param config: the settings.
-    :param log_folder: where run folders go.
-    :param seed: of the policy, the environments (number i gets ``seed + i``) and the exploration.
-    :param device: cpu, cuda or auto; the small networks here are fastest on the cpu.
-    :param trained_agent: zip whose policy and critic to start from.
-    :param eval_freq: timesteps between evaluations; below 1 only one at the end.
-    :param eval_episodes: episodes of one evaluation; below 1 none at all.
-    :param n_eval_envs: environments to evaluate in; None for as many as episodes if batched, else 1.
-    :param eval_env_kwargs: put over the settings' ``env_kwargs`` in the evaluation's environments.
-    :param save_freq: timesteps between checkpoints; below 1 none.
-    :param log_interval: rollouts between two lines of the log.
-    :param tensorboard_log: folder for TensorBoard, None for none.
-    :param progress: whether to show a progress bar.
-    :param verbose: as in SB3.
-    :param unique: add a UUID to the run folder's name.
-    """
-
-    config: TrainingConfig
-    log_folder: str = "logs"
-    seed: int = 0
-    device: str = "cpu"
-    trained_agent: str | None = None
-    eval_freq: int = 250_000
-    eval_episodes: int = 48
-    n_eval_envs: int | None = None
-    eval_env_kwargs: dict[str, Any] | None = None
-    save_freq: int = -1
-    log_interval: int = 1
-    tensorboard_log: str | None = None
-    progress: bool = False
-    verbose: int = 0
-    unique: bool = False
-
-    def __post_init__(self) -> None:
-        check_seed(self.seed)
-        if self.n_eval_envs is not None and self.n_eval_envs < 1:
-            raise ConfigError(f"n_eval_envs {self.n_eval_envs}: must be at least 1")
-        if self.log_interval < 1:
-            raise ConfigError(f"log_interval {self.log_interval}: must be at least 1")
+    config: TrainingConfig = Field(description="the settings")
+    log_folder: str = Field(default="logs", description="where run folders go")
+    seed: Annotated[int, AfterValidator(check_seed)] = Field(default=0, description="of policy, environments and exploration")
+    device: str = Field(default="cpu", description="cpu, cuda or auto; small networks are fastest on the cpu")
+    trained_agent: str | None = Field(default=None, description="zip whose policy and critic to start from")
+    eval_freq: int = Field(default=250_000, description="timesteps between evaluations; below 1 only one at the end")
+    eval_episodes: int = Field(default=48, description="episodes of one evaluation; below 1 none at all")
+    n_eval_envs: PositiveInt | None = Field(default=None, description="None: as many as episodes if batched, else 1")
+    eval_env_kwargs: dict[str, Any] | None = Field(default=None, description="put over env_kwargs in evaluations")
+    save_freq: int = Field(default=-1, description="timesteps between checkpoints; below 1 none")
+    log_interval: PositiveInt = Field(default=1, description="rollouts between two lines of the log")
+    tensorboard_log: str | None = Field(default=None, description="folder for TensorBoard")
+    progress: bool = Field(default=False, description="whether to show a progress bar")
+    verbose: int = Field(default=0, description="as in SB3")
+    unique: bool = Field(default=False, description="add a UUID to the run folder's name")
 
     @property
     def for_evaluation(self) -> TrainingConfig:
@@ -68,24 +43,7 @@ class TrainingJob:
 
     def arguments(self) -> dict[str, Any]:
         """What args.yml holds: everything but the settings, which config.yml holds."""
-        plain = {entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name != "config"}
-        return {"algo": self.config.algo, "env": self.config.env_id, **plain}
-
-    @staticmethod
-    def from_arguments(config: TrainingConfig, arguments: dict[str, Any], where: str | Path) -> TrainingJob:
-        """The job that :meth:`arguments` came from.
-
-        :raises ConfigError: an argument that no job has, or of another type.
-        """
-        names = {entry.name for entry in fields(TrainingJob)} - {"config"}
-        given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs")}
-        for key in given:
-            if key not in names:
-                raise ConfigError(f"{where}: {unknown('argument', key, names)}")
-        try:
-            return TrainingJob(config, **given)
-        except TypeError as error:
-            raise ConfigError(f"{where}: {error}") from None
+        return {"algo": self.config.algo, "env": self.config.env_id, **self.model_dump(exclude={"config"})}
 
 
 def describe(job: TrainingJob) -> str:

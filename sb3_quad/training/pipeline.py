@@ -1,6 +1,6 @@
 """Several training jobs in a row, each starting from the agent of the one before: the two stages of the thesis (4.2).
 
-A pipeline's file names its stages in order::
+A pipeline's file names its stages in order; :class:`Stage` lists the keys::
 
     stages:
       - name: stage one
@@ -11,26 +11,12 @@ A pipeline's file names its stages in order::
         env: QuadStateRecovery-v0
         pass_on: best
         require: {success_rate: 0.9}
-
-=========  ================================================================================================
-key        meaning
-=========  ================================================================================================
-name       what the stage is called in tables
-algo, env  as for a single run
-conf_file  settings file; ``<algo>.yml`` of the package without it
-settings   changes to these settings, such as ``n_timesteps: 5_000_000``
-pass_on    ``best`` (default): the best evaluation, by success, then by reward; or ``last``
-trim       correct the agent's steady offset before passing it on: ``position``, by offset and scale of its position
-           (:mod:`sb3_quad.training.trim`), or ``hover``, by its last layer (:mod:`sb3_quad.training.hover`)
-require    ``success_rate``, ``mean_reward``: what the best evaluation must reach, or the pipeline stops here
-eval_freq  transitions between evaluations, ``eval_episodes`` in each, for this stage
-=========  ================================================================================================
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,11 +31,11 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.report.curves import read_curve
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
-from sb3_quad.training.hover import trim_hover
+from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train
-from sb3_quad.training.trim import trim
+from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
 
@@ -62,18 +48,18 @@ class Requirement(Frozen):
 
 
 class Stage(Frozen):
-    """One stage of a pipeline; see the module for its keys."""
+    """One stage of a pipeline."""
 
-    name: str = Field(min_length=1)
-    algo: str
-    env: str
-    conf_file: str | None = None
-    settings: dict[str, Any] = Field(default_factory=dict)
-    pass_on: Literal["best", "last"] = "best"
-    trim: Literal["position", "hover"] | None = None
-    require: Requirement = Requirement()
-    eval_freq: int | None = None
-    eval_episodes: PositiveInt | None = None
+    name: str = Field(min_length=1, description="what the stage is called in tables")
+    algo: str = Field(description="as for a single run")
+    env: str = Field(description="as for a single run")
+    conf_file: str | None = Field(default=None, description="settings file; <algo>.yml of the package without it")
+    settings: dict[str, Any] = Field(default={}, description="changes to these settings, such as n_timesteps: 5_000_000")
+    pass_on: Literal["best", "last"] = Field(default="best", description="the best evaluation, by success, then by reward")
+    trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
+    require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
+    eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
+    eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
 
 class Pipeline(Frozen):
@@ -82,27 +68,34 @@ class Pipeline(Frozen):
     stages: tuple[Stage, ...] = Field(min_length=1)
 
 
-@dataclass(frozen=True)
-class StageResult:
-    """A finished stage.
+class StageResult(Frozen):
+    """A finished stage."""
 
-    :param agent: the zip that is passed on.
-    :param seconds: wall-clock time of its training; of a stage that was resumed, since then.
-    """
-
-    stage: Stage
-    run: RunFolder
-    agent: Path
+    run: str = Field(description="its run folder")
+    agent: str = Field(description="the zip that is passed on")
     timesteps: int
-    seconds: float
+    seconds: float = Field(description="of training; of a stage that was resumed, since then")
+
+
+class Status(Pipeline):
+    """What ``pipeline.yml`` in a pipeline's folder holds."""
+
+    job: dict[str, Any] = Field(description="arguments of every job")
+    done: tuple[StageResult, ...]
+    current: str | None = Field(description="the run folder of the stage under way")
 
 
 @dataclass(frozen=True)
 class PipelineResult:
-    """How a pipeline ended: all stages, or those before an interruption (then ``exit_code`` is not 0)."""
+    """How a pipeline ended.
+
+    :param stages: by name, all of them, or those before an interruption (then ``exit_code`` is not 0).
+    :param job: that of the first stage.
+    """
 
     folder: Path
-    stages: list[StageResult]
+    stages: dict[str, StageResult]
+    job: TrainingJob
     exit_code: int = 0
 
 
@@ -129,44 +122,29 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
     stages = []
     for stage in pipeline.stages:
         settings = {**stage.settings, **changes}
-        if "env_kwargs" in stage.settings and "env_kwargs" in changes:
-            settings["env_kwargs"] = {**stage.settings["env_kwargs"], **changes["env_kwargs"]}
-        if "env_kwargs" in settings:
-            settings["env_kwargs"] = with_vehicle_path(settings["env_kwargs"])
+        parts = [parse_mapping(given.get("env_kwargs"), f"{stage.name}: env_kwargs") for given in (stage.settings, changes)]
+        if any(parts):
+            settings["env_kwargs"] = with_vehicle_path({**parts[0], **parts[1]})
         stages.append(stage.model_copy(update={"settings": settings}))
     return Pipeline(stages=tuple(stages))
 
 
-def make_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
-    """The job of every stage, checked before the first one starts.
-
-    :param job: arguments of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq`` and
-        ``eval_episodes`` go before them.
-    :raises ConfigError: settings that do not fit, named with their stage.
-    """
-    jobs = []
-    for stage in pipeline.stages:
-        try:
-            config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
-        except ConfigError as error:
-            raise ConfigError(f"stage {stage.name!r}: {error}") from None
-        own = {key: getattr(stage, key) for key in ("eval_freq", "eval_episodes") if getattr(stage, key) is not None}
-        jobs.append(TrainingJob(config, **{**job, **own}))
-    return jobs
-
-
 def run_pipeline(
-    pipeline: Pipeline, jobs: list[TrainingJob], name: str, report: Callable[[str], None] = print
+    pipeline: Pipeline, job: Mapping[str, Any], name: str, report: Callable[[str], None] = print
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
     Their run folders lie where single runs lie; ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` says which they are.
 
+    :param job: arguments of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq`` and
+        ``eval_episodes`` go before them.
     :param name: of the pipeline, for its folder.
+    :raises ConfigError: settings that do not fit, named with their stage, before the first one starts.
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was missed.
     """
-    folder = claim_folder(Path(jobs[0].log_folder) / name, name)
-    return _go_on(folder, pipeline, jobs, [], None, report)
+    status = Status(stages=pipeline.stages, job=dict(job), done=(), current=None)
+    jobs = _make_jobs(status)
+    return _go_on(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
 
 def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **changes: Any) -> PipelineResult:
@@ -175,59 +153,57 @@ def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **chang
     :param changes: arguments of the jobs to change, as for :func:`~sb3_quad.training.trainer.resume`.
     :raises ConfigError: a folder without an interrupted pipeline, or with a damaged ``pipeline.yml``.
     """
-    pipeline, content = _read_status(folder)
-    jobs = make_jobs(pipeline, {**content["job"], **changes})
-    done = []
-    for stage, entry in zip(pipeline.stages, content["done"], strict=False):
-        done.append(StageResult(stage, open_run(entry["run"]), Path(entry["agent"]), entry["timesteps"], entry["seconds"]))
-    if len(done) == len(pipeline.stages):
+    status = validate(Status, *SETTINGS.read(folder / STATUS_FILE))
+    if len(status.done) == len(status.stages):
         raise ConfigError(f"{folder}: all stages of this pipeline are done")
-    return _go_on(folder, pipeline, jobs, done, content["current"], report, **changes)
+    status = status.model_copy(update={"job": {**status.job, **changes}})
+    return _go_on(folder, status, _make_jobs(status), report, **changes)
 
 
-def first_job(folder: Path) -> TrainingJob:
-    """The job of a pipeline's first stage, from its folder."""
-    pipeline, content = _read_status(folder)
-    return make_jobs(pipeline, content["job"])[0]
-
-
-def _read_status(folder: Path) -> tuple[Pipeline, dict[str, Any]]:
-    content, where = SETTINGS.read(folder / STATUS_FILE)
-    if not {"stages", "job", "done", "current"} <= content.keys():
-        raise ConfigError(f"{where}: holds no pipeline's status")
-    return validate(Pipeline, {"stages": content["stages"]}, where), content
+def _make_jobs(status: Status) -> list[TrainingJob]:
+    jobs = []
+    for stage in status.stages:
+        where = f"stage {stage.name!r}"
+        try:
+            config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from None
+        own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
+        jobs.append(validate(TrainingJob, {**status.job, **own, "config": config}, where))
+    return jobs
 
 
 def _go_on(
-    folder: Path,
-    pipeline: Pipeline,
-    jobs: list[TrainingJob],
-    done: list[StageResult],
-    current: str | None,
-    report: Callable[[str], None],
-    **changes: Any,
+    folder: Path, status: Status, jobs: list[TrainingJob], report: Callable[[str], None], **changes: Any
 ) -> PipelineResult:
-    for stage, job in list(zip(pipeline.stages, jobs, strict=True))[len(done) :]:
+    done, current, exit_code = list(status.done), status.current, 0
+
+    def write(under_way: str | None) -> None:
+        content = status.model_copy(update={"done": tuple(done), "current": under_way})
+        text = yaml.safe_dump(content.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
+        write_text(folder / STATUS_FILE, text)
+
+    for stage, job in list(zip(status.stages, jobs, strict=True))[len(done) :]:
         report(f"{stage.name}: {describe(job)}")
         if current is not None and open_run(current).resume_state.is_file():
             result = resume(current, report, **changes)
         else:
-            start = replace(job, trained_agent=str(done[-1].agent)) if done else job
-            result = train(start, report, on_start=lambda run: _write_status(folder, pipeline, jobs, done, str(run.path)))
-        current = None
-        if result.exit_code != 0:
+            start = job.model_copy(update={"trained_agent": done[-1].agent}) if done else job
+            result = train(start, report, on_start=lambda run: write(str(run.path)))
+        current, exit_code = None, result.exit_code
+        if exit_code != 0:
             report(f"to go on with the whole pipeline: --resume {folder}")
-            return PipelineResult(folder, done, result.exit_code)
-        agent = _passed_on(stage, result.run)
-        if stage.trim is not None:
-            agent = _trimmed(agent, job, stage.trim, report)
-        done.append(StageResult(stage, result.run, agent, result.model.num_timesteps, round(result.seconds, 1)))
-        _write_status(folder, pipeline, jobs, done, None)
-    return PipelineResult(folder, done)
+            break
+        agent, seconds = _passed_on(stage, job, result.run, report), round(result.seconds, 1)
+        timesteps = result.model.num_timesteps
+        done.append(StageResult(run=str(result.run.path), agent=str(agent), timesteps=timesteps, seconds=seconds))
+        write(None)
+    names = [stage.name for stage in status.stages[: len(done)]]
+    return PipelineResult(folder, dict(zip(names, done, strict=True)), jobs[0], exit_code)
 
 
-def _passed_on(stage: Stage, run: RunFolder) -> Path:
-    """The zip that a stage passes on.
+def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]) -> Path:
+    """The zip that a stage passes on; a trimmed one lies beside the agent that was trimmed.
 
     :raises TrainingError: its best evaluation misses the stage's requirement.
     """
@@ -241,35 +217,17 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
                 f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires "
                 f"(success_rate {stage.require.success_rate:g}, mean_reward {wanted:g}); its run is {run.path}"
             )
-    return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
-
-
-def _trimmed(agent: Path, job: TrainingJob, kind: str, report: Callable[[str], None]) -> Path:
-    """Trim the agent in a zip; the trimmed one lies beside it."""
+    agent = run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
+    if stage.trim is None:
+        return agent
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
     seed, settings = seed_for("trim", job.seed), job.flight_settings
-    if kind == "hover":
-        hover = trim_hover(model, seed, settings)
-        done = f"action at the target {hover.before:.4f} from hover, now {hover.after:.4f}"
+    if stage.trim == "hover":
+        did = trim_hover(model, seed, settings)
+        line = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     else:
-        result = trim(model, seed, settings)
-        done = f"steady offset {result.offset_before:.3f} m, now {result.offset_after:.3f} m; position scale {result.scale:g}"
-    trimmed = agent.with_name("trimmed_model.zip")
-    save_model(model, trimmed)
-    report(f"trimmed: {done}: {trimmed}")
-    return trimmed
-
-
-def _write_status(
-    folder: Path, pipeline: Pipeline, jobs: list[TrainingJob], done: list[StageResult], current: str | None
-) -> None:
-    own = ("algo", "env", "trained_agent", "eval_freq", "eval_episodes")  # the stages hold theirs
-    status = {
-        "stages": [stage.model_dump(mode="json", exclude_defaults=True) for stage in pipeline.stages],
-        "job": {key: value for key, value in jobs[0].arguments().items() if key not in own},
-        "done": [
-            {"run": str(r.run.path), "agent": str(r.agent), "timesteps": r.timesteps, "seconds": r.seconds} for r in done
-        ],
-        "current": current,
-    }
-    write_text(folder / STATUS_FILE, yaml.safe_dump(status, sort_keys=False))
+        did = trim(model, seed, settings)
+        line = f"steady offset {did.before:.3f} m, now {did.after:.3f} m; position scale {did.scale:g}"
+    save_model(model, run.trimmed_model)
+    report(f"trimmed: {line}: {run.trimmed_model}")
+    return run.trimmed_model

@@ -8,33 +8,26 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
-from sb3_quad.callbacks.last_good import ENVIRONMENT, Snapshot, set_random_state
+from sb3_quad.callbacks.interruption import ENVIRONMENT, Snapshot, set_random_state
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 
-def write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm, resumable: bool) -> None:
-    """Write the snapshot's model and, if the run is to be resumable, random numbers, environments and dataset.
+def write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm) -> None:
+    """Write the snapshot's model, random numbers and environments, and the dataset if there is one.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    if resumable:
-        if hasattr(model, "save_dataset"):
-            model.save_dataset(run.dataset)
-        write_arrays(run.resume_state, compressed=False, timesteps=np.array(snapshot.timesteps), **snapshot.state)
+    if hasattr(model, "save_dataset"):
+        model.save_dataset(run.dataset)
+    state: dict[str, Any] = {"timesteps": snapshot.timesteps, **snapshot.state}
+    write_arrays(run.resume_state, **state)
     write_bytes(run.model, snapshot.model)
-
-
-def forget_snapshot(run: RunFolder) -> None:
-    """Remove what only an interrupted run needs."""
-    run.resume_state.unlink(missing_ok=True)
-    run.dataset.unlink(missing_ok=True)
 
 
 def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> OnPolicyAlgorithm:

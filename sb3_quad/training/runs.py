@@ -1,24 +1,7 @@
-"""Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``.
-
-==========================  =========================================================================
-file                        what
-==========================  =========================================================================
-<Env>.zip                   the model at the end, or where it was interrupted
-best_model.zip              the best of the evaluations: by success, then by mean reward
-trimmed_model.zip           the same after trimming, where a pipeline does that
-rl_model_<N>_steps.zip      checkpoints (``--save-freq``)
-evaluations.npz             every evaluation, as SB3's EvalCallback writes it
-0.monitor.csv               every training episode, as SB3's Monitor writes it
-<Env>/config.yml            the settings
-<Env>/args.yml              the command line's arguments; as env_kwargs what the agent is judged with, for rl_zoo3's enjoy
-<Env>/command.txt           what was typed
-resume.npz, dataset.npz     an interrupted run's random numbers, environments and dataset (``--resume``)
-==========================  =========================================================================
-"""
+"""Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``."""
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 import uuid
@@ -30,12 +13,11 @@ import yaml
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.base.yaml_files import parse_mapping_file
-from sb3_quad.settings.flight import FlightSettings, flight_settings
 from sb3_quad.settings.literals import ZooLoader
 
 
 class RunFolder:
-    """The files of one run; see the table of this module.
+    """The files of one run. There are also ``rl_model_<N>_steps.zip``, its checkpoints.
 
     :param path: the folder.
     :param name: the environment id, as file names take it.
@@ -43,16 +25,16 @@ class RunFolder:
 
     def __init__(self, path: Path, name: str) -> None:
         self.path, self.name = path, name
-        self.model = path / f"{name}.zip"
-        self.best_model = path / "best_model.zip"
-        self.trimmed_model = path / "trimmed_model.zip"
-        self.evaluations = path / "evaluations.npz"
-        self.episodes = path / "0.monitor.csv"
-        self.dataset = path / "dataset.npz"
-        self.resume_state = path / "resume.npz"
-        self.config = path / name / "config.yml"
-        self.arguments = path / name / "args.yml"
-        self.command = path / name / "command.txt"
+        self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
+        self.best_model = path / "best_model.zip"  # of the evaluations: by success, then by mean reward
+        self.trimmed_model = path / "trimmed_model.zip"  # the same after trimming, where a pipeline does that
+        self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
+        self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
+        self.resume_state = path / "resume.npz"  # of an interrupted run: random numbers and environments
+        self.dataset = path / "dataset.npz"  # of an interrupted run
+        self.config = path / name / "config.yml"  # the settings
+        self.arguments = path / name / "args.yml"  # of the command line; env_kwargs: what the agent is judged with
+        self.command = path / name / "command.txt"  # what was typed
 
     @property
     def result(self) -> Path:
@@ -68,10 +50,11 @@ class RunFolder:
 
         :raises ConfigError: there is none.
         """
-        steps = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
+        names = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
+        steps = [int(name) for name in names if name.isdigit()]
         if not steps:
             raise ConfigError(f"{self.path}: holds no checkpoint; train with --save-freq to have some")
-        return self.checkpoint(max(int(step) for step in steps if step.isdigit()))
+        return self.checkpoint(max(steps))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
         """Write config.yml, args.yml and command.txt."""
@@ -88,13 +71,6 @@ class RunFolder:
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
         return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
-
-    def flight_settings(self) -> FlightSettings:
-        """How the run's agent was judged, and is to be flown.
-
-        :raises ConfigError: as :meth:`read_yaml`; or values that do not fit.
-        """
-        return flight_settings(*self.read_yaml(), str(self.config))
 
 
 def file_name(env_id: str) -> str:
@@ -119,11 +95,11 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     """
     try:
         parent.mkdir(parents=True, exist_ok=True)
-        number = latest_run(parent, name) + 1
+        number = max(_runs(parent, name), default=0) + 1
         while True:
             path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
             try:
-                os.mkdir(path)  # fails if another run was quicker
+                path.mkdir()  # fails if another run was quicker
                 return path
             except FileExistsError:
                 number += 1
@@ -132,14 +108,10 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
         raise ConfigError(f"log folder {parent}: cannot be written ({reason}); give another with -f") from None
 
 
-def latest_run(parent: Path, name: str) -> int:
-    """The greatest run number in a folder, 0 if there is none."""
-    numbers = [0]
-    for entry in parent.glob(f"{name}_*"):
-        number = entry.name.removeprefix(f"{name}_").split("_")[0]
-        if number.isdigit():
-            numbers.append(int(number))
-    return max(numbers)
+def _runs(parent: Path, name: str) -> dict[int, Path]:
+    """The folders ``<parent>/<name>_<number>…`` by their numbers."""
+    entries = {entry: entry.name.removeprefix(f"{name}_").split("_")[0] for entry in sorted(parent.glob(f"{name}_*"))}
+    return {int(number): entry for entry, number in entries.items() if number.isdigit()}
 
 
 def open_run(path: str | Path) -> RunFolder:
@@ -163,11 +135,10 @@ def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) ->
     :raises ConfigError: there is no such run; the message names those there are.
     """
     parent, name = Path(log_folder) / algo, file_name(env_id)
-    number = exp_id if exp_id > 0 else latest_run(parent, name)
-    found = sorted(entry for entry in parent.glob(f"{name}_*") if entry.is_dir())
-    for entry in found:
-        if entry.name.removeprefix(f"{name}_").split("_")[0] == str(number):
-            return RunFolder(entry, name)
-    there = ", ".join(entry.name for entry in found) or "no run of this environment"
+    runs = _runs(parent, name)
+    number = exp_id if exp_id > 0 else max(runs, default=0)
+    if number in runs:
+        return RunFolder(runs[number], name)
+    there = ", ".join(entry.name for entry in runs.values()) or "no run of this environment"
     wanted = f"{name}_{number}" if number else name
     raise ConfigError(f"{parent}: there is no run {wanted}, but {there}; give another with --env, --algo, -f or --exp-id")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,13 +14,14 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import one_line, save_model
+from sb3_quad.base.files import one_line, save_model, write_bytes
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.callbacks.episode_log import EpisodeLog
+from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.last_good import LastGoodModel
+from sb3_quad.callbacks.interruption import LastGoodModel
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
@@ -28,16 +29,12 @@ from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.resume import forget_snapshot, load_snapshot, write_snapshot
+from sb3_quad.training.resume import load_snapshot, write_snapshot
 from sb3_quad.training.runs import RunFolder, claim_run, open_run
 
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 EvalEnvs = dict[str | None, VecEnv]
-
-
-def _always(success: float, reward: float) -> bool:
-    return True
 
 
 @dataclass(frozen=True)
@@ -61,7 +58,7 @@ def train(
     job: TrainingJob,
     report: Report = print,
     on_start: Callable[[RunFolder], None] = lambda run: None,
-    should_continue: ShouldContinue = _always,
+    should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
     """Train as ``job`` says, in a run folder of its own.
 
@@ -78,7 +75,7 @@ def train(
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
         run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": job.for_evaluation.env_kwargs})
         on_start(run)
-        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps, should_continue)
+        return _learn(job, run, model, eval_envs, signals, report, should_continue)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -92,12 +89,13 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     if not {"algo", "env"} <= arguments.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
-    job = TrainingJob.from_arguments(config, {**arguments, **changes}, run.arguments)
+    given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs")}
+    job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = load_snapshot(run, config.algo, env, job.device, **attributes)
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
-        return _learn(job, run, model, eval_envs, signals, report, config.n_timesteps - model.num_timesteps)
+        return _learn(job, run, model, eval_envs, signals, report)
 
 
 @contextmanager
@@ -107,20 +105,16 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
     The latter by task, the run's own first, whose name is None; none if there are no evaluations.
     """
     config = job.config
-    made: list[VecEnv] = []
     evaluating: EvalEnvs = {}
-    try:
-        made.append(make_environments(config, config.n_envs, seed_for("training", job.seed)))
+    with ExitStack() as stack:
+        env = stack.enter_context(closing(make_environments(config, config.n_envs, seed_for("training", job.seed))))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
             for task in (None, *config.eval_tasks):
                 settings = config.for_evaluation({**(job.eval_env_kwargs or {}), **({} if task is None else {"task": task})})
-                made.append(make_environments(settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed)))
-                evaluating[task] = made[-1]
-        yield made[0], evaluating
-    finally:
-        for env in made:
-            env.close()
+                made = make_environments(settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed))
+                evaluating[task] = stack.enter_context(closing(made))
+        yield env, evaluating
 
 
 def _expert(config: TrainingConfig) -> dict[str, Any]:
@@ -156,19 +150,32 @@ def _learn(
     eval_envs: EvalEnvs,
     signals: StopSignals,
     report: Report,
-    timesteps: int,
-    should_continue: ShouldContinue = _always,
+    should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
-    last_good, best = LastGoodModel(), _best_model(job, run, model, eval_envs, report, should_continue)
+    last_good, best = LastGoodModel(), None
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
-    callbacks += [] if best is None else [best]
-    callbacks += [] if job.save_freq < 1 else [Checkpoint(job.save_freq, run.checkpoint)]
+    if eval_envs:
+        best = BestModel(
+            eval_envs[None],
+            every=job.eval_freq if job.eval_freq > 0 else 2**62,
+            n_episodes=job.eval_episodes,
+            seed=seed_for("evaluation", job.seed),
+            best_model=run.best_model,
+            evaluations=run.evaluations,
+            report=report,
+            others={task: env for task, env in eval_envs.items() if task is not None},
+            expert=getattr(model, "expert", None) if job.config.eval_expert else None,
+            should_continue=should_continue,
+        )
+        callbacks.append(best)
+    if job.save_freq > 0:
+        callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
     callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
     start = time.perf_counter()
     try:
         model.learn(
-            timesteps,
+            job.config.n_timesteps - model.num_timesteps,
             callback=callbacks,
             log_interval=job.log_interval,
             tb_log_name=f"{job.config.algo}_{run.path.name}",
@@ -184,10 +191,11 @@ def _learn(
     seconds = time.perf_counter() - start
     if signals.received is None:
         save_model(model, run.model)
-        forget_snapshot(run)
+        for only_interrupted in (run.resume_state, run.dataset):
+            only_interrupted.unlink(missing_ok=True)
         return TrainingResult(job, run, model, seconds)
     if last_good.snapshot is not None:
-        write_snapshot(run, last_good.snapshot, model, resumable=True)
+        write_snapshot(run, last_good.snapshot, model)
         report(
             f"interrupted by {signals.name} after {last_good.snapshot.timesteps:,} timesteps: model saved to {run.model}; "
             f"to go on: --resume {run.path}"
@@ -197,36 +205,12 @@ def _learn(
     return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
 
 
-def _best_model(
-    job: TrainingJob,
-    run: RunFolder,
-    model: OnPolicyAlgorithm,
-    eval_envs: EvalEnvs,
-    report: Report,
-    should_continue: ShouldContinue,
-) -> BestModel | None:
-    if not eval_envs:
-        return None
-    return BestModel(
-        eval_envs[None],
-        every=job.eval_freq if job.eval_freq > 0 else 2**62,
-        n_episodes=job.eval_episodes,
-        seed=seed_for("evaluation", job.seed),
-        best_model=run.best_model,
-        evaluations=run.evaluations,
-        report=report,
-        others={task: env for task, env in eval_envs.items() if task is not None},
-        expert=getattr(model, "expert", None) if job.config.eval_expert else None,
-        should_continue=should_continue,
-    )
-
-
 def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, model: OnPolicyAlgorithm) -> None:
     """Save the last good model, and say so in ``error``; a numerical breakdown becomes a TrainingError."""
     snapshot = last_good.snapshot
     if snapshot is None:
         return
-    write_snapshot(run, snapshot, model, resumable=False)
+    write_bytes(run.model, snapshot.model)
     where = f"the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
         raise type(error)(f"{error}; {where}") from error

@@ -1,50 +1,68 @@
-"""Trimming an agent: the offset μ and the scale α of its position, found by flying and folded into its first layer (4.3.1).
+"""Trimming an agent, in place: its steady offset from the target is cancelled by its own weights, so its zip stays stock.
 
-An agent that PPO has trained hovers beside its target, by the same vector wherever the target is, and covers the last metre
-slowly. The thesis cancels both in the scaling of the observation (Eq. 3.16): the measured offset goes into the position
-components of μ, and σ is multiplied by an α below 1 near the target (Eq. 4.10). Here α is a constant, so that both can go into
-the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ / (α σ)): the agent flies without any wrapper,
-and its zip stays a stock one.
+:func:`trim` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its target, by the same vector
+wherever the target is, and covers the last metre slowly. The thesis cancels both in the scaling of the observation (Eq. 3.16):
+the measured offset goes into the position components of μ, and σ is multiplied by an α below 1 near the target (Eq. 4.10).
+Here α is a constant, so that both can go into the actor's first layer, since
+W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ / (α σ)): the agent flies without any wrapper.
+
+That fits one heading. :func:`trim_hover` is for agents whose offset turns with the heading: at its target, level and at rest,
+an agent should give hover thrust, and one that was trained by samples gives that but for a hundredth. What its last layer W, b
+must change by, D = [ΔW, Δb], follows in closed form::
+
+    min  mean_ψ |h̄(ψ) D + y(ψ)|² + λ mean_s |h(s) D|²
+
+with h the input of that layer and a 1, h̄(ψ) its mean over the observation noise at the target with heading ψ, y(ψ) the mean
+action there less that of hover, and s the states of flights: a change is cheap where the agent never is.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import deepcopy
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
-from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 _POSITION = GROUPS["position"]
 SCALES = (1.0, 0.85, 0.75, 0.65, 0.55, 0.5)  # α
 N_TARGETS, N_RECOVERIES = 120, 480  # flights that judge a scale
 TOLERATED = 0.02  # loss of recovery success for which a smaller α is still taken, if it does not double the failures
 
+STIFFNESS = 0.1  # λ
+N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
+TASKS = {"state_recovery": 0.5, "recovery_and_tracking": 0.5}
+N_FLIGHTS, STEPS, EVERY = 240, 300, 3  # flights whose states must not see a change: their first 3 s, every third step
 
-@dataclass(frozen=True)
-class Trim:
+
+class Trim(NamedTuple):
     """What trimming did.
 
-    :param offset_before: size of the steady offset in m.
-    :param offset_after: the same, after it.
+    :param before: size of the steady offset in m; of :func:`trim_hover`, the mean action at the target less that of hover,
+        root mean square over headings and rotors.
+    :param after: the same, after it.
     :param scale: α.
     """
 
-    offset_before: float
-    offset_after: float
-    scale: float
+    before: float
+    after: float
+    scale: float = 1.0
 
 
 def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
-    """Find μ and α for an agent and fold them into its first layer, in place.
+    """Find μ and α for an agent and fold them into its first layer.
 
     Of the scales, the one with the highest mean reward of target tracking is taken, if all its flights succeed and recoveries
     succeed as often as with α = 1, within two hundredths and with at most twice the failures.
@@ -55,33 +73,34 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
     """
     own = settings or FlightSettings()
     layer = _first_layer(model)
-    original = layer.weight.detach().clone(), layer.bias.detach().clone()
-    std = np.asarray(DEFAULT_STD if own.observation_std is None else own.observation_std, dtype=np.float64)[_POSITION]
-    before = float(np.linalg.norm(hover_offset(model, seed=seed, settings=own)))
-    best, best_reward, needed = 1.0, -np.inf, 0.0
-    best_layer = original
+    original = best = deepcopy(layer.state_dict())
+    _, std = _scaling(own)
+    before = hover_offset(model, seed=seed, settings=own)
+    best_scale, best_reward, needed = 1.0, -np.inf, 0.0
     for scale in SCALES:
-        _restore(layer, original)
+        layer.load_state_dict(original)
         scale_position(model, scale)
         try:
             for number in range(1, ROUNDS + 1):
-                shift_position(model, hover_offset(model, seed=seed + number * N_TARGETS, settings=own), std)
+                shift_position(model, hover_offset(model, seed=seed + number * N_TARGETS, settings=own), std[_POSITION])
         except ConfigError:
             if scale == 1.0:
                 raise
             break  # already too lively to hover
-        reward, success, recovery = _judge(model, seed, own)
+        tracking = _fly(model, own, "target_tracking", range(seed, seed + N_TARGETS))
+        recovery = float(_fly(model, own, "state_recovery", range(seed, seed + N_RECOVERIES)).success.mean())
+        reward = float(tracking.reward.mean())
         if scale == 1.0:
             needed = recovery - min(TOLERATED, 1.0 - recovery)
-        if success == 1.0 and recovery >= needed and reward > best_reward:
-            best, best_reward = scale, reward
-            best_layer = layer.weight.detach().clone(), layer.bias.detach().clone()
-    _restore(layer, best_layer)
-    return Trim(before, float(np.linalg.norm(hover_offset(model, seed=seed, settings=own))), best)
+        if tracking.success.all() and recovery >= needed and reward > best_reward:
+            best, best_scale, best_reward = deepcopy(layer.state_dict()), scale, reward
+    layer.load_state_dict(best)
+    after = hover_offset(model, seed=seed, settings=own)
+    return Trim(float(np.linalg.norm(before)), float(np.linalg.norm(after)), best_scale)
 
 
 def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray) -> None:
-    """Let the actor see its position moved by ``offset`` (m, world frame), in place.
+    """Let the actor see its position moved by ``offset`` (m, world frame).
 
     :param std: σ of the position features, shape (3,).
     """
@@ -92,17 +111,38 @@ def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray
 
 
 def scale_position(model: OnPolicyAlgorithm, scale: float) -> None:
-    """Let the actor see its distance from the target divided by ``scale`` (α), in place."""
+    """Let the actor see its distance from the target divided by ``scale`` (α)."""
     with th.no_grad():
         _first_layer(model).weight[:, _POSITION] /= scale
 
 
-def _judge(model: OnPolicyAlgorithm, seed: int, settings: FlightSettings) -> tuple[float, float, float]:
-    """Mean reward and success of target tracking, success of state recovery."""
-    episodes = {"task_kwargs": None, "max_episode_steps": MAX_EPISODE_STEPS}
-    tracking = fly_settings(model, settings.with_changes(task="target_tracking", **episodes), range(seed, seed + N_TARGETS))
-    recovery = fly_settings(model, settings.with_changes(task="state_recovery", **episodes), range(seed, seed + N_RECOVERIES))
-    return float(tracking.reward.mean()), float(tracking.success.mean()), float(recovery.success.mean())
+def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
+    """Correct an agent's last layer so that it hovers at its target with every heading.
+
+    :param seed: of the flights and of the observation noise.
+    :param settings: vehicle, noise and scaling that the agent flies with.
+    :raises ConfigError: an agent whose last layer is not linear, or that does not read the 18 features.
+    """
+    layer = getattr(model.policy, "action_net", None)
+    if not isinstance(layer, th.nn.Linear) or model.observation_space.shape != (OBSERVATION_SIZE,):
+        raise ConfigError("trimming needs an MlpPolicy that reads the 18 features")
+    own = settings or FlightSettings()
+    at_target = _latents(model, _at_target(own, np.random.default_rng(seed)))
+    at_target = at_target.reshape(N_HEADINGS, N_SAMPLES, -1).mean(dim=1)
+    seen = _Observations()
+    _fly(model, own, TASKS, range(seed, seed + N_FLIGHTS), STEPS, seen)
+    flown = _latents(model, np.concatenate(seen.kept))
+    hover = load_vehicle(own.vehicle).hover_action
+    with th.no_grad():
+        weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()  # (inputs + 1, actions)
+        before = at_target @ weights - hover
+        metric = at_target.T @ at_target / len(at_target) + STIFFNESS * flown.T @ flown / len(flown)
+        metric += 1e-6 * th.eye(len(metric), dtype=metric.dtype)
+        weights -= th.linalg.solve(metric, at_target.T @ before / len(at_target))
+        layer.weight.copy_(weights[:-1].T)
+        layer.bias.copy_(weights[-1])
+        after = at_target @ weights - hover
+    return Trim(*(float(action.square().mean().sqrt()) for action in (before, after)))
 
 
 def _first_layer(model: OnPolicyAlgorithm) -> th.nn.Linear:
@@ -112,7 +152,50 @@ def _first_layer(model: OnPolicyAlgorithm) -> th.nn.Linear:
     return layer
 
 
-def _restore(layer: th.nn.Linear, values: tuple[th.Tensor, th.Tensor]) -> None:
+def _fly(
+    model: OnPolicyAlgorithm, settings: FlightSettings, task: Any, seeds: range, steps: int = MAX_EPISODE_STEPS, *hooks: Hook
+) -> Flights:
+    changes = {"task": task, "task_kwargs": None, "max_episode_steps": steps}
+    return fly_settings(model, settings.with_changes(**changes), seeds, hooks=hooks)
+
+
+class _Observations(Hook):
+    """Keeps every third observation of flights."""
+
+    def __init__(self) -> None:
+        self.kept: list[Float32Array] = []
+        self._steps = 0
+
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
+        if self._steps % EVERY == 0:
+            self.kept.append(observation[flying])
+        self._steps += 1
+
+
+def _latents(model: OnPolicyAlgorithm, observations: Float32Array) -> th.Tensor:
+    """Inputs of the actor's last layer and a 1, float64, (n, inputs + 1)."""
+    policy: Any = model.policy
     with th.no_grad():
-        layer.weight.copy_(values[0])
-        layer.bias.copy_(values[1])
+        tensor = th.as_tensor(observations, device=model.device)
+        features = BasePolicy.extract_features(policy, tensor, policy.pi_features_extractor)
+        latent = policy.mlp_extractor.forward_actor(features).double().cpu()
+    return th.cat([latent, th.ones(len(latent), 1, dtype=th.float64)], dim=1)
+
+
+def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Array:
+    """Observations at the target, level and at rest: N_HEADINGS headings, N_SAMPLES of each."""
+    heading = np.repeat(np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False), N_SAMPLES)
+    features = np.zeros((heading.size, OBSERVATION_SIZE))
+    cosine, sine = np.cos(heading), np.sin(heading)
+    rotation = np.stack([cosine, sine, 0 * sine, -sine, cosine, 0 * sine, 0 * sine, 0 * sine, 0 * sine + 1], axis=1)
+    features[:, GROUPS["rotation"]] = rotation  # world to body, row by row
+    features *= 1.0 + settings.noise * rng.standard_normal(features.shape)
+    mean, std = _scaling(settings)
+    return np.asarray((features - mean) / std, dtype=np.float32)
+
+
+def _scaling(settings: FlightSettings) -> tuple[FloatArray, FloatArray]:
+    """μ and σ of Eq. 3.16, (18,) both."""
+    given = ((settings.observation_mean, DEFAULT_MEAN), (settings.observation_std, DEFAULT_STD))
+    mean, std = (np.asarray(default if value is None else value, dtype=np.float64) for value, default in given)
+    return mean, std

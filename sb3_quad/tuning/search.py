@@ -7,7 +7,6 @@ import json
 import math
 import warnings
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -149,7 +148,7 @@ class Search:
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
                 # Never due with the last timestep: that evaluation follows the last update.
-                replace(self.job, config=config, eval_freq=total // count + 1 if count > 1 else -1),
+                self.job.model_copy(update={"config": config, "eval_freq": total // count + 1 if count > 1 else -1}),
                 report=lambda line: None,
                 on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 should_continue=should_continue,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,15 +18,7 @@ from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.config import load_config
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.job import TrainingJob, describe
-from sb3_quad.training.pipeline import (
-    PipelineResult,
-    first_job,
-    load_pipeline,
-    make_jobs,
-    resume_pipeline,
-    run_pipeline,
-    with_settings,
-)
+from sb3_quad.training.pipeline import PipelineResult, load_pipeline, resume_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import train
 
 FRESH_EPISODES = 960
@@ -49,21 +40,20 @@ def run_stages(
                 f"{flag} goes with a single run (--algo, --env); a pipeline's stages have their own in {conf_file}"
             )
     pipeline = with_settings(load_pipeline(conf_file), overrides)
-    jobs = make_jobs(pipeline, job)
     start = time.perf_counter()
-    result = run_pipeline(pipeline, jobs, Path(conf_file).stem, report)
-    return finish(result, options.reference, time.perf_counter() - start, jobs[0], report)
+    result = run_pipeline(pipeline, job, Path(conf_file).stem, report)
+    return finish(result, options.reference, time.perf_counter() - start, report)
 
 
-def finish(result: PipelineResult, reference: bool, seconds: float, first: TrainingJob, report: Callable[[str], None]) -> int:
+def finish(result: PipelineResult, reference: bool, seconds: float, report: Callable[[str], None]) -> int:
     """Train the reference agent if it is wanted, and print both tasks' tables."""
     if result.exit_code != 0:
         return result.exit_code
-    times = {entry.stage.name: entry.seconds for entry in result.stages}
+    first, times = result.job, {name: entry.seconds for name, entry in result.stages.items()}
     controllers: dict[str, Any] = {"expert": resolve_expert(first.config.expert or "pid", first.flight_settings.vehicle)}
-    controllers |= {entry.stage.name: load_model(entry.agent) for entry in result.stages}
+    controllers |= {name: load_model(entry.agent) for name, entry in result.stages.items()}
     if reference:
-        job = _reference(first, sum(entry.timesteps for entry in result.stages))
+        job = _reference(first, sum(entry.timesteps for entry in result.stages.values()))
         report(f"PPO only: {describe(job)}")
         alone = train(job, report)
         if alone.exit_code != 0:
@@ -72,8 +62,8 @@ def finish(result: PipelineResult, reference: bool, seconds: float, first: Train
         controllers["PPO only"] = load_model(alone.run.best_model if alone.run.best_model.is_file() else alone.run.model)
     print_tables(controllers, first)
     report("; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; both stages together: {seconds:.0f} s")
-    for entry in result.stages:
-        report(f"{entry.stage.name}: {entry.agent}")
+    for name, entry in result.stages.items():
+        report(f"{name}: {entry.agent}")
     report(f"saved in {result.folder}")
     return 0
 
@@ -90,11 +80,11 @@ def _reference(first: TrainingJob, n_timesteps: int) -> TrainingJob:
     """PPO alone on as many timesteps as all stages had together."""
     kept = {"vec_env": first.config.vec_env, "env_kwargs": first.config.flight_settings.in_any_task()}
     config = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, {**kept, "n_timesteps": n_timesteps})
-    return replace(first, config=config, trained_agent=None)
+    return first.model_copy(update={"config": config, "trained_agent": None})
 
 
 def resume_stages(folder: Path, changes: Mapping[str, Any], reference: bool, report: Callable[[str], None]) -> int:
     """Go on with an interrupted pipeline. Returns the exit code."""
     start = time.perf_counter()
     result = resume_pipeline(folder, report, **changes)
-    return finish(result, reference, time.perf_counter() - start, first_job(folder), report)
+    return finish(result, reference, time.perf_counter() - start, report)

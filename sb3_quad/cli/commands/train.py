@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.validate import validate
 from sb3_quad.cli.arguments.train import DEFAULT_PIPELINE
 from sb3_quad.cli.commands.stages import resume_stages, run_stages
 from sb3_quad.cli.compare import agent_and_expert
@@ -44,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
 
 def make_job(options: argparse.Namespace) -> TrainingJob:
     """The job that a command line describes."""
-    return TrainingJob(make_config(options), **job_arguments(options))
+    return validate(TrainingJob, {"config": make_config(options), **job_arguments(options)}, "command line")
 
 
 def job_arguments(options: argparse.Namespace) -> dict[str, Any]:

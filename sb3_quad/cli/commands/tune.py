@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 from contextlib import suppress
-from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.validate import validate
 from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console, print_line, progress_bar
 from sb3_quad.cli.parser import pairs
@@ -65,19 +65,20 @@ def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
         given = {**config.eval_env_kwargs, **pairs(options.eval_env_kwargs, "--eval-env-kwargs")}
         config = build_config(config.algo, config.env_id, {**config.settings, "eval_env_kwargs": given})
     space = load_space(config.algo, config.settings, options.search_space)
-    job = TrainingJob(
-        config,
-        seed=make_seed(options),
-        device=options.device,
-        trained_agent=options.trained_agent,
-        eval_episodes=EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes,
-        n_eval_envs=options.n_eval_envs,
-    )
+    given = {
+        "seed": make_seed(options),
+        "device": options.device,
+        "trained_agent": options.trained_agent,
+        "eval_episodes": EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes,
+        "n_eval_envs": options.n_eval_envs,
+    }
+    job = validate(TrainingJob, {"config": config, **given}, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     name = options.study_name or f"{config.algo}_{config.env_id}"
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
     try:
-        return Search(replace(job, log_folder=str(folder)), space, name, options.storage or folder / JOURNAL, *study), folder
+        job = job.model_copy(update={"log_folder": str(folder)})
+        return Search(job, space, name, options.storage or folder / JOURNAL, *study), folder
     except SB3QuadError:
         with suppress(OSError):
             folder.rmdir()
@@ -115,7 +116,7 @@ def _fly(search: Search, best: FrozenTrial) -> None:
         return
     run = open_run(path)
     config = build_config(known.algo, known.env_id, settings_of(best))
-    console().print(agent_and_expert(replace(search.job, config=config), load_model(run.model)))
+    console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
     print_line(f"agent: {run.model}")
 
 

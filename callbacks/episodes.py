@@ -1,15 +1,60 @@
-"""How the training's flights end, and how soon they arrive, in the log."""
+"""The training's episodes: each in a file, and how the latest flights ended in the log."""
 
 from __future__ import annotations
 
+import time
 from collections import deque
+from pathlib import Path
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.monitor import ResultsWriter
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.controller import true_state_of
+
+
+class EpisodeLog(BaseCallback):
+    """Adds a line for each episode that ends: return, length, seconds since the start, success.
+
+    It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and rl-zoo's plots read the file.
+    An existing file is continued.
+
+    >>> from stable_baselines3 import PPO
+    >>> from stable_baselines3.common.results_plotter import load_results
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, device="cpu")
+    >>> _ = model.learn(800, callback=EpisodeLog("0.monitor.csv"))
+    >>> len(load_results("."))
+    16
+
+    :param path: must be named ``<number>.monitor.csv``.
+    :param env_id: noted in the file.
+    """
+
+    def __init__(self, path: str | Path, env_id: str = "", verbose: int = 0) -> None:
+        super().__init__(verbose)
+        self._path = Path(path)
+        self._env_id = env_id
+
+    def _on_training_start(self) -> None:
+        self._start = time.time()
+        header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
+        self._writer = ResultsWriter(str(self._path), header, ("is_success",), override_existing=not self._path.exists())
+
+    def _on_step(self) -> bool:
+        infos, seconds = self.locals["infos"], round(time.time() - self._start, 3)
+        for row in np.flatnonzero(self.locals["dones"]):
+            info = infos[row]
+            if "episode" in info:
+                values = {"r": round(float(info["episode"]["r"]), 6), "l": int(info["episode"]["l"]), "t": seconds}
+                self._writer.write_row({**values, "is_success": info.get("is_success", "")})
+        return True
+
+    def _on_training_end(self) -> None:
+        self._writer.close()
 
 
 class FlightMetrics(BaseCallback):

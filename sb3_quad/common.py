@@ -1,0 +1,132 @@
+"""What DAgger and PPO with behavioural cloning share: the terms of Eqs. 4.3 and 4.4, and forward passes.
+
+Every function takes and gives tensors; ``b`` is the mini-batch, ``a`` the action dimension. The forward passes leave out what
+a training step does not need, and agree with the policy's own methods to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import torch as th
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
+from stable_baselines3.common.torch_layers import MlpExtractor
+from torch.nn import functional as F
+
+CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
+CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
+HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
+MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
+
+
+def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """-log π(a|s) of a diagonal Gaussian, (b,), summed over the action's dimensions."""
+    scaled = (actions - mean) * th.exp(-log_std)
+    return (0.5 * scaled.square() + log_std + 0.5 * math.log(2.0 * math.pi)).sum(dim=1)
+
+
+def gaussian_entropy(log_std: th.Tensor) -> th.Tensor:
+    """H of a diagonal Gaussian, a scalar: the same in every state, because the standard deviation is (Eq. 4.2)."""
+    return (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+
+
+def cloning_errors(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """How far the policy is from the expert's ``actions`` (b, a), by row, (b,); L_BC is the mean over the rows.
+
+    ``"nll"``: Eq. 3.12, the negative log-likelihood, a sum over the action's dimensions; it also shrinks the standard
+    deviation towards the error that is left. The others are means over the dimensions and leave the deviation alone.
+    ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. In a tumble, the
+    expert's action cannot be told from a noisy observation: squared errors are large there and take most of the gradient,
+    though nothing can be learnt. Linear ones leave more of it to the approach and the hover, where a hundredth is
+    centimetres. ``"huber_mse"``: that and three times the squared error, for policies that must do both.
+    """
+    if kind == "nll":
+        return gaussian_nll(mean, log_std, actions)
+    squared = (mean - actions).square().mean(dim=1)
+    if kind == "mse":
+        return squared
+    huber = F.huber_loss(mean, actions, delta=HUBER_DELTA, reduction="none").mean(dim=1) / HUBER_DELTA
+    return huber if kind == "huber" else huber + MSE_WEIGHT * squared
+
+
+def value_loss(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range: float | None) -> th.Tensor:
+    """The critic's loss, a scalar: Eq. 3.8 averaged over the rows, or plain mean squared error without ``clip_range``.
+
+    Eq. 3.8 takes the larger of the two errors, so leaving the clip range is never rewarded; SB3's own clipping takes
+    the clipped one alone.
+
+    :param values: v(s) now, (b,)
+    :param old_values: v(s) when the rollout was flown, (b,)
+    :param returns: Ĝ of Eq. 3.11, (b,)
+    """
+    error = (values - returns).square()
+    if clip_range is not None:
+        clipped = old_values + (values - old_values).clamp(-clip_range, clip_range)
+        error = th.max(error, (clipped - returns).square())
+    return error.mean()
+
+
+def l2_loss(policy: ActorCriticPolicy) -> th.Tensor:
+    """½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar; biases and log_std are left out."""
+    return 0.5 * th.stack([weights.square().sum() for weights in policy.parameters() if weights.ndim > 1]).sum()
+
+
+def actor_mean(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
+    """Mean of the policy's Gaussian, (b, a), by the actor alone; ``evaluate_actions`` would run the critic too."""
+    features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
+    mean: th.Tensor = policy.action_net(_latent(policy, "actor", features))
+    return mean
+
+
+def critic_values(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
+    """``policy.predict_values``, (b,)."""
+    features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
+    values: th.Tensor = policy.value_net(_latent(policy, "critic", features))
+    return values.flatten()
+
+
+def evaluate_actions(
+    policy: ActorCriticPolicy, observations: th.Tensor, actions: th.Tensor
+) -> tuple[th.Tensor, th.Tensor, th.Tensor | None, th.Tensor]:
+    """``policy.evaluate_actions`` in less time, and the mode of the action distribution.
+
+    :return: values (b,); log-probabilities of ``actions`` (b,); entropy, (b,), or a scalar where it is the same for all, or
+        None without a closed form; modes (b, a).
+    """
+    features: Any = policy.extract_features(observations)
+    for_actor, for_critic = (features, features) if policy.share_features_extractor else features
+    latent_pi, latent_vf = _latent(policy, "actor", for_actor), _latent(policy, "critic", for_critic)
+    values = policy.value_net(latent_vf).flatten()
+    if type(policy.action_dist) is DiagGaussianDistribution:
+        mean, log_std = policy.action_net(latent_pi), policy.log_std
+        return values, -gaussian_nll(mean, log_std, actions), gaussian_entropy(log_std), mean
+    distribution = policy._get_action_dist_from_latent(latent_pi)
+    return values, distribution.log_prob(actions), distribution.entropy(), distribution.mode()
+
+
+def _latent(policy: ActorCriticPolicy, part: str, features: th.Tensor) -> th.Tensor:
+    """Input of the last layer of the ``actor`` or the ``critic``, (b, latent_dim)."""
+    extractor: Any = policy.mlp_extractor
+    if type(extractor) is not MlpExtractor:
+        return extractor.forward_actor(features) if part == "actor" else extractor.forward_critic(features)  # type: ignore[no-any-return]
+    for layer in extractor.policy_net if part == "actor" else extractor.value_net:
+        features = _Tanh.apply(features) if type(layer) is th.nn.Tanh else layer(features)  # type: ignore[no-untyped-call]
+    return features
+
+
+class _Tanh(th.autograd.Function):
+    """tanh(x) = 2 σ(2x) - 1. PyTorch's CPU code computes σ three to four times as fast as tanh; they agree to 1e-7."""
+
+    @staticmethod
+    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:
+        y = th.sigmoid(x + x).mul_(2.0).sub_(1.0)
+        ctx.save_for_backward(y)
+        return y
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: th.Tensor) -> th.Tensor:
+        (y,) = ctx.saved_tensors
+        result: th.Tensor = th.ops.aten.tanh_backward(gradients[0], y)
+        return result

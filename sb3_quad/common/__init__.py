@@ -1,1 +1,0 @@
-"""What the two algorithms share: forward passes and loss terms."""
