@@ -7,8 +7,8 @@ from typing import Any
 
 from sb3_quad.base.arrays import Arrays, FloatArray
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import Flights, Plan, fly_settings
-from sb3_quad.scenarios.sample import Episodes, sample_episodes
+from sb3_quad.evaluation.flights import Flights, fly_settings
+from sb3_quad.scenarios.sample import sample_plan
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
 
@@ -37,22 +37,19 @@ def fly_scenario(
     chosen = range(scenario.seed, scenario.seed + scenario.episodes) if seeds is None else seeds
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
-    size = PART_SIZES.get(backend, 1)
+    size, settings = PART_SIZES.get(backend, 1), flown_as(scenario)
     parts, trajectories = [], None
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
-        episodes = sample_episodes(scenario, chosen[part], None if factors is None else factors[part])
-        recorder = Recorder(min(recorded, len(episodes.seeds)), episodes.steps) if recorded and first == 0 else None
-        settings, plan = flown_as(episodes)
+        plan = sample_plan(scenario, chosen[part], None if factors is None else factors[part])
+        recorder = Recorder(min(recorded, len(chosen[part])), scenario.steps) if recorded and first == 0 else None
         hooks = () if recorder is None else (recorder,)
-        parts.append(fly_settings(controller, settings, episodes.seeds, backend, scenario.tolerances, hooks, plan))
+        parts.append(fly_settings(controller, settings, chosen[part], backend, scenario.tolerances, hooks, plan))
         trajectories = recorder.arrays() if recorder is not None else trajectories
     return Flights.concatenate(parts), trajectories or {}
 
 
-def flown_as(episodes: Episodes) -> tuple[FlightSettings, Plan]:
-    """How the episodes of a scenario are flown, and what happens along the way."""
-    settings = FlightSettings(
-        task=episodes.task, vehicle=episodes.vehicle, noise=episodes.noise, max_episode_steps=episodes.steps
-    )
-    return settings, Plan(episodes.start, episodes.wrenches, episodes.waypoints, episodes.radius)
+def flown_as(scenario: Scenario) -> FlightSettings:
+    """How the episodes of a scenario are flown."""
+    vehicle = scenario.flown_vehicle()
+    return FlightSettings(task=scenario.task, vehicle=vehicle, noise=scenario.noise, max_episode_steps=scenario.steps)

@@ -11,11 +11,10 @@ import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
-from sb3_quad.evaluation.flights import Plan
 from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.scenarios.parts import Wrench
-from sb3_quad.scenarios.sample import Generators, sample_episodes, sample_wrenches
+from sb3_quad.scenarios.sample import Plan, sample_plan, sample_wrenches
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.recording import Recording, record
@@ -41,7 +40,8 @@ class Setting:
         vehicle = load_vehicle(settings.vehicle)
         start = {} if target is None else {"target": _target(target, vehicle)[None]}
         wrenches = [] if wrench is None else [wrench]
-        return Setting(settings, Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0]))))
+        acting = sample_wrenches(wrenches, vehicle.control_step, settings.max_episode_steps, [np.random.default_rng(0)])
+        return Setting(settings, Plan(start, acting))
 
     @staticmethod
     def of_scenario(text: str) -> Setting:
@@ -53,8 +53,7 @@ class Setting:
         if not colon:
             raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
         scenario = load_suite(suite).scenario(name)
-        n_steps = round(scenario.duration / scenario.flown_vehicle().control_step)
-        settings = FlightSettings(vehicle=scenario.vehicle, max_episode_steps=n_steps)
+        settings = FlightSettings(vehicle=scenario.vehicle, max_episode_steps=scenario.steps)
         return Setting(settings, scenario=scenario)
 
     def fly(self, name: str, controller: Any, seed: int, n_steps: int, deterministic: bool) -> Recording:
@@ -66,7 +65,7 @@ class Setting:
         """
         settings, plan = self.settings, self.plan
         if self.scenario is not None:
-            settings, plan = flown_as(sample_episodes(self.scenario, [seed]))
+            settings, plan = flown_as(self.scenario), sample_plan(self.scenario, [seed])
         return record(name, controller, settings.with_changes(max_episode_steps=n_steps), seed, plan, deterministic)
 
 

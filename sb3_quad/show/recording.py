@@ -11,8 +11,9 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose
-from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
+from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.experts.controller import observation_function
+from sb3_quad.scenarios.sample import Plan
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.state import POSITION, TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
