@@ -99,9 +99,13 @@ class StageResult:
 
 @dataclass(frozen=True)
 class PipelineResult:
-    """How a pipeline ended: all stages, or those before an interruption (then ``exit_code`` is not 0)."""
+    """How a pipeline ended: all stages, or those before an interruption (then ``exit_code`` is not 0).
+
+    :param job: of the first stage.
+    """
 
     folder: Path
+    job: TrainingJob
     stages: list[StageResult]
     exit_code: int = 0
 
@@ -185,12 +189,6 @@ def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **chang
     return _go_on(folder, pipeline, jobs, done, content["current"], report, **changes)
 
 
-def first_job(folder: Path) -> TrainingJob:
-    """The job of a pipeline's first stage, from its folder."""
-    pipeline, content = _read_status(folder)
-    return make_jobs(pipeline, content["job"])[0]
-
-
 def _read_status(folder: Path) -> tuple[Pipeline, dict[str, Any]]:
     content, where = SETTINGS.read(folder / STATUS_FILE)
     if not {"stages", "job", "done", "current"} <= content.keys():
@@ -217,13 +215,13 @@ def _go_on(
         current = None
         if result.exit_code != 0:
             report(f"to go on with the whole pipeline: --resume {folder}")
-            return PipelineResult(folder, done, result.exit_code)
+            return PipelineResult(folder, jobs[0], done, result.exit_code)
         agent = _passed_on(stage, result.run)
         if stage.trim is not None:
             agent = _trimmed(agent, job, stage.trim, report)
         done.append(StageResult(stage, result.run, agent, result.model.num_timesteps, round(result.seconds, 1)))
         _write_status(folder, pipeline, jobs, done, None)
-    return PipelineResult(folder, done)
+    return PipelineResult(folder, jobs[0], done)
 
 
 def _passed_on(stage: Stage, run: RunFolder) -> Path:
