@@ -12,11 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.scenarios.load import SUITES, load_suite, parse_suite
+from sb3_quad.scenarios.load import SUITES, axis_label, load_suite, parse_suite
 from sb3_quad.scenarios.parts import VehicleChanges
-from sb3_quad.scenarios.sample import sample_episodes
+from sb3_quad.scenarios.sample import sample_plan
 from sb3_quad.scenarios.scenario import Scenario, Suite
-from sb3_quad.scenarios.vary import axis_label
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -148,7 +147,7 @@ def test_vary_is_a_grid_of_named_cells():
 @given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))
 def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"
-    sampled, again = (sample_episodes(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
+    sampled, again = (sample_plan(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
     state = np.zeros((20, 3))
     state[3:7] = sampled["quaternion"].T
     cosines = QuadcopterState(state).rotation[:, 2, 2]
@@ -162,8 +161,8 @@ def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
 
 
 def test_what_a_task_samples_itself_stays_with_the_environment():
-    recovery = sample_episodes(load_suite("thesis").scenario("recovery"))
-    assert recovery.start == {}
+    recovery = load_suite("thesis").scenario("recovery")
+    assert sample_plan(recovery, [0]).start == {}
     assert recovery.task.random_attitude and recovery.task.velocity_std == 2.0 and recovery.task.body_rates_std == 4.0
 
 
@@ -178,10 +177,11 @@ def test_the_wrench_at_any_time_is_the_sum_of_those_that_act(times, factor):
         f" force: [{k + 1}, 0, 0], torque: [0, {k + 1}, 0]}}"
         for k, (first, length, frame) in enumerate(times)
     )
-    episodes = sample_episodes(scenario(f"duration: 0.5, wrenches: [{entries}]"), [0, 1], np.array([1.0, factor]))
+    windy = scenario(f"duration: 0.5, wrenches: [{entries}]")
+    wrenches = sample_plan(windy, [0, 1], np.array([1.0, factor])).wrenches
     now = np.zeros((2, 12))
-    for step in range(episodes.steps):
-        now = episodes.wrenches.get(step, now)
+    for step in range(windy.steps):
+        now = wrenches.get(step, now)
         expected = np.zeros(12)
         for k, (first, length, frame) in enumerate(times):
             if first <= step < first + length:

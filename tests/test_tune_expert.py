@@ -83,7 +83,7 @@ def test_gains_in_another_form_are_not_cut_in_half():
 
 
 def test_the_cost_tells_better_gains_from_worse_and_repeats_itself():
-    objective = ExpertObjective(ITM, GAINS, starts=600, targets=16, seed=3)
+    objective = ExpertObjective(ITM, starts=600, targets=16, seed=3)
     good = objective.cost(GAINS)
     assert objective.cost(GAINS) == good
     assert good.lost == 0 and good.settling < 4
@@ -122,7 +122,7 @@ def test_it_writes_a_vehicle_that_flies_and_goes_on_where_it_was_left(slow_itm, 
     tuned = load_vehicle(output)
     assert tuned.geometric_gains != load_vehicle(slow_itm).geometric_gains
     assert tuned.model_copy(update={"geometric_gains": None}) == ITM.model_copy(update={"geometric_gains": None})
-    objective = ExpertObjective(ITM, load_vehicle(slow_itm).geometric_gains, starts=120, targets=8)
+    objective = ExpertObjective(load_vehicle(slow_itm), starts=120, targets=8)
     assert objective.cost(tuned.geometric_gains).value < objective.cost(load_vehicle(slow_itm).geometric_gains).value
 
     assert main([*command, "-n", "20", "--seed", "1"]) == 2
@@ -178,7 +178,7 @@ def test_without_optuna_it_says_what_to_install(monkeypatch, tmp_path, capsys):
 
 
 def test_a_search_in_memory_starts_from_its_first_gains():
-    search = ExpertSearch(ITM, GAINS, starts=60, targets=4)
+    search = ExpertSearch(ITM, starts=60, targets=4)
     assert search.best == GAINS and search.trials_done == 0
     seen = []
     search.run(2, lambda done, least: seen.append((done, least)) is None)

@@ -47,6 +47,11 @@ def whole(text: str) -> int:
     return int(number)
 
 
+def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Those of some options that are given."""
+    return {name: value for name in names if (value := getattr(options, name)) is not None}
+
+
 def pairs(entries: Sequence[str] | None, option: str) -> dict[str, Any]:
     """``k:v`` entries as a mapping.
 

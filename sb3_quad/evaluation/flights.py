@@ -9,7 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unk
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.experts.controller import Controller
+from sb3_quad.scenarios.sample import Plan
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, WRENCH_SIZE, QuadcopterState
@@ -79,22 +80,6 @@ class Flights:
         columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
         times = {key: np.concatenate([part.time_to[key] for part in parts]) for key in parts[0].time_to}
         return Flights(time_to=times, **columns)
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What happens to n episodes whoever flies them.
-
-    :param start: what replaces the environments' own sample, as of :meth:`Fleet.reset`.
-    :param wrenches: from the control steps before which the external wrench changes to the new one, (n, 12).
-    :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its target.
-    :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
-    """
-
-    start: Mapping[str, FloatArray] = field(default_factory=dict)
-    wrenches: Mapping[int, FloatArray] = field(default_factory=dict)
-    waypoints: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    radius: float = 0.5
 
 
 class Hook:

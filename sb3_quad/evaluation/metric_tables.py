@@ -8,8 +8,8 @@ from itertools import groupby
 
 from sb3_quad.evaluation.records import Estimate, HitLimit, Metrics, Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
+from sb3_quad.scenarios.load import axis_name
 from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
-from sb3_quad.scenarios.vary import axis_name
 
 SUCCESS, REWARD, PATH, MEDIAN, LARGEST = "success", "mean reward", "mean path", "final error, median", "final error, largest"
 FLOWN, REACHED, COMPLETED, COURSE_TIME = "time flown", "waypoints reached", "courses completed", "time of the course"

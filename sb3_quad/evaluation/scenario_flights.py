@@ -9,10 +9,10 @@ import numpy as np
 
 from sb3_quad.base.arrays import Arrays, FloatArray
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import Flights, Plan, fly_settings
+from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.records import Estimate, HitLimit, HitTrial
 from sb3_quad.evaluation.summary import share
-from sb3_quad.scenarios.sample import Episodes, sample_episodes
+from sb3_quad.scenarios.sample import sample_plan
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.settings.flight import FlightSettings
 
@@ -43,23 +43,20 @@ def fly_scenario(
     chosen = range(scenario.seed, scenario.seed + scenario.episodes) if seeds is None else seeds
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
-    size = PART_SIZES.get(backend, 1)
+    size, settings = PART_SIZES.get(backend, 1), flown_as(scenario)
     parts, recorder = [], Recorder(recorded)
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
-        episodes = sample_episodes(scenario, chosen[part], None if factors is None else factors[part])
-        settings, plan = flown_as(episodes)
+        plan = sample_plan(scenario, chosen[part], None if factors is None else factors[part])
         hooks = [recorder] if recorded and first == 0 else []
-        parts.append(fly_settings(controller, settings, episodes.seeds, backend, scenario.tolerances, hooks, plan))
+        parts.append(fly_settings(controller, settings, chosen[part], backend, scenario.tolerances, hooks, plan))
     return Flights.concatenate(parts), recorder.arrays() if recorded else {}
 
 
-def flown_as(episodes: Episodes) -> tuple[FlightSettings, Plan]:
-    """How the episodes of a scenario are flown, and what happens along the way."""
-    settings = FlightSettings(
-        task=episodes.task, vehicle=episodes.vehicle, noise=episodes.noise, max_episode_steps=episodes.steps
-    )
-    return settings, Plan(episodes.start, episodes.wrenches, episodes.waypoints, episodes.radius)
+def flown_as(scenario: Scenario) -> FlightSettings:
+    """How the episodes of a scenario are flown."""
+    vehicle = scenario.flown_vehicle()
+    return FlightSettings(task=scenario.task, vehicle=vehicle, noise=scenario.noise, max_episode_steps=scenario.steps)
 
 
 def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> HitLimit | None:

@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.records import Estimate, Metrics, Results
 from sb3_quad.report.tracks import Flown, Track
+from sb3_quad.scenarios.load import axis_label, axis_name
 from sb3_quad.scenarios.scenario import Scenario
-from sb3_quad.scenarios.vary import axis_label, axis_name
 
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
 FORCE = "#db1a24"

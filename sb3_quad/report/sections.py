@@ -13,8 +13,8 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
 from sb3_quad.report.plots import Plot, arrivals_plot, errors_plot, group_plots, hits_plot
 from sb3_quad.report.tracks import Flown, read_tracks
+from sb3_quad.scenarios.load import axis_label
 from sb3_quad.scenarios.scenario import Scenario
-from sb3_quad.scenarios.vary import axis_label
 
 OVERVIEW = "Share of flights that neither touch the ground nor leave the range. Where a scenario is varied: least to greatest."
 

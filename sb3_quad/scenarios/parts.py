@@ -136,11 +136,6 @@ class Target(OneOf):
         """The fixed targets, in order; none if the target is random."""
         return self.waypoints if self.waypoints is not None else () if self.position is None else (self.position,)
 
-    @property
-    def switching_radius(self) -> float:
-        """The radius within which a waypoint counts as reached, m."""
-        return 0.5 if self.radius is None else self.radius
-
 
 class Wrench(Frozen):
     """An external force and torque at the centre of mass for some time; those that overlap add up."""

@@ -15,6 +15,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import SUITE
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
+from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle, is_vehicle_file, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
@@ -81,8 +82,7 @@ class Scenario(Frozen):
     @model_validator(mode="after")
     def _possible(self) -> Scenario:
         vehicle = self.flown_vehicle()
-        self._check_ground(vehicle)
-        self._check_reach(vehicle)
+        self._check_way(vehicle)
         step = vehicle.control_step
         if self.duration < step:
             raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
@@ -90,9 +90,8 @@ class Scenario(Frozen):
             if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
                 raise ValueError(f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control step, {step:g} s")
             if wrench.start >= self.duration:
-                raise ValueError(
-                    f"wrenches.{number}: starts at {wrench.start:g} s, when the episode of {self.duration:g} s is over"
-                )
+                over = f"when the episode of {self.duration:g} s is over"
+                raise ValueError(f"wrenches.{number}: starts at {wrench.start:g} s, {over}")
         if self.hit_search is not None and not self.wrenches:
             raise ValueError("hit_search: there are no wrenches to search with")
         return self
@@ -122,43 +121,53 @@ class Scenario(Frozen):
         return self.title or self.name
 
     @property
+    def steps(self) -> int:
+        """Control steps of an episode."""
+        return round(self.duration / self.nominal_vehicle().control_step)
+
+    @property
+    def task(self) -> Task:
+        """What the environments sample themselves, so that random targets and attitudes are those of training."""
+        return Task(
+            name="scenario",
+            start_position=self.start.position,
+            target_distance=self.target.distance or 0.0,
+            random_attitude=self.start.attitude.distribution == "uniform",
+            velocity_std=self.start.velocity.std or 0.0,
+            body_rates_std=self.start.body_rates.std or 0.0,
+            max_distance=self.max_distance,
+        )
+
+    @property
     def is_fixed(self) -> bool:
         """Whether every episode has the same start, target and wrenches, so that only noise tells them apart."""
-        start = self.start
-        vectors = [start.velocity, start.body_rates]
+        vectors = [self.start.velocity, self.start.body_rates]
         vectors += [vector for wrench in self.wrenches for vector in (wrench.force, wrench.torque)]
-        random = any(vector.value is None and vector.largest > 0.0 for vector in vectors)
-        fixed_target = self.target.distance is None or self.target.distance == 0.0
-        return fixed_target and not random and (start.attitude.quaternion is not None or start.attitude.tilt == 0.0)
+        random = self.start.attitude.distribution or self.start.attitude.tilt or self.target.distance
+        return not random and all(vector.value is not None or vector.largest == 0.0 for vector in vectors)
 
-    def _check_ground(self, vehicle: Vehicle) -> None:
-        least = vehicle.collision_radius
-        if self.start.position[2] <= least:
-            raise ValueError(f"start.position: {list(self.start.position)} touches the ground; z must exceed {least:g} m")
+    def _check_way(self, vehicle: Vehicle) -> None:
+        """See that start and targets lie above ground, within ``max_distance`` of each other and within reach."""
+        start, distance, least = self.start.position, self.target.distance or 0.0, vehicle.collision_radius
+        if start[2] <= least:
+            raise ValueError(f"start.position: {list(start)} touches the ground; z must exceed {least:g} m")
         for point in self.target.points:
             if point[2] <= least:
                 raise ValueError(f"target: {list(point)} lies below ground; z must exceed {least:g} m")
-
-    def _check_reach(self, vehicle: Vehicle) -> None:
-        start, least = self.start.position, self.start.velocity.largest
-        points = [start, *self.target.points]
-        for before, after in itertools.pairwise(points):
-            if math.dist(before, after) > self.max_distance:
-                raise ValueError(
-                    f"target: {list(after)} is {math.dist(before, after):.3g} m away, and an episode ends beyond"
-                    f" max_distance {self.max_distance:g} m"
-                )
-        distance = self.target.distance or 0.0
+        legs = list(itertools.pairwise([start, *self.target.points]))
+        for before, after in legs:
+            if (far := math.dist(before, after)) > self.max_distance:
+                limit = f"an episode ends beyond max_distance {self.max_distance:g} m"
+                raise ValueError(f"target: {list(after)} is {far:.3g} m away, and {limit}")
         if distance > self.max_distance:
             raise ValueError(f"target.distance: {distance:g} m is beyond max_distance {self.max_distance:g} m")
         # Full thrust in one direction throughout: no point outside this ball can be reached, whatever flies there.
-        thrust, fall = vehicle.thrust_limits[1] * vehicle.gravity, vehicle.gravity
-        half = 0.5 * self.duration**2
-        length = sum(math.dist(before, after) for before, after in itertools.pairwise(points))
-        needed = [math.dist(start, (x, y, z + fall * half)) for x, y, z in self.target.points]
-        reach = thrust * half + least * self.duration
-        out = any(far > reach for far in needed) or distance > (thrust - fall) * half + least * self.duration
-        if out or length > (thrust + fall) * half + least * self.duration:
+        half, coasting = 0.5 * self.duration**2, self.start.velocity.largest * self.duration
+        fall, thrust = vehicle.gravity, vehicle.thrust_limits[1] * vehicle.gravity
+        out = [math.dist(start, (x, y, z + fall * half)) > thrust * half + coasting for x, y, z in self.target.points]
+        out.append(distance > (thrust - fall) * half + coasting)
+        out.append(sum(itertools.starmap(math.dist, legs)) > (thrust + fall) * half + coasting)
+        if any(out):
             raise ValueError(f"target: cannot be reached within the duration of {self.duration:g} s at full thrust")
 
 
@@ -194,19 +203,19 @@ class Suite(Frozen):
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
-        changes: dict[str, Any] = {"episodes": episodes, "seed": seed}
-        flown_by = ""
+        changes = {key: value for key, value in (("episodes", episodes), ("seed", seed)) if value is not None}
+        flown_by: dict[str, Any] = {}
         if vehicle is not None:
-            changes |= {"vehicle": str(Path(vehicle).absolute()) if is_vehicle_file(vehicle) else vehicle, "reference": {}}
-            flown_by = f", flown by {vehicle}"
-        changes = {key: value for key, value in changes.items() if value is not None}
-        kept = [each for each in self.scenarios if not names or each.name in names or each.group in names]
+            flown_by = {"vehicle": str(Path(vehicle).absolute()) if is_vehicle_file(vehicle) else vehicle, "reference": {}}
         changed = []
-        for scenario in kept:
-            data = {**scenario.model_dump(), **changes}
+        for scenario in self.scenarios:
+            if names and scenario.name not in names and scenario.group not in names:
+                continue
+            data = {**scenario.model_dump(), **changes, **flown_by}
             if scenario.hit_search is not None and episodes is not None:
                 data["hit_search"]["episodes"] = min(scenario.hit_search.episodes, episodes)
-            changed.append(validate(Scenario, data, f"scenario {scenario.name}{flown_by}"))
+            where = f"scenario {scenario.name}" + (f", flown by {vehicle}" if flown_by else "")
+            changed.append(validate(Scenario, data, where))
         return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")

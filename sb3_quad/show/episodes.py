@@ -12,12 +12,12 @@ from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
 from sb3_quad.drawing.labels import COLOURS
-from sb3_quad.evaluation.flights import Hook, Plan, fly_settings
+from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.experts.controller import observation_function
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.scenarios.parts import Wrench
-from sb3_quad.scenarios.sample import Generators, sample_episodes, sample_wrenches
+from sb3_quad.scenarios.sample import Plan, sample_plan, sample_wrenches
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.recording import Recording
 from sb3_quad.simulation.checks import vector
@@ -75,7 +75,9 @@ def fixed_setting(
         if target[2] <= vehicle.collision_radius:
             raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
     wrenches = [validate(Wrench, push, "the push")] if push else []
-    plan = Plan(start, sample_wrenches(wrenches, vehicle, settings.max_episode_steps, Generators([0])))
+    generators = [np.random.default_rng(0)]
+    acting = sample_wrenches(wrenches, vehicle.control_step, settings.max_episode_steps, generators)
+    plan = Plan(start, acting)
     return Setting(settings.vehicle, lambda seed: (settings, plan))
 
 
@@ -88,7 +90,8 @@ def scenario_setting(text: str) -> Setting:
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).scenario(name)
-    return Setting(scenario.vehicle, lambda seed: flown_as(sample_episodes(scenario, [seed])))
+    settings = flown_as(scenario)
+    return Setting(scenario.vehicle, lambda seed: (settings, sample_plan(scenario, [seed])))
 
 
 def fly_all(

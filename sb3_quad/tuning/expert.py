@@ -18,7 +18,7 @@ import yaml
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains
+from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.tuning.study import load_optuna, open_study
@@ -66,19 +66,15 @@ class ExpertObjective:
     Nearly all starts are recovered by any sensible gains and no longer tell them apart: of ``starts`` recoveries, those
     ``hardest`` on which the first gains come closest to the ground are flown, and the others taken as recovered.
 
-    :param vehicle: what is flown.
-    :param first: gains to choose the hardest starts by; None: :func:`~sb3_quad.experts.geometric.derived_gains`.
+    :param vehicle: what is flown; the gains of its file, or those derived from it, choose the hardest starts.
     :param starts: recoveries to choose from.
     :param targets: tracking episodes. Half as many recoveries, from any start, are flown for their reward.
     :param seed: of all episodes.
     """
 
-    def __init__(
-        self, vehicle: Vehicle, first: GeometricGains | None = None, starts: int = 40_000, targets: int = 300, seed: int = 0
-    ) -> None:
+    def __init__(self, vehicle: Vehicle, starts: int = 40_000, targets: int = 300, seed: int = 0) -> None:
         self.vehicle, self.starts = vehicle, starts
-        expert = GeometricExpert(vehicle, first or derived_gains(vehicle))
-        heights = self._fly(expert, "state_recovery", range(seed, seed + starts), DESCENT)[1].lowest
+        heights = self._fly(GeometricExpert(vehicle), "state_recovery", range(seed, seed + starts), DESCENT)[1].lowest
         self.hardest = [seed + int(row) for row in np.sort(np.argsort(heights)[: max(starts // 60, 1)])]
         self.tracking = range(seed, seed + targets)
         self.recovery = range(seed + starts, seed + starts + max(targets // 2, 1))
@@ -115,35 +111,27 @@ class _Way(Hook):
 
 
 class ExpertSearch:
-    """A search that a journal file remembers, so that it goes on where it was left.
+    """A search around the gains of a vehicle's file, or those derived from it.
 
     :param vehicle: what the gains are for.
-    :param first: the gains it starts from, in the middle of what it tries.
-    :param journal: its file; one that exists is continued. None: nothing is remembered.
+    :param journal: a file that remembers the search; one that exists is continued. None: nothing is remembered.
     :param seed: of the sampler, and of the episodes.
     :param starts: recoveries of the objective, of which the hardest are flown; ``targets`` its tracking episodes.
     :raises ConfigError: Optuna is missing; a journal that cannot be read, or that is of a search with other settings.
     """
 
     def __init__(
-        self,
-        vehicle: Vehicle,
-        first: GeometricGains,
-        journal: Path | None = None,
-        seed: int = 0,
-        starts: int = 40_000,
-        targets: int = 300,
+        self, vehicle: Vehicle, journal: Path | None = None, seed: int = 0, starts: int = 40_000, targets: int = 300
     ) -> None:
-        self.vehicle, self.first = vehicle, first
+        self.vehicle, self.first = vehicle, GeometricExpert(vehicle).gains
         self._sizes = {"starts": starts, "targets": targets, "seed": seed}
         plain = vehicle.model_dump(mode="json", exclude={"geometric_gains"})
-        settings = json.dumps([plain, first.model_dump(mode="json", exclude={"measured"}), self._sizes], sort_keys=True)
-        start = {name: getattr(first, name) for name in SEARCHED}
-        self.study, known = open_study("geometric_gains", journal, "minimize", (SETTINGS, settings), start)
+        settings = json.dumps([plain, self.first.model_dump(mode="json", exclude={"measured"}), self._sizes], sort_keys=True)
+        self._start = {name: getattr(self.first, name) for name in SEARCHED}
+        self.study, known = open_study("geometric_gains", journal, "minimize", (SETTINGS, settings), self._start)
         if known != settings:
-            raise ConfigError(
-                f"journal {journal}: is of a search for another vehicle, or with other gains, sizes or seed; give another one"
-            )
+            other = "is of a search for another vehicle, or with other gains, sizes or seed"
+            raise ConfigError(f"journal {journal}: {other}; give another one")
         self.study.sampler = load_optuna().samplers.CmaEsSampler(seed=seed, popsize=16)
 
     @property
@@ -156,11 +144,6 @@ class ExpertSearch:
         """The best gains so far, the first ones if none have been flown."""
         return self._gains(self.study.best_params) if self.trials_done else self.first
 
-    @property
-    def best_cost(self) -> float:
-        """What they cost; infinite if none have been flown."""
-        return float(self.study.best_value) if self.trials_done else float("inf")
-
     def run(self, trials: int, after_each: Callable[[int, float], bool]) -> None:
         """Fly gains until ``trials`` are done in all.
 
@@ -169,18 +152,17 @@ class ExpertSearch:
         remaining = trials - self.trials_done
         if remaining <= 0:
             return
-        objective = ExpertObjective(self.vehicle, self.first, **self._sizes)
+        objective = ExpertObjective(self.vehicle, **self._sizes)
 
         def fly(trial: Trial) -> float:
-            middles = {name: getattr(self.first, name) for name in SEARCHED}
-            values = {name: trial.suggest_float(name, x / RANGE, x * RANGE, log=True) for name, x in middles.items()}
+            values = {name: trial.suggest_float(name, x / RANGE, x * RANGE, log=True) for name, x in self._start.items()}
             cost = objective.cost(self._gains(values))
             for part, value in cost._asdict().items():
                 trial.set_user_attr(part, value)
             return cost.value
 
         def report(study: Study, trial: Any) -> None:
-            if not after_each(self.trials_done, self.best_cost):
+            if not after_each(self.trials_done, study.best_value):
                 study.stop()
 
         self.study.optimize(fly, n_trials=remaining, callbacks=[report])

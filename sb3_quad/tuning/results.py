@@ -14,6 +14,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.report.plots import picture, styled
 from sb3_quad.tuning.search import ERROR, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import Choice, Interval, current
 
@@ -29,14 +30,22 @@ STYLES: dict[str, dict[str, Any]] = {
 }
 
 
-def write_results(search: Search, folder: Path) -> None:
-    """Write, or renew, the files of a search in its folder, less the plot.
+def write_results(search: Search) -> None:
+    """Write, or renew, the files of a search in its job's folder, less the plot.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
+    folder, best = Path(search.job.log_folder), search.best
     write_text(folder / TRIALS, trials_csv(search))
-    if search.best is not None:
-        write_text(folder / BEST, best_yaml(search, search.best, folder / BEST))
+    if best is not None:
+        head = [
+            f"Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.name}.",
+            f"{in_words(search, best)} over {search.job.eval_episodes} episodes, by which it was chosen;"
+            f" seed {search.job.seed}.",
+            train_command(search),
+        ]
+        settings = yaml.safe_dump({search.job.config.env_id: settings_of(best)}, sort_keys=False)
+        write_text(folder / BEST, "".join(f"# {line}\n" for line in head) + settings)
 
 
 def settings_of(trial: FrozenTrial) -> dict[str, Any]:
@@ -57,22 +66,11 @@ def in_words(search: Search, trial: FrozenTrial) -> str:
     return f"{rate}mean reward {reward:.2f}"
 
 
-def best_yaml(search: Search, best: FrozenTrial, path: Path) -> str:
-    """A trial's settings as ``train --conf-file`` takes them."""
-    how, episodes = in_words(search, best), search.job.eval_episodes
-    lines = [
-        f"# Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.name}.",
-        f"# {how} over {episodes} episodes, by which it was chosen; seed {search.job.seed}.",
-        f"# {train_command(search, path)}",
-    ]
-    return "\n".join(lines) + "\n" + yaml.safe_dump({search.job.config.env_id: settings_of(best)}, sort_keys=False)
-
-
-def train_command(search: Search, path: Path) -> str:
-    """What trains with the settings of a file, as the trials were."""
-    config = search.job.config
+def train_command(search: Search) -> str:
+    """What trains with the best settings, as the trials were."""
+    config, file = search.job.config, Path(search.job.log_folder, BEST)
     start = f" -i {search.job.trained_agent}" if search.job.trained_agent else ""
-    return f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {path}{start}"
+    return f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {file}{start}"
 
 
 def trials_csv(search: Search) -> str:
@@ -82,19 +80,19 @@ def trials_csv(search: Search) -> str:
     writer = csv.DictWriter(text, head, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
     for trial in search.trials():
-        state, duration = trial.state.name, trial.duration
         own = {
             "number": trial.number,
-            "state": state,
-            "value": trial.value if state == "COMPLETE" else None,
+            "state": trial.state.name,
+            "value": trial.value if trial.state.name == "COMPLETE" else None,
             "evaluations": len(trial.intermediate_values),
-            "seconds": None if duration is None else round(duration.total_seconds(), 2),
+            "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 2),
         }
         writer.writerow({**trial.user_attrs, **varied(search, trial), **own})
     return text.getvalue()
 
 
-def write_plot(search: Search, path: Path) -> None:
+@styled
+def write_plot(search: Search) -> None:
     """Plot the history of the trials, and each setting against what came of it, as PNG.
 
     Pruned trials are grey crosses, the best one is ringed. The vertical axis is the success, or the mean reward once half of
@@ -127,14 +125,13 @@ def write_plot(search: Search, path: Path) -> None:
             panel.set_xscale("log")
             panel.set_xticks(ticks, [f"{float(f'{tick:.2g}'):g}" for tick in ticks])
             panel.minorticks_off()
+        elif not isinstance(dimension, Choice):
+            panel.locator_params(axis="x", integer=dimension is None or dimension.whole)
         panel.set_xlabel(name)
-        panel.grid(alpha=0.25)
     first = panels[0, 0]
     numbers = [trial.number for trial in groups["finished"]]
     first.step(numbers, np.maximum.accumulate(heights["finished"]), where="post", color="C0", alpha=0.5)
-    first.legend(frameon=False, fontsize="small")
+    first.legend(fontsize="small")
     for panel in panels[:, 0]:
         panel.set_ylabel(label)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    write_bytes(path, buffer.getvalue())
+    write_bytes(Path(search.job.log_folder, PLOT), picture(figure, "png", dpi=110))

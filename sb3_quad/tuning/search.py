@@ -69,9 +69,9 @@ class Search:
         where = f"study {name} in {storage}"
         if not isinstance(known, dict):
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
-        differing = sorted(key for key in {**known, **wanted} if known.get(key) != wanted.get(key))
+        differing = ", ".join(sorted(key for key in {**known, **wanted} if known.get(key) != wanted.get(key)))
         if differing:
-            other = f"was begun with other settings ({', '.join(differing)})"
+            other = f"was begun with other settings ({differing})"
             raise ConfigError(f"{where}: {other}; give the same again, or another --study-name")
 
     def run(
@@ -98,8 +98,7 @@ class Search:
                 if failures == number + 1 == HOPELESS:
                     raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {ended.user_attrs[ERROR]}")
         except (OSError, load_optuna().exceptions.OptunaError) as error:
-            reason = f"{type(error).__name__}: {one_line(error)}"
-            raise ConfigError(f"storage {self.storage}: fails ({reason})") from error
+            raise ConfigError(f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})") from error
 
     def trials(self, *states: str) -> list[FrozenTrial]:
         """The trials in these states, such as ``COMPLETE``; all that ended by default."""

@@ -72,9 +72,32 @@ class Interval(Frozen):
             raise ValueError(f"low {self.low:g} and high {self.high:g} must be whole numbers")
         return self
 
+    def suggest(self, trial: Trial, name: str) -> Parameter:
+        """What a trial has under a name."""
+        if self.whole:
+            return trial.suggest_int(name, int(self.low), int(self.high), log=self.log)
+        return trial.suggest_float(name, self.low, self.high, log=self.log)
+
+    def setting(self, parameter: Any) -> Any:
+        """The value that a parameter stands for, as the settings hold it."""
+        if self.whole:
+            return parameter
+        written = f"{min(max(float(f'{parameter:.4g}'), self.low), self.high):.4g}"
+        return f"{LINEAR}{written}" if self.schedule else float(written)
+
+    def parameter(self, setting: Any) -> Parameter:
+        """The parameter that stands for a value of the settings.
+
+        :raises ValueError: the value is not among those of the space.
+        """
+        number = _number_of(setting)
+        if number is None or not self.low <= number <= self.high:
+            raise ValueError(f"{setting!r} is not between {self.low:g} and {self.high:g}")
+        return int(number) if self.whole else float(number)
+
 
 class Choice(Frozen):
-    """One of several values, which may be lists and mappings too."""
+    """One of several values, which may be lists and mappings too. Its methods are those of :class:`Interval`."""
 
     values: tuple[Any, ...]
 
@@ -83,6 +106,16 @@ class Choice(Frozen):
         """The values as Optuna holds them: plain ones as they are, others as JSON."""
         plain = (bool, int, float, str, type(None))
         return [value if isinstance(value, plain) else json.dumps(value, default=str) for value in self.values]
+
+    def suggest(self, trial: Trial, name: str) -> Parameter:
+        return trial.suggest_categorical(name, self.labels)
+
+    def setting(self, parameter: Any) -> Any:
+        return self.values[self.labels.index(parameter)]
+
+    def parameter(self, setting: Any) -> Parameter:
+        (label,) = Choice(values=(setting,)).labels
+        return self.labels[self.labels.index(label)]
 
 
 @dataclass(frozen=True)
@@ -99,27 +132,23 @@ class SearchSpace:
 
     def suggest(self, trial: Trial) -> dict[str, Any]:
         """All settings of a trial: plain values, as YAML holds them."""
-        return self.settings({name: _suggest(each, trial, name) for name, each in self.dimensions.items()})
+        return self.settings({name: each.suggest(trial, name) for name, each in self.dimensions.items()})
 
     def settings(self, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
         """All settings of a trial with these parameters."""
         changed = dict(self.base)
-        values = {name: _setting(self.dimensions[name], parameter) for name, parameter in parameters.items()}
-        for name, value in values.items():
+        for name, parameter in parameters.items():
             outer, dot, inner = name.partition(".")
-            if dot:
-                changed[outer] = {**_plain(changed.get(outer)), inner: value}
-            elif name != MINIBATCHES:
-                changed[name] = value
-        if MINIBATCHES in values:
-            rollout = math.prod(_number_of(current(self.algo, changed, key)) or 1 for key in ("n_steps", "n_envs"))
-            changed["batch_size"] = math.ceil(rollout / values[MINIBATCHES])  # of all but the last, which may be smaller
+            value = self.dimensions[name].setting(parameter)
+            changed[outer] = {**_plain(changed.get(outer)), inner: value} if dot else value
+        if MINIBATCHES in changed:  # of the same size, but for the last, which may be smaller
+            changed["batch_size"] = math.ceil(_rollout(self.algo, changed) / changed.pop(MINIBATCHES))
         return changed
 
     def start(self) -> dict[str, Parameter] | None:
         """The parameters that stand for the settings as they are; None if one of these lies outside the space."""
         try:
-            return {name: _parameter(each, current(self.algo, self.base, name)) for name, each in self.dimensions.items()}
+            return {name: each.parameter(current(self.algo, self.base, name)) for name, each in self.dimensions.items()}
         except ValueError:
             return None
 
@@ -152,8 +181,7 @@ def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
     if dot:
         return _plain(settings.get(outer)).get(inner)
     if name == MINIBATCHES:
-        steps, envs, size = (_number_of(current(algo, settings, key)) or 1 for key in ("n_steps", "n_envs", "batch_size"))
-        return round(steps * envs / size)
+        return round(_rollout(algo, settings) / (_number_of(current(algo, settings, "batch_size")) or 1))
     parameters = constructor_parameters(get_algorithm(algo))
     default = {"n_envs": 1, **{key: each.default for key, each in parameters.items()}}
     return settings.get(name, default.get(name))
@@ -181,35 +209,9 @@ def _dimension(algo: str, settings: Mapping[str, Any], name: str, given: Any, wh
     return Interval.model_construct(low=low, high=high, log=True, whole=whole, schedule=schedule)
 
 
-def _suggest(dimension: Interval | Choice, trial: Trial, name: str) -> Parameter:
-    if isinstance(dimension, Choice):
-        return trial.suggest_categorical(name, dimension.labels)
-    if dimension.whole:
-        return trial.suggest_int(name, int(dimension.low), int(dimension.high), log=dimension.log)
-    return trial.suggest_float(name, dimension.low, dimension.high, log=dimension.log)
-
-
-def _setting(dimension: Interval | Choice, parameter: Any) -> Any:
-    """The value that a parameter stands for, as the settings hold it."""
-    if isinstance(dimension, Choice):
-        return dimension.values[dimension.labels.index(parameter)]
-    if dimension.whole:
-        return parameter
-    written = f"{min(max(float(f'{parameter:.4g}'), dimension.low), dimension.high):.4g}"
-    return f"{LINEAR}{written}" if dimension.schedule else float(written)
-
-
-def _parameter(dimension: Interval | Choice, setting: Any) -> Parameter:
-    """The parameter that stands for a value of the settings.
-
-    :raises ValueError: the value is not among those that the dimension has.
-    """
-    if isinstance(dimension, Choice):
-        return dimension.labels[dimension.labels.index(Choice(values=(setting,)).labels[0])]
-    number = _number_of(setting)
-    if number is None or not dimension.low <= number <= dimension.high:
-        raise ValueError(f"{setting!r} is not between {dimension.low:g} and {dimension.high:g}")
-    return int(number) if dimension.whole else float(number)
+def _rollout(algo: str, settings: Mapping[str, Any]) -> float:
+    """Timesteps of a rollout."""
+    return math.prod(_number_of(current(algo, settings, key)) or 1 for key in ("n_steps", "n_envs"))
 
 
 def _plain(value: Any) -> dict[str, Any]:

@@ -24,13 +24,14 @@ PATIENCE = 10.0  # s to wait for the process that begins a study to say what it 
 
 
 def load_optuna() -> Any:
-    """Optuna, without its log.
+    """Optuna, without its log and without warnings that parts of it are experimental.
 
     :raises ConfigError: Optuna or cmaes is missing; the message says what to install.
     """
     require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
     optuna = require("optuna", "tune", "a search")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
+    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
     return optuna
 
 
@@ -49,14 +50,15 @@ def open_study(
     :raises ConfigError: Optuna is missing; a storage that cannot be used, such as a file that is no journal.
     """
     optuna = load_optuna()
+    opened: Any = None if storage is None else str(storage)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            keywords = {"study_name": name, "storage": _open_storage(optuna, storage)}
-            try:
-                study, new = optuna.create_study(direction=direction, **keywords), True
-            except optuna.exceptions.DuplicatedStudyError:
-                study, new = optuna.load_study(**keywords), False
+        if storage is not None and "://" not in str(storage):
+            Path(storage).parent.mkdir(parents=True, exist_ok=True)
+            opened = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(opened))
+        try:
+            study, new = optuna.create_study(study_name=name, storage=opened, direction=direction), True
+        except optuna.exceptions.DuplicatedStudyError:
+            study, new = optuna.load_study(study_name=name, storage=opened), False
     except Exception as error:  # databases and damaged journals raise what they like
         reason = f"{type(error).__name__}: {one_line(error)}"
         raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
@@ -71,15 +73,6 @@ def open_study(
     return study, study.user_attrs.get(attribute)
 
 
-def _open_storage(optuna: Any, storage: str | Path | None) -> Any:
-    if storage is None:
-        return optuna.storages.InMemoryStorage()
-    if "://" in str(storage):
-        return optuna.storages.RDBStorage(str(storage))
-    Path(storage).parent.mkdir(parents=True, exist_ok=True)
-    return optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(str(storage)))
-
-
 def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
     """The next trial of a study. What is proposed depends on ``seed``, the trial's number and the trials known.
 
@@ -89,22 +82,17 @@ def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
     :param n_startup_trials: sampled at random first.
     """
     optuna = load_optuna()
-    study.sampler = optuna.samplers.RandomSampler()  # proposes nothing yet: the trial's number is to be known first
+    samplers = optuna.samplers
+    study.sampler = samplers.RandomSampler()  # proposes nothing yet: the trial's number is to be known first
     trial = study.ask()
     own = int(np.random.SeedSequence([seed, trial.number]).generate_state(1)[0])
-    study.sampler = _make_sampler(optuna.samplers, sampler, own, n_startup_trials)
+    study.sampler = {
+        "tpe": samplers.TPESampler(seed=own, n_startup_trials=n_startup_trials, multivariate=True, constant_liar=True),
+        "random": samplers.RandomSampler(seed=own),
+        "cmaes": samplers.CmaEsSampler(seed=own, n_startup_trials=n_startup_trials, warn_independent_sampling=False),
+    }[sampler]
     sampled: Trial = optuna.trial.Trial(study, trial._trial_id)
     return sampled
-
-
-def _make_sampler(samplers: Any, name: str, seed: int, n_startup_trials: int) -> Any:
-    if name == "random":
-        return samplers.RandomSampler(seed=seed)
-    if name == "cmaes":
-        return samplers.CmaEsSampler(seed=seed, n_startup_trials=n_startup_trials, warn_independent_sampling=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # what is experimental about TPE's arguments is Optuna's affair
-        return samplers.TPESampler(seed=seed, n_startup_trials=n_startup_trials, multivariate=True, constant_liar=True)
 
 
 def make_pruner(name: str, n_startup_trials: int, n_evaluations: int) -> BasePruner:
@@ -114,9 +102,9 @@ def make_pruner(name: str, n_startup_trials: int, n_evaluations: int) -> BasePru
     :param n_evaluations: of a trial; ``median`` prunes none before a third of them.
     """
     pruners = load_optuna().pruners
-    pruner: BasePruner = pruners.NopPruner()
-    if name == "halving":
-        pruner = pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0)
-    elif name == "median":
-        pruner = pruners.MedianPruner(n_startup_trials=n_startup_trials, n_warmup_steps=n_evaluations // 3)
-    return pruner
+    chosen: BasePruner = {
+        "median": pruners.MedianPruner(n_startup_trials=n_startup_trials, n_warmup_steps=n_evaluations // 3),
+        "halving": pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0),
+        "none": pruners.NopPruner(),
+    }[name]
+    return chosen

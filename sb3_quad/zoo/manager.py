@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import rl_zoo3.exp_manager
 from rl_zoo3 import ALGOS
@@ -24,9 +24,6 @@ from sb3_quad.settings.config import SETTINGS, VEC_ENVS
 from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.zoo.registration import OWN_ALGORITHMS, Settings, register_space, to_keywords
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
 
 
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
@@ -63,21 +60,18 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if self._env_id in ENVIRONMENTS:
             self.monitor_kwargs = {"info_keywords": ("is_success",)}  # for plot_train -y success
 
-    def read_hyperparameters(self) -> tuple[Settings, Settings]:
+    def read_hyperparameters(self) -> Any:
         """The settings of the environment, to be processed and to be saved."""
         if not self._ours:
-            return super().read_hyperparameters()  # type: ignore[no-any-return]
+            return super().read_hyperparameters()
         given, self.env_kwargs = self.env_kwargs, {}
-        trial_id = self.trial_id
-        if self.algo in OWN_ALGORITHMS:
-            self.trial_id = None  # a trial's values are read below, once the settings that they change are known
+        trial_id, self.trial_id = self.trial_id, None  # is read below, once the settings that it changes are known
         settings, saved = super().read_hyperparameters()
         changes: Settings = {}
         if self.algo in OWN_ALGORITHMS:
             register_space(self.algo, dict(settings))
-            if self.storage and self.study_name and trial_id:
-                of_trial = self.load_trial(self.storage, self.study_name, trial_id)
-                changes = {**of_trial, **(self.custom_hyperparams or {})}
+        if self.storage and self.study_name and trial_id:
+            changes = {**self.load_trial(self.storage, self.study_name, trial_id), **(self.custom_hyperparams or {})}
         changes["env_kwargs"] = {**parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"), **given}
         for each in (settings, saved):
             each.update(changes)
@@ -129,20 +123,18 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             self.vec_env_class = make
         return super().create_envs(n_envs, eval_env, no_log)
 
-    def _load_pretrained_agent(self, hyperparams: Settings, env: VecEnv) -> BaseAlgorithm:
+    def _load_pretrained_agent(self, hyperparams: Settings, env: VecEnv) -> Any:
         if self.algo not in OWN_ALGORITHMS:
-            return super()._load_pretrained_agent(hyperparams, env)  # type: ignore[no-any-return]
-        given: Settings = {"tensorboard_log": self.tensorboard_log, "seed": self.seed, "verbose": self.verbose}
-        model = ALGOS[self.algo](env=env, device=self.device, **given, **hyperparams)
+            return super()._load_pretrained_agent(hyperparams, env)
+        given = {name: getattr(self, name) for name in ("tensorboard_log", "seed", "verbose", "device")}
+        model = ALGOS[self.algo](env=env, **given, **hyperparams)
         transfer_policy(self.trained_agent, model)
-        return model  # type: ignore[no-any-return]
+        return model
 
     def _save_config(self, saved_hyperparams: Settings) -> None:
-        given = self.args.env_kwargs
         if self._ours:
             self.args.env_kwargs = self.eval_env_kwargs
         super()._save_config(saved_hyperparams)
-        self.args.env_kwargs = given
 
 
 def _find_config(given: str, algo: str) -> str:

@@ -47,7 +47,7 @@ def register_space(algo: str, settings: Mapping[str, Any]) -> None:
         found = load_space(algo, settings).settings(parameters)
         return {name: value for name, value in found.items() if name not in settings or settings[name] != value}
 
-    def sample(trial: Any, n_actions: int, n_envs: int, additional_args: Settings) -> Settings:
+    def sample(trial: Any, *_: Any) -> Settings:
         load_space(algo, settings).suggest(trial)
         return to_keywords(algo, convert_parameters(trial.params), "search space")
 

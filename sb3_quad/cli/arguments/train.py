@@ -42,6 +42,10 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
     start = "agent to start from: policy and critic of an SB3 on-policy zip, or a name such as itm-recovery"
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
+    add("--n-eval-envs", type=whole, metavar="N", help="environments to evaluate in (batch: one per episode; else 1)")
+    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
+    add("--device", help="cpu (default), cuda or auto")
+    add("--num-threads", type=whole, metavar="N", help="threads of PyTorch (its own choice)")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -55,11 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--seed", type=int, help="seed (0); negative: a random one, noted in args.yml")
     add("--eval-freq", type=whole, metavar="N", help="timesteps between evaluations (250000); below 1: one at the end")
     add("--eval-episodes", type=whole, metavar="N", help="episodes of an evaluation (48); 0: no evaluations")
-    add("--n-eval-envs", type=whole, metavar="N", help="environments to evaluate in (batch: one per episode; else 1)")
     add("--save-freq", type=whole, metavar="N", help="timesteps between checkpoints (none)")
     add("--log-interval", type=whole, metavar="N", help="rollouts between two tables of --verbose 1 (1)")
     add("-tb", "--tensorboard-log", metavar="DIR", help="folder for TensorBoard")
-    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
-    add("--device", help="cpu (default), cuda or auto")
-    add("--num-threads", type=whole, metavar="N", help="threads of PyTorch (its own choice)")
     add("--verbose", type=int, choices=(0, 1, 2), help="1: SB3's tables, 2: debugging (0)")

@@ -37,7 +37,3 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("-f", "--log-folder", default="logs", metavar="DIR", help="the results go to DIR/tune/ALGO/ENV_N (logs)")
     add("--seed", type=int, help="of the trainings and the sampler (0); negative: a random one")
     add("--eval-episodes", type=whole, metavar="N", help="episodes of an evaluation (batch: 240, else 48)")
-    add("--n-eval-envs", type=whole, metavar="N", help="environments to evaluate in (batch: one per episode; else 1)")
-    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
-    add("--device", default="cpu", help="cpu (default), cuda or auto")
-    add("--num-threads", type=whole, metavar="N", help="threads of PyTorch (its own choice)")

@@ -8,9 +8,9 @@ import json
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.cli.output import console
-from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.evaluation.tables import text_table
 from sb3_quad.settings.config import SETTINGS, load_config
-from sb3_quad.training.benchmark import ENV_ID, Measurement, as_dict, single, training_loop, vectorised
+from sb3_quad.training.benchmark import ENV_ID, as_dict, single, training_loop, vectorised
 
 
 def run(options: argparse.Namespace) -> int:
@@ -31,14 +31,10 @@ def run(options: argparse.Namespace) -> int:
     if config is not None:
         with screen.status(f"training loop of {config.algo}"):
             measurements.extend(training_loop(config))
-    screen.print(_table(measurements))
+    first = measurements[0].rate
+    rows = ((each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements)
+    screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
     if options.output is not None:
         write_text(options.output, json.dumps(as_dict(measurements), indent=2) + "\n")
         print(f"written to {options.output}")
     return 0
-
-
-def _table(measurements: list[Measurement]) -> Table:
-    first = measurements[0].rate
-    rows = ((each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements)
-    return text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows)

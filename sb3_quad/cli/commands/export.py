@@ -16,10 +16,8 @@ def run(options: argparse.Namespace) -> int:
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
     model = Path(options.model)
-    if not model.is_file():
-        raise ConfigError(f"model {model}: no such file")
     file = Path(options.file) if options.file else model.with_suffix(FORMATS[options.format])
-    if file.exists() and file.samefile(model):
+    if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
     refuse_existing(file, options.overwrite)
     if options.name is not None and options.format != "c":

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
+from sb3_quad.cli.commands.train import make_config, make_seed, prepare
 from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console, print_line, progress_bar
-from sb3_quad.cli.parser import pairs
-from sb3_quad.cli.settings import make_config, make_seed, prepare
-from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.cli.parser import given, pairs
+from sb3_quad.evaluation.tables import text_table
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
@@ -39,46 +39,42 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError("--n-trials must be at least 0, --max-total-trials at least 1")
     prepare(options)
     with StopSignals() as signals:
-        search, folder = _make_search(options)
-        print_line(f"study {search.name} in {search.storage}: {_count(search)}; results go to {folder}")
+        search = _make_search(options)
+        print_line(f"study {search.name} in {search.storage}: {_count(search)}; results go to {search.job.log_folder}")
         with progress_bar(options.progress) as show:
             done = count()
             show(next(done), options.n_trials, "trials")
 
             def after_each(trial: FrozenTrial) -> None:
-                write_results(search, folder)
+                write_results(search)
                 print_line(_line(search, trial))
                 show(next(done), options.n_trials, "trials")
 
             try:
                 search.run(options.n_trials, options.max_total_trials, signals, after_each)
             finally:
-                write_results(search, folder)
-    _print_results(search, folder)
+                write_results(search)
+    _print_results(search)
     return signals.exit_code
 
 
-def _make_search(options: argparse.Namespace) -> tuple[Search, Path]:
-    """The search that a command line describes, and the folder of its results, which is new."""
+def _make_search(options: argparse.Namespace) -> Search:
+    """The search that a command line describes; the folder of its results is new."""
     config = make_config(options)
     if options.eval_env_kwargs is not None:  # into the settings, so that the best ones have it too
-        given = {**config.eval_env_kwargs, **pairs(options.eval_env_kwargs, "--eval-env-kwargs")}
-        config = build_config(config.algo, config.env_id, {**config.settings, "eval_env_kwargs": given})
+        evaluation = {**config.eval_env_kwargs, **pairs(options.eval_env_kwargs, "--eval-env-kwargs")}
+        config = build_config(config.algo, config.env_id, {**config.settings, "eval_env_kwargs": evaluation})
     space = load_space(config.algo, config.settings, options.search_space)
-    given = {
-        "seed": make_seed(options),
-        "device": options.device,
-        "trained_agent": options.trained_agent,
-        "eval_episodes": EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes,
-        "n_eval_envs": options.n_eval_envs,
-    }
-    job = validate(TrainingJob, {"config": config, **given}, "command line")
+    episodes = EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes
+    arguments = given(options, "device", "trained_agent", "n_eval_envs")
+    arguments |= {"config": config, "seed": make_seed(options), "eval_episodes": episodes}
+    job = validate(TrainingJob, arguments, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     name = options.study_name or f"{config.algo}_{config.env_id}"
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
     try:
         job = job.model_copy(update={"log_folder": str(folder)})
-        return Search(job, space, name, options.storage or folder / JOURNAL, *study), folder
+        return Search(job, space, name, options.storage or folder / JOURNAL, *study)
     except SB3QuadError:
         with suppress(OSError):
             folder.rmdir()
@@ -95,38 +91,31 @@ def _line(search: Search, trial: FrozenTrial) -> str:
     return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
 
 
-def _print_results(search: Search, folder: Path) -> None:
+def _print_results(search: Search) -> None:
     """The best trials, the best agent on fresh episodes, and where everything is."""
-    best = search.best
-    if best is not None:
-        write_plot(search, folder / PLOT)
-        console().print(_best_trials(search))
-        _fly(search, best)
-    written = [TRIALS] if best is None else [TRIALS, BEST, PLOT]
-    print_line(f"{_count(search)}; saved in {folder}: {', '.join(written)}")
+    if search.best is not None:
+        write_plot(search)
+        _print_best(search, search.best)
+    written = [TRIALS] if search.best is None else [TRIALS, BEST, PLOT]
+    print_line(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
     print_line(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
-    if best is not None:
-        print_line(f"to train: {train_command(search, folder / BEST)}")
+    if search.best is not None:
+        print_line(f"to train: {train_command(search)}")
 
 
-def _fly(search: Search, best: FrozenTrial) -> None:
-    """The best agent on episodes by which nothing was chosen, where its run folder is at hand."""
-    path, known = Path(best.user_attrs[RUN]), search.job.config
-    if known.task is None or not path.is_dir():
-        return
-    run = open_run(path)
-    config = build_config(known.algo, known.env_id, settings_of(best))
-    console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
-    print_line(f"agent: {run.model}")
-
-
-def _best_trials(search: Search) -> Table:
-    best = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
-    rows = [("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in best))]
-    if search.job.config.task is not None:
-        rows.insert(0, ("success", *(f"{100 * trial.user_attrs[SUCCESS]:.2f} %" for trial in best)))
-    rows += [(name, *(str(varied(search, trial)[name]) for trial in best)) for name in search.space.dimensions]
-    return text_table(f"the best of {_count(search)}", ("trial", *(str(trial.number) for trial in best)), rows)
+def _print_best(search: Search, best: FrozenTrial) -> None:
+    """The best trials, and the best agent on episodes by which nothing was chosen, where its run folder is at hand."""
+    known, path = search.job.config, Path(best.user_attrs[RUN])
+    trials = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
+    rows = [("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in trials))]
+    if known.task is not None:
+        rows.insert(0, ("success", *(f"{100 * trial.user_attrs[SUCCESS]:.2f} %" for trial in trials)))
+    rows += [(name, *(str(varied(search, trial)[name]) for trial in trials)) for name in search.space.dimensions]
+    console().print(text_table(f"the best of {_count(search)}", ("trial", *(str(trial.number) for trial in trials)), rows))
+    if known.task is not None and path.is_dir():
+        run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
+        console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
+        print_line(f"agent: {run.model}")
 
 
 def _count(search: Search) -> str:
