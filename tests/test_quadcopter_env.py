@@ -354,14 +354,19 @@ def test_side_by_side_as_alone(kind: Any) -> None:
 
 
 def test_import_is_light() -> None:
-    """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for gymnasium.make."""
+    """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for gymnasium.make.
+
+    PyBullet is imported without its line about its build, and standard error works afterwards.
+    """
     code = (
         "import sys, sb3_quad, sb3_quad.envs, gymnasium;"
         "print([m for m in ('pybullet', 'numba', 'torch') if m in sys.modules]);"
-        "gymnasium.make('QuadTargetTracking-v0').reset(seed=0); print('torch' in sys.modules)"
+        "gymnasium.make('QuadTargetTracking-v0').reset(seed=0); print('torch' in sys.modules);"
+        "print('told', file=sys.stderr)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert result.stdout.split("\n")[:2] == ["[]", "False"]
+    assert result.stdout.splitlines() == ["[]", "False"]
+    assert result.stderr.splitlines() == ["told"]
 
 
 def test_package_names() -> None:

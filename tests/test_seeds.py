@@ -37,7 +37,8 @@ def test_a_training_begins_with_the_episodes_of_its_range(tmp_path):
     config = build_config("ppo", "QuadStateRecovery-v0", settings)
     keys = []
     for seed in (5, 524_288):
-        result = train(TrainingJob(config, str(tmp_path), seed, eval_episodes=0), lambda line: None)
+        job = TrainingJob(config=config, log_folder=str(tmp_path), seed=seed, eval_episodes=0)
+        result = train(job, lambda line: None)
         keys.append(result.model.get_env().unwrapped.batch.streams[:2].tolist())
     fresh = result.model.get_env().unwrapped.batch
     for key, first in zip(keys, (5, seed_for("training", 524_288)), strict=True):
