@@ -98,7 +98,7 @@ def test_pid_error_under_a_constant_force():
 
 
 def test_pid_gains_of_itm_are_those_of_table_a1():
-    proportional, derivative = PIDExpert()._attitude
+    _, (proportional, derivative), *_ = PIDExpert()._constants
     np.testing.assert_allclose(proportional, [0.54165, 0.81810, 0.80676], rtol=1e-4)
     np.testing.assert_allclose(derivative, [0.12037, 0.18180, 0.17928], rtol=1e-4)
 
