@@ -170,7 +170,7 @@ def test_experts_by_name(tmp_path, monkeypatch):
         ("missing.zip", ConfigError, "no such file"),
         (str(half_written), ConfigError, "not a complete SB3 zip"),
         ("no_such_module:factory", ConfigError, "cannot be imported"),
-        ("my_experts:nothing", ConfigError, "has no 'nothing'"),
+        ("my_experts:nothing", ConfigError, "no attribute 'nothing'"),
         ("my_experts:broken", ExpertError, "ZeroDivisionError"),
     ):
         with pytest.raises(error, match=message):
