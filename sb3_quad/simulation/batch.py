@@ -7,7 +7,6 @@ from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.utils import seeding
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
@@ -74,7 +73,7 @@ class QuadcopterBatch:
         self.vehicle_list = _vehicles(vehicle if one_each else [vehicle] * n, n)
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
         self.vehicles = np.stack([each.parameters() for each in columns], axis=1)
-        self.tasks: TaskTable = resolve_tasks(task, task_kwargs)
+        self.tasks = resolve_tasks(task, task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
         self.state = np.zeros((STATE_SIZE, n))
         self.queue = np.zeros((self.vehicle_list[0].delay, 4, n))
@@ -95,12 +94,7 @@ class QuadcopterBatch:
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""
-        self.set_streams([seeding.np_random(None if each is None else int(each))[0] for each in seeds], rows)
-
-    def set_streams(self, generators: Sequence[np.random.Generator], rows: Rows = None) -> None:
-        """New streams of the given rows, each from a generator; their next reset begins the first episode."""
-        keys = [stream_key(generator) for generator in generators]
-        self.streams[:, self.rows(rows)] = new_streams(np.array(keys, dtype=np.uint64))
+        self.streams[:, self.rows(rows)] = new_streams([stream_key(each) for each in seeds])
 
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
@@ -226,7 +220,7 @@ class QuadcopterBatch:
         # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
         weights = np.concatenate([np.zeros(used.size), new.weights])
         self.task_index[:] = index
-        self.tasks = TaskTable(parameters, weights, (*(self.tasks.tasks[k] for k in used), *new.tasks))
+        self.tasks = TaskTable(parameters, weights)
         self._bind()
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:

@@ -29,6 +29,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.layout import row_slices
+from sb3_quad.simulation.rotation import rotation_rows
 
 STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}
 STATE_SIZE = sum(STATE.values())
@@ -87,12 +88,7 @@ class QuadcopterState:
     @property
     def rotation(self) -> FloatArray:
         """Rotation matrices R, body to world, shape (n, 3, 3)."""
-        w, x, y, z = self.array[QUATERNION]
-        rows = (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        )
+        rows = rotation_rows.py_func(*self.array[QUATERNION])
         return np.moveaxis(np.array(rows), -1, 0)
 
     @property

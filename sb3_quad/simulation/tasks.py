@@ -90,7 +90,6 @@ class TaskTable(NamedTuple):
     """(K, columns), see :data:`TASK`"""
     weights: FloatArray
     """(K,), cumulative, the last one 1"""
-    tasks: tuple[Task, ...]
 
 
 def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> TaskTable:
@@ -102,7 +101,7 @@ def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) 
     weights = dict(task) if isinstance(task, Mapping) else {task: 1.0}
     if not weights:
         raise ConfigError("task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}")
-    tasks = tuple(_resolve(entry, dict(task_kwargs or {})) for entry in weights)
+    parameters = np.stack([_resolve(entry, dict(task_kwargs or {})).parameters() for entry in weights])
     try:
         shares = np.array([float(share) for share in weights.values()])
     except (TypeError, ValueError):
@@ -111,7 +110,7 @@ def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) 
         raise ConfigError(f"task: the weights {shares.tolist()} must be finite, not negative and not all zero")
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0
-    return TaskTable(np.stack([entry.parameters() for entry in tasks]), cumulative, tasks)
+    return TaskTable(parameters, cumulative)
 
 
 def _resolve(entry: Any, overrides: dict[str, Any]) -> Task:
