@@ -20,7 +20,6 @@ from sb3_quad.simulation.engine.block import (
     load_rows,
     load_scaling,
     load_scored,
-    load_state,
     load_vehicles,
     store_observations,
     store_state,
@@ -112,7 +111,7 @@ def run_block(job, number, b, fresh):
         std = carray(pointer(job.std_at), (OBSERVATION_SIZE, scaling), np.float64)
         load_scaling(b, mean, std, carray(pointer(job.noise_level_at), (scaling,), np.float64), first, count)
     if job.mode > LOOK:
-        load_state(b, state, first, count)
+        load_rows(state, 0, first, count, b.state)
         if fresh or job.vehicle_columns > 1:
             load_vehicles(b, vehicles, first, count, job.physics_step)
         if fresh or job.tasks > 1:
@@ -161,7 +160,7 @@ def run_block(job, number, b, fresh):
         if dones[i]:
             returns[i] = 0.0
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
-    load_state(b, state, first, count)
+    load_rows(state, 0, first, count, b.state)
     load_rows(streams, 0, first, count, b.stream)
     observe(b)
     store_observations(b, observations, first, count)
