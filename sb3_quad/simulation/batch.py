@@ -11,7 +11,7 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.checks import per_row, whole_number
-from sb3_quad.simulation.engine.random import new_streams, stream_key
+from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, StepArrays, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, compilation_notice, run
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
@@ -94,7 +94,7 @@ class QuadcopterBatch:
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""
-        self.streams[:, self.rows(rows)] = new_streams([stream_key(each) for each in seeds])
+        self.streams[:, self.rows(rows)] = new_streams(seeds)
 
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
@@ -237,9 +237,8 @@ class QuadcopterBatch:
     def _bind(self) -> None:
         """Write down for the compiled step where all arrays are; again whenever one is replaced."""
         first = self.vehicle_list[0]
-        self.arrays = {name: getattr(self, name) for name in ARRAYS if not name.startswith("task_")}
-        self.arrays |= {"task_index": self.task_index}
-        self.arrays |= {"task_parameters": self.tasks.parameters, "task_weights": self.tasks.weights}
+        table = {"task_parameters": self.tasks.parameters, "task_weights": self.tasks.weights}
+        self._bound = {name: table[name] if name in table else getattr(self, name) for name in ARRAYS}
         sizes = {
             "n": self.n,
             "delay": first.delay,
@@ -254,7 +253,7 @@ class QuadcopterBatch:
         }
         self.job = np.zeros(1, dtype=JOB)
         self._job_numbers = self.job.view(np.int64)
-        for name, value in {**sizes, **{f"{name}_at": array.ctypes.data for name, array in self.arrays.items()}}.items():
+        for name, value in {**sizes, **{f"{name}_at": array.ctypes.data for name, array in self._bound.items()}}.items():
             self.job[name] = value
 
 

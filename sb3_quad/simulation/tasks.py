@@ -59,7 +59,7 @@ class Task(Frozen):
         """What compiled code needs, in the order of :data:`TASK`, shape (columns,)."""
         nearest = self.target_distance if self.nearest_target is None else self.nearest_target
         values = {**{name: getattr(self, name) for name in TASK}, "nearest_target": nearest}
-        return np.concatenate([np.atleast_1d(np.asarray(value, dtype=np.float64)) for value in values.values()])
+        return np.hstack(list(values.values())).astype(np.float64)
 
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}

@@ -68,15 +68,15 @@ def block_in(memory):
 
 
 @compiled(forceinline=True)
-def load_rows(source, row, first, count, target):
-    """Copy rows of a (rows, n) array, from ``row`` on, to rows of a block."""
+def load_rows(source, first, count, target):
+    """Copy the first rows of a (rows, n) array to those of a block."""
     for k in range(target.shape[0]):
         if count == LANES:
             for lane in range(LANES):
-                target[k, lane] = source[row + k, first + lane]
+                target[k, lane] = source[k, first + lane]
         else:
             for lane in range(LANES):
-                target[k, lane] = source[row + k, first + min(lane, count - 1)]
+                target[k, lane] = source[k, first + min(lane, count - 1)]
 
 
 @compiled

@@ -14,6 +14,7 @@ number there can be is 6.6.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -32,15 +33,13 @@ _TO_UNIT = float32(2.0**-31)
 _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 
 
-def stream_key(seed: int | None) -> int:
-    """A 64-bit key, the first number of the generator that Gymnasium makes of a seed; None: the system's entropy."""
-    generator, _ = seeding.np_random(None if seed is None else int(seed))
-    return int(generator.integers(2**64, dtype=np.uint64))
+def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
+    """Streams before their first episode, shape (4, n), from n seeds; None: the operating system's entropy.
 
-
-def new_streams(keys: npt.ArrayLike) -> npt.NDArray[np.uint32]:
-    """Streams before their first episode, shape (4, n), from 64-bit keys of shape (n,)."""
-    keys = np.asarray(keys, dtype=np.uint64)
+    A key is the first number of the generator that Gymnasium makes of the seed.
+    """
+    generators = [seeding.np_random(None if seed is None else int(seed))[0] for seed in seeds]
+    keys = np.array([generator.integers(2**64, dtype=np.uint64) for generator in generators], dtype=np.uint64)
     streams = np.zeros((4, keys.size), dtype=np.uint32)
     streams[KEY_LO] = keys & np.uint64(0xFFFFFFFF)
     streams[KEY_HI] = keys >> np.uint64(32)
