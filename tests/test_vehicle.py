@@ -184,6 +184,7 @@ def test_files_are_told_from_names() -> None:
         ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give only one"),
         ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise.* N"),
         ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits: must be two numbers .*rad/s"),
+        ({"rotor_thrust_limits": "15", "thrust_limits": ...}, "rotor_thrust_limits: must be two numbers .* N"),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: is missing"),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "thrust_coefficient": "x"}, "thrust_coefficient: "),
         ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),

@@ -85,9 +85,9 @@ class QuadcopterBatch:
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
+        self._bind()
         self.set_noise(noise)
         self.set_observation_scaling(observation_mean, observation_std)
-        self._bind()
         with compilation_notice():
             self.observe()
         self.seed([None if seed is None else seed + row for row in range(n)])
@@ -230,8 +230,7 @@ class QuadcopterBatch:
                 return np.zeros(1, dtype=np.int64)
             self.noise_level = np.repeat(self.noise_level, self.n)
             self.mean, self.std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-            if hasattr(self, "job"):
-                self._bind()
+            self._bind()
         return self.rows(rows)
 
     def _bind(self) -> None:

@@ -86,10 +86,8 @@ TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 class TaskTable(NamedTuple):
     """The tasks an environment samples from at each reset; K rows."""
 
-    parameters: FloatArray
-    """(K, columns), see :data:`TASK`"""
-    weights: FloatArray
-    """(K,), cumulative, the last one 1"""
+    parameters: FloatArray  # (K, columns), see TASK
+    weights: FloatArray  # (K,), cumulative, the last one 1
 
 
 def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> TaskTable:

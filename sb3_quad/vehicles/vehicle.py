@@ -8,15 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import (
-    Field,
-    ModelWrapValidatorHandler,
-    NonNegativeFloat,
-    PositiveFloat,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+from pydantic import Field, ModelWrapValidatorHandler, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import CannotHover
@@ -37,7 +29,6 @@ OTHER_LIMITS = {
     "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
     "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
 }
-_PAIR = TypeAdapter(tuple[float, float])
 
 
 class Vehicle(Frozen):
@@ -88,9 +79,10 @@ class Vehicle(Frozen):
             return handler(data)
         (name,) = given
         others = {key: value for key, value in data.items() if key != name}
+        pair = data[name] if isinstance(data[name], (list, tuple)) else ()
         try:
-            least, most = _PAIR.validate_python(data[name])
-        except ValidationError:
+            least, most = (float(limit) for limit in pair)
+        except (TypeError, ValueError):
             raise ValueError(f"{name}: must be two numbers ({OTHER_LIMITS[name]})") from None
         if not 0.0 <= least < most < math.inf:
             raise ValueError(f"{name} [{least:g}, {most:g}]: must rise, from at least 0 ({OTHER_LIMITS[name]})")

@@ -7,7 +7,6 @@ each distance between two rows, needs no test for overlap, and vectorises the lo
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ def _source_stamp() -> tuple[tuple[str, float, int], ...]:
     package = Path(__file__).resolve().parents[2]
     folders = ("base", "vehicles", "simulation", "experts")
     files = sorted(path for folder in folders for path in (package / folder).rglob("*.py"))
-    return tuple((path.name, os.stat(path).st_mtime, os.stat(path).st_size) for path in files)
+    return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in files)
 
 
 @intrinsic
