@@ -57,7 +57,8 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
 # The parts of the state lie in it, each under its name.
 _PARTS = {name: (np.dtype(("f8", (STATE[name], LANES))), 8 * LANES * row) for name, row in X._asdict().items()}
 _WHOLE = np.dtype([(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()])
-BLOCK = np.dtype({**(_WHOLE.fields or {}), **_PARTS})
+_FIELDS: Any = {**(_WHOLE.fields or {}), **_PARTS}
+BLOCK = np.dtype(_FIELDS)
 MEMORY = BLOCK.itemsize + 64  # bytes of the array that a block lies in, at a cache line
 
 
