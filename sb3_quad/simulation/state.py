@@ -1,18 +1,8 @@
 """The true state of n quadcopters, the wrench that acts on them, and how both lie in memory.
 
 One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle per column, so that
-compiled loops over vehicles run over neighbouring numbers. The order of the rows is that of the tables.
-
-================  =====  ===============================================================  ======
-state             rows   meaning                                                          unit
-================  =====  ===============================================================  ======
-position          3      r, world frame                                                   m
-quaternion        4      body to world, (w, x, y, z), unit norm                           --
-velocity          3      v, world frame                                                   m/s
-body_rates        3      angular velocity, body frame (x forward, z up)                   rad/s
-rotor_speeds      4      ω of each rotor; thrust F = kF ω² (Eq. 2.4)                      rad/s
-target            3      r_T, world frame                                                 m
-================  =====  ===============================================================  ======
+compiled loops over vehicles run over neighbouring numbers. The order of the rows is that of :data:`STATE`;
+:class:`QuadcopterState` says what they are.
 
 A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N), ``torque_world`` and ``torque_body`` (N m),
 three rows each, all at the centre of mass.
@@ -44,7 +34,7 @@ FORCE_WORLD, FORCE_BODY, TORQUE_WORLD, TORQUE_BODY = row_slices(WRENCH).values()
 class QuadcopterState:
     """Read access to the true state of n vehicles; what an expert is given.
 
-    :param array: float64 of shape ``(STATE_SIZE, n)``, laid out as this module's table says. The properties are views
+    :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The properties are views
         of it with one vehicle per row, so they show later changes: copy what must last.
     """
 
@@ -62,7 +52,7 @@ class QuadcopterState:
 
     @property
     def quaternion(self) -> FloatArray:
-        """Body to world, shape (n, 4), (w, x, y, z)."""
+        """Body to world, shape (n, 4), (w, x, y, z), unit norm."""
         return self.array[QUATERNION].T
 
     @property
@@ -72,12 +62,12 @@ class QuadcopterState:
 
     @property
     def body_rates(self) -> FloatArray:
-        """Angular velocity, shape (n, 3), body frame, rad/s."""
+        """Angular velocity, shape (n, 3), body frame (x forward, z up), rad/s."""
         return self.array[BODY_RATES].T
 
     @property
     def rotor_speeds(self) -> FloatArray:
-        """Rotor speeds ω, shape (n, 4), rad/s."""
+        """Rotor speeds ω, shape (n, 4), rad/s; each gives a thrust F = kF ω² (Eq. 2.4)."""
         return self.array[ROTOR_SPEEDS].T
 
     @property
