@@ -188,7 +188,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         fixed = parse_options(options, self.vehicle)
         batch = self.batch
         if seed is not None:
-            batch.set_streams([self.np_random])
+            batch.seed([seed])
         batch.reset()
         for rows, values in fixed:
             batch.state[rows, 0] = values

@@ -180,7 +180,7 @@ def test_failures_are_one_line_each_and_the_others_fly(here, capsys):
         "missing.zip": "no such file",
         "pidd": "did you mean 'pid'",
         "my_controllers:broken": "RuntimeError: no model",
-        "my_controllers:nothing": "has no 'nothing'",
+        "my_controllers:nothing": "no attribute 'nothing'",
         "no_such_module:make": "cannot be imported",
         "broken_module:make": "ZeroDivisionError",
         "my_controllers:fails_in_flight": "shape (5, 18)",

@@ -98,7 +98,7 @@ def test_pid_error_under_a_constant_force():
 
 
 def test_pid_gains_of_itm_are_those_of_table_a1():
-    proportional, derivative = PIDExpert()._attitude
+    _, (proportional, derivative), *_ = PIDExpert()._constants
     np.testing.assert_allclose(proportional, [0.54165, 0.81810, 0.80676], rtol=1e-4)
     np.testing.assert_allclose(derivative, [0.12037, 0.18180, 0.17928], rtol=1e-4)
 
@@ -170,7 +170,7 @@ def test_experts_by_name(tmp_path, monkeypatch):
         ("missing.zip", ConfigError, "no such file"),
         (str(half_written), ConfigError, "not a complete SB3 zip"),
         ("no_such_module:factory", ConfigError, "cannot be imported"),
-        ("my_experts:nothing", ConfigError, "has no 'nothing'"),
+        ("my_experts:nothing", ConfigError, "no attribute 'nothing'"),
         ("my_experts:broken", ExpertError, "ZeroDivisionError"),
     ):
         with pytest.raises(error, match=message):

@@ -10,7 +10,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.engine.block import T
-from sb3_quad.simulation.engine.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox, stream_key
+from sb3_quad.simulation.engine.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.state import BODY_RATES, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.simulation.tasks import SCORED, TASK, TASKS, Task, resolve_tasks
@@ -22,7 +22,7 @@ ITM = load_vehicle("itm")
 def start(n, task, seed=0, **task_kwargs):
     """n rows at the start of their first episode."""
     rows = QuadcopterBatch(n, task, task_kwargs, autoreset=False, n_threads=1)
-    rows.streams[:] = new_streams(np.arange(seed, seed + n, dtype=np.uint64))
+    rows.seed(range(seed, seed + n))
     rows.reset()
     return rows
 
@@ -53,10 +53,10 @@ def test_philox_gives_the_published_numbers(word, expected):
 
 
 def test_streams_hold_key_episode_and_step():
-    streams = new_streams(np.array([1 + (2 << 32), 2**64 - 1], dtype=np.uint64))
-    assert streams[KEY_LO].tolist() == [1, 2**32 - 1] and streams[KEY_HI].tolist() == [2, 2**32 - 1]
-    assert not streams[[EPISODE, STEP]].any()
-    assert stream_key(np.random.default_rng(0)) == stream_key(np.random.default_rng(0)) < 2**64
+    streams = new_streams([3, np.int64(3), None, None])
+    key = int(np.random.default_rng(3).integers(2**64, dtype=np.uint64))
+    assert streams[KEY_LO, :2].tolist() == [key % 2**32] * 2 and streams[KEY_HI, :2].tolist() == [key >> 32] * 2
+    assert not streams[[EPISODE, STEP]].any() and (streams[:, 2] != streams[:, 3]).any()
 
 
 def noise_of(n, steps, task="state_recovery"):
@@ -247,10 +247,10 @@ def test_tasks_of_the_thesis():
 
 def test_task_specifications():
     own = Task(name="own", target_distance=3.0)
-    assert resolve_tasks(own).tasks == (own,)
+    np.testing.assert_array_equal(resolve_tasks(own).parameters, own.parameters()[None])
     table = resolve_tasks({"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50})
     assert table.weights.tolist() == [0.25, 1.0]
-    assert [task.max_distance for task in table.tasks] == [50.0, 50.0]
+    assert table.parameters[:, T.max_distance].tolist() == [50.0, 50.0]
     assert table.parameters.shape == (2, sum(TASK.values()))
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
-from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle, is_vehicle_file, load_vehicle, vehicle_names
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 
 ITM = load_vehicle("itm")
 GAINS = ITM.model_dump(mode="json")["geometric_gains"]
@@ -49,7 +49,7 @@ def write(path: Path, **changes: Any) -> Path:
 
 
 def test_default_vehicle_is_the_specified_one() -> None:
-    assert vehicle_names() == ["crazyflie", "hummingbird", "itm"]
+    assert VEHICLES.names() == ["crazyflie", "hummingbird", "itm"]
     assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (1.727, (0.006687, 0.0101, 0.00996), 0.016)
     assert (ITM.thrust_coefficient, ITM.motor_gain, ITM.gravity) == (8.54858e-6, 20.0, 9.81)
     assert (ITM.physics_step, ITM.control_step, ITM.substeps, ITM.delay) == (0.0025, 0.01, 4, 1)
@@ -141,7 +141,7 @@ def test_numbers_as_yaml_writes_them(tmp_path: Path) -> None:
     assert load_vehicle(path).thrust_coefficient == 8e-6
 
 
-@pytest.mark.parametrize("name", vehicle_names())
+@pytest.mark.parametrize("name", VEHICLES.names())
 def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
     vehicle = load_vehicle(name)
     assert vehicle.name == name and vehicle.geometric_gains is not None
@@ -174,8 +174,8 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
 
 
 def test_files_are_told_from_names() -> None:
-    assert is_vehicle_file("my.yaml") and is_vehicle_file("here/my") and is_vehicle_file(Path("my"))
-    assert not is_vehicle_file("itm")
+    assert VEHICLES.is_path("my.yaml") and VEHICLES.is_path("here/my") and VEHICLES.is_path(Path("my"))
+    assert not VEHICLES.is_path("itm")
 
 
 @pytest.mark.parametrize(
@@ -184,6 +184,7 @@ def test_files_are_told_from_names() -> None:
         ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give only one"),
         ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise.* N"),
         ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits: must be two numbers .*rad/s"),
+        ({"rotor_thrust_limits": "15", "thrust_limits": ...}, "rotor_thrust_limits: must be two numbers .* N"),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: is missing"),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "thrust_coefficient": "x"}, "thrust_coefficient: "),
         ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),

@@ -4,42 +4,31 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 
 
-@contextmanager
-def atomic_write(path: Path) -> Iterator[BinaryIO]:
+def write_bytes(path: str | Path, content: bytes) -> None:
     """Write beside ``path`` and move the finished file there, so that a reader never meets half of it.
 
-    An error or an interruption inside the ``with`` block leaves whatever ``path`` held before.
+    :raises ConfigError: a folder that cannot be written, a full disk; whatever ``path`` held is still there.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    file = Path(path)
+    beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
-        with beside.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
-
-
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write a file whole.
-
-    :raises ConfigError: a folder that cannot be written, a full disk.
-    """
-    try:
-        with atomic_write(Path(path)) as file:
-            file.write(content)
+        file.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            with beside.open("wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fsync(stream.fileno())
+            os.replace(beside, file)
+        finally:
+            beside.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 

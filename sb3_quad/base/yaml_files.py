@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import yaml
@@ -28,9 +28,12 @@ def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoad
 
     :raises ConfigError: it is missing, unreadable or holds something else.
     """
-    content = parse_yaml(read_text(path), str(path), loader)
+    return _mapping(parse_yaml(read_text(path), str(path), loader), str(path))
+
+
+def _mapping(content: Any, where: str) -> dict[Any, Any]:
     if not isinstance(content, dict):
-        raise ConfigError(f"{path}: must hold keys and values")
+        raise ConfigError(f"{where}: must hold keys and values")
     return content
 
 
@@ -53,7 +56,7 @@ class YamlFolder:
 
     def names(self) -> list[str]:
         """The names of the files in the package."""
-        return [name for folder in ("", *self.folders) for name in sorted(self._files(folder))]
+        return list(self._files())
 
     def is_path(self, source: str | Path) -> bool:
         """Whether a source is the path of a file rather than a name.
@@ -71,12 +74,10 @@ class YamlFolder:
         """
         if self.is_path(source):
             return read_text(source), str(source)
-        name = str(source)
-        folder, _, _ = name.rpartition("/")
-        if name not in self.names():
-            raise ConfigError(f"{unknown(self.kind, name, self.names())}, or the path of a {self.suffix} file")
-        file = self._files(folder)[name]
-        return file.read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"
+        name, files = str(source), self._files()
+        if name not in files:
+            raise ConfigError(f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file")
+        return files[name].read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"
 
     def read(self, source: str | Path) -> tuple[dict[Any, Any], str]:
         """The keys and values of a file by name or path, and what messages call it.
@@ -84,14 +85,14 @@ class YamlFolder:
         :raises ConfigError: as :meth:`text`; or it holds something else.
         """
         text, where = self.text(source)
-        content = parse_yaml(text, where)
-        if not isinstance(content, dict):
-            raise ConfigError(f"{where}: must hold keys and values")
-        return content, where
+        return _mapping(parse_yaml(text, where), where), where
 
-    def _files(self, folder: str) -> dict[str, Any]:
-        place = resources.files(self.package)
-        place = place.joinpath(folder) if folder else place
-        prefix = f"{folder}/" if folder else ""
-        found = [entry for entry in place.iterdir() if entry.name.endswith(self.suffix)]
-        return {prefix + (each.name if self.in_name else each.name.removesuffix(self.suffix)): each for each in found}
+    def _files(self) -> dict[str, Any]:
+        """The files in the package, by name."""
+        found = {}
+        for folder in ("", *self.folders):
+            for file in sorted(resources.files(self.package).joinpath(folder).iterdir(), key=lambda file: file.name):
+                if file.name.endswith(self.suffix):
+                    name = str(PurePosixPath(folder, file.name))
+                    found[name if self.in_name else name.removesuffix(self.suffix)] = file
+        return found

@@ -64,11 +64,6 @@ def move_body(client: int, body: int, position: Sequence[float], quaternion: Seq
     p.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
 
 
-def arm_length(vehicle: Vehicle) -> float:
-    """Distance of the outermost rotor from the centre of mass, m."""
-    return max(math.hypot(x, y) for x, y in vehicle.rotor_positions)
-
-
 def rotor_radius(vehicle: Vehicle) -> float:
     """Radius at which neighbouring rotors are drawn just clear of each other, m."""
     return 0.44 * min(math.dist(one, other) for one, other in itertools.combinations(vehicle.rotor_positions, 2))
@@ -76,7 +71,7 @@ def rotor_radius(vehicle: Vehicle) -> float:
 
 def span(vehicle: Vehicle) -> float:
     """Radius of the vehicle with its rotors, m."""
-    return arm_length(vehicle) + rotor_radius(vehicle)
+    return vehicle.arm_length + rotor_radius(vehicle)
 
 
 def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:

@@ -49,7 +49,7 @@ class Scene:
         self.client = int(p.connect(p.DIRECT)) if client is None else client
         if client is None:  # also given back when the object is forgotten without close(): PyBullet's clients are limited
             self._close = weakref.finalize(self, p.disconnect, self.client)
-        self.scale = size * models.arm_length(vehicle) / REFERENCE_ARM  # distances in pictures are multiples of it
+        self.scale = size * vehicle.arm_length / REFERENCE_ARM  # distances in pictures are multiples of it
         self.span = size * models.span(vehicle)
         self._vehicles = [_VehicleBodies(vehicle, self.client, size, self.scale) for _ in range(n_vehicles)]
         ball, rings = [models.Part(p.GEOM_SPHERE, radius=0.14)], models.rings(RING * self.scale, 0.014 * self.scale)
@@ -106,7 +106,7 @@ class _VehicleBodies:
 
     def __init__(self, vehicle: Vehicle, client: int, size: float, scale: float) -> None:
         self.client = client
-        arm, radius = size * models.arm_length(vehicle), size * models.rotor_radius(vehicle)
+        arm, radius = size * vehicle.arm_length, size * models.rotor_radius(vehicle)
         self.centres = np.array([(size * x, size * y, 0.17 * arm) for x, y in vehicle.rotor_positions])
         angle = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
         self.rims = self.centres[:, None] + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)

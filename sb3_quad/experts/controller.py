@@ -23,7 +23,7 @@ class Controller:
     The first of these that fits is used:
 
     1. ``source.actions(state)`` (such as ``PIDExpert``), where the true state is to be had: it is free of noise.
-    2. ``source.predict(observation, deterministic=…)``: an SB3 model, or an ``Expert`` of this package without a true state.
+    2. ``source.predict(observation)``, deterministic: an SB3 model, or an ``Expert`` of this package without a true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
     2 and 3 get the observations that a policy sees. Controllers with a memory (recurrent policies) are not supported.
@@ -33,7 +33,6 @@ class Controller:
     :param observation_space: None: not checked.
     :param true_state: gives the present true state; None: there is none.
     :param kind: what messages call it.
-    :param deterministic: whether a policy gives the mean of its actions, or a sample.
     :raises ConfigError: a source that is none of the three, or whose spaces do not fit; ``ExpertError`` of an expert.
     """
 
@@ -44,7 +43,6 @@ class Controller:
         observation_space: spaces.Space[Any] | None = None,
         true_state: Callable[[], QuadcopterState] | None = None,
         kind: str = "controller",
-        deterministic: bool = True,
     ) -> None:
         error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
         self.source, self.kind = source, kind
@@ -61,12 +59,10 @@ class Controller:
                 label = what.replace("_", " ")
                 raise error(f"{kind} {self.name}: its {label} has shape {theirs.shape}, the environment's {ours.shape}")
         self.needs_state = hasattr(source, "actions") and true_state is not None
-        if self.needs_state:
-            assert true_state is not None
-            state = true_state
-            self._ask: Ask = lambda observation: source.actions(state())
+        if self.needs_state and true_state is not None:
+            self._ask: Ask = lambda observation: source.actions(true_state())
         elif hasattr(source, "predict") or callable(source):
-            self._ask = observation_function(source, deterministic)
+            self._ask = observation_function(source)
         elif hasattr(source, "actions"):
             raise error(f"{kind} {self.name}: needs the true state, and this environment has no true_state()")
         else:
@@ -126,7 +122,10 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
 
 
 def observation_function(source: Any, deterministic: bool = True) -> Ask:
-    """A policy or a function as a function from observations (n, ...) to actions (n, ...)."""
+    """A policy or a function as a function from observations (n, ...) to actions (n, ...).
+
+    :param deterministic: whether a policy gives the mean of its actions, or a sample.
+    """
     if hasattr(source, "predict"):
         return lambda observation: source.predict(observation, deterministic=deterministic)[0]
-    return lambda observation: source(observation)
+    return source  # type: ignore[no-any-return]

@@ -12,7 +12,7 @@ from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.rotation import rotation_rows
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
-from sb3_quad.vehicles.authority import command_lag, greatest_moments
+from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -22,14 +22,14 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
 
-    The units are the lag τ from a command to its thrust (:func:`~sb3_quad.vehicles.authority.command_lag`); the greatest
+    The units are the lag τ from a command to its thrust (:class:`~sb3_quad.vehicles.authority.Authority`); the greatest
     angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
     upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
     limits in hover thrusts.
     """
     least, most = vehicle.thrust_limits
-    turn = float(np.min(greatest_moments(vehicle)[:2] / np.asarray(vehicle.inertia[:2])))
-    lag = command_lag(vehicle)
+    able = Authority(vehicle)
+    turn, lag = float(able.accelerations[:2].min()), able.command_lag
     rate = min(1.0 / (lag + 1.0 / math.sqrt(turn)), 0.438 / lag)
     sideways = math.sqrt(most**2 - 1.0)
     return GeometricGains(
@@ -76,15 +76,14 @@ class GeometricExpert(Expert):
         super().__init__(vehicle, observation_mean, observation_std)
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
-        self._gains = self.gains.values()
-        self._body = np.array([v.mass, v.gravity, *v.inertia, command_lag(v)])
-        self._thrust_range = np.array(v.thrust_range)
+        body = np.array([v.mass, v.gravity, *v.inertia, Authority(v).command_lag])
+        self._constants = self.gains.values(), body, v.mixer_inverse, np.array(v.thrust_range)
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
         moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
-        _geometric(*moving, self._gains, self._body, self.vehicle.mixer_inverse, self._thrust_range, actions)
+        _geometric(*moving, *self._constants, actions)
         return actions
 
 

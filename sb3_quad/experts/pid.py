@@ -51,15 +51,15 @@ class PIDExpert(Expert):
                 raise ConfigError(f"PIDExpert: {name} is {value}, must be a finite number of at least 0")
         v = self.vehicle
         inertia = np.asarray(v.inertia)
-        self._gains = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
-        self._attitude = np.stack([inertia * natural_frequency**2, inertia * 2 * damping * natural_frequency])
-        self._thrust_range = np.array(v.thrust_range)
+        position = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
+        attitude = np.stack([inertia * natural_frequency**2, inertia * 2 * damping * natural_frequency])
+        self._constants = position, attitude, v.mixer_inverse, np.array(v.thrust_range)
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
         moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
-        _pid(*moving, self._gains, self._attitude, self.vehicle.mixer_inverse, self._thrust_range, actions)
+        _pid(*moving, *self._constants, actions)
         return actions
 
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Callable
+import pkgutil
 from pathlib import Path
 from typing import Any
 
@@ -26,40 +25,26 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
         expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for.
     :param kind: what messages call it.
-    :raises ConfigError: an unknown name, a missing or unreadable file.
+    :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be imported.
     :raises ExpertError: a factory that fails.
     """
     if not isinstance(spec, (str, Path)):
         return spec
     text = str(spec)
-    if text in EXPERTS:
-        return _factory(EXPERTS[text], kind)(load_vehicle(vehicle))
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)
-    if ":" in text:
-        factory = _factory(text, kind)
-        try:
-            return factory(load_vehicle(vehicle))
-        except SB3QuadError:
-            raise
-        except Exception as error:
-            raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
-    valid = [*EXPERTS, *pretrained_names()]
-    raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
-
-
-def _factory(path: str, kind: str) -> Callable[[Vehicle], Any]:
-    module_name, _, attribute = path.partition(":")
+    location = EXPERTS.get(text, text)
+    if ":" not in location:
+        valid = [*EXPERTS, *pretrained_names()]
+        raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
     try:
-        factory = getattr(importlib.import_module(module_name), attribute)
-    except ImportError as error:
-        raise ConfigError(f"{kind} {path}: module {module_name} cannot be imported ({error})") from None
-    except AttributeError:
-        raise ConfigError(f"{kind} {path}: module {module_name} has no {attribute!r}") from None
+        factory = pkgutil.resolve_name(location)
     except Exception as error:  # whatever the module does when it is imported
-        reason = f"{type(error).__name__}: {error}"
-        raise ConfigError(f"{kind} {path}: module {module_name} fails when it is imported ({reason})") from error
-    if not callable(factory):
-        raise ConfigError(f"{kind} {path}: {attribute} is not callable")
-    return factory  # type: ignore[no-any-return]
+        raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error
+    try:
+        return factory(load_vehicle(vehicle))
+    except SB3QuadError:
+        raise
+    except Exception as error:
+        raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from sb3_quad.evaluation.tables import Table, text_table
-from sb3_quad.vehicles.authority import Authority, gyration_ratio
+from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SLIM_THRUST = 1.2  # thrust-to-weight ratio below which little is left to turn and brake with
@@ -20,7 +20,7 @@ def parameter_table(vehicle: Vehicle, able: Authority) -> Table:
     action = f"{vehicle.hover_action:+.3f}" if abs(vehicle.hover_action) > 5e-4 else "0"
     ixx, iyy, izz = vehicle.inertia
     share = max(vehicle.inertia) / (sum(vehicle.inertia) - max(vehicle.inertia))
-    ratios = ", ".join(f"{ratio:.2f}" for ratio in gyration_ratio(vehicle))
+    ratios = ", ".join(f"{ratio:.2f}" for ratio in able.gyration_ratios)
     rows = (
         ("can hover", f"yes: thrust-to-weight ratio {able.thrust_to_weight:.2f}, least {able.least_thrust:.2f}"),
         ("mass, weight", f"{vehicle.mass:g} kg, {vehicle.mass * vehicle.gravity:.4g} N"),
@@ -60,7 +60,7 @@ def authority_table(able: Authority) -> Table:
 def warnings(vehicle: Vehicle, able: Authority) -> list[str]:
     """What is possible but unlikely: mostly a wrong unit."""
     found = []
-    ratio = gyration_ratio(vehicle)
+    ratio = able.gyration_ratios
     if ratio.max() > 1.0 or ratio.min() < 0.05:
         found.append(
             f"inertia: radii of gyration of {ratio.min():.3g} to {ratio.max():.3g} of the rotors' distance are unusual "
@@ -70,6 +70,6 @@ def warnings(vehicle: Vehicle, able: Authority) -> list[str]:
         found.append(
             f"thrust: a thrust-to-weight ratio of {able.thrust_to_weight:.2f} leaves little to turn and to brake with"
         )
-    if vehicle.collision_radius > 2.0 * max(math.hypot(x, y) for x, y in vehicle.rotor_positions):
+    if vehicle.collision_radius > 2.0 * vehicle.arm_length:
         found.append("collision_radius: is more than twice the rotors' distance from the centre; is it in m?")
     return found

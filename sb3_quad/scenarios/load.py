@@ -16,7 +16,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
 from sb3_quad.scenarios.scenario import Scenario, Suite
-from sb3_quad.vehicles.vehicle import is_vehicle_file
+from sb3_quad.vehicles.vehicle import VEHICLES
 
 SUITES = YamlFolder("suite", "sb3_quad.scenarios.suites")
 MAX_CELLS = 1000
@@ -55,7 +55,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         if not isinstance(entry, dict):
             raise ConfigError(f"{where}: scenarios.{number}: must hold keys and values, such as 'name: hover'")
         place, vehicle = f"{where}: scenario {entry.get('name', number)}", entry.get("vehicle")
-        if isinstance(vehicle, str) and is_vehicle_file(vehicle):
+        if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
             entry = {**entry, "vehicle": str(folder / vehicle)}
         scenarios += [validate(Scenario, cell, place) for cell in expand(entry, place)]
     return validate(Suite, {**data, "scenarios": scenarios}, where)

@@ -16,7 +16,7 @@ from sb3_quad.base.seeds import SUITE
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.vehicle import Vehicle, is_vehicle_file, load_vehicle
+from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
@@ -206,7 +206,7 @@ class Suite(Frozen):
         changes = {key: value for key, value in (("episodes", episodes), ("seed", seed)) if value is not None}
         flown_by: dict[str, Any] = {}
         if vehicle is not None:
-            flown_by = {"vehicle": str(Path(vehicle).absolute()) if is_vehicle_file(vehicle) else vehicle, "reference": {}}
+            flown_by = {"vehicle": str(Path(vehicle).absolute()) if VEHICLES.is_path(vehicle) else vehicle, "reference": {}}
         changed = []
         for scenario in self.scenarios:
             if names and scenario.name not in names and scenario.group not in names:

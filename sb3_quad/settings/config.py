@@ -38,7 +38,7 @@ from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.settings.values import convert, positive_whole, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.vehicles.vehicle import is_vehicle_file
+from sb3_quad.vehicles.vehicle import VEHICLES
 
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("geometric", "thesis"))
 """The settings files that come with the package, as ``--conf-file`` takes them."""
@@ -199,7 +199,7 @@ def build_config(
 def with_vehicle_path(value: Any) -> Any:
     """``env_kwargs`` whose vehicle file, if they name one, can be found from any folder: runs are flown and resumed later."""
     vehicle = value.get("vehicle") if isinstance(value, dict) else None
-    if not isinstance(vehicle, (str, Path)) or not is_vehicle_file(vehicle):
+    if not isinstance(vehicle, (str, Path)) or not VEHICLES.is_path(vehicle):
         return value
     return {**value, "vehicle": str(Path(vehicle).absolute())}
 

@@ -7,12 +7,11 @@ from typing import Any, TypeAlias, TypedDict
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium.utils import seeding
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.checks import per_row, whole_number
-from sb3_quad.simulation.engine.random import new_streams, stream_key
+from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, StepArrays, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, compilation_notice, run
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
@@ -74,7 +73,7 @@ class QuadcopterBatch:
         self.vehicle_list = _vehicles(vehicle if one_each else [vehicle] * n, n)
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
         self.vehicles = np.stack([each.parameters() for each in columns], axis=1)
-        self.tasks: TaskTable = resolve_tasks(task, task_kwargs)
+        self.tasks = resolve_tasks(task, task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
         self.state = np.zeros((STATE_SIZE, n))
         self.queue = np.zeros((self.vehicle_list[0].delay, 4, n))
@@ -86,21 +85,16 @@ class QuadcopterBatch:
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
+        self._bind()
         self.set_noise(noise)
         self.set_observation_scaling(observation_mean, observation_std)
-        self._bind()
         with compilation_notice():
             self.observe()
         self.seed([None if seed is None else seed + row for row in range(n)])
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""
-        self.set_streams([seeding.np_random(None if each is None else int(each))[0] for each in seeds], rows)
-
-    def set_streams(self, generators: Sequence[np.random.Generator], rows: Rows = None) -> None:
-        """New streams of the given rows, each from a generator; their next reset begins the first episode."""
-        keys = [stream_key(generator) for generator in generators]
-        self.streams[:, self.rows(rows)] = new_streams(np.array(keys, dtype=np.uint64))
+        self.streams[:, self.rows(rows)] = new_streams(seeds)
 
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
@@ -226,7 +220,7 @@ class QuadcopterBatch:
         # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
         weights = np.concatenate([np.zeros(used.size), new.weights])
         self.task_index[:] = index
-        self.tasks = TaskTable(parameters, weights, (*(self.tasks.tasks[k] for k in used), *new.tasks))
+        self.tasks = TaskTable(parameters, weights)
         self._bind()
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
@@ -236,16 +230,14 @@ class QuadcopterBatch:
                 return np.zeros(1, dtype=np.int64)
             self.noise_level = np.repeat(self.noise_level, self.n)
             self.mean, self.std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-            if hasattr(self, "job"):
-                self._bind()
+            self._bind()
         return self.rows(rows)
 
     def _bind(self) -> None:
         """Write down for the compiled step where all arrays are; again whenever one is replaced."""
         first = self.vehicle_list[0]
-        self.arrays = {name: getattr(self, name) for name in ARRAYS if not name.startswith("task_")}
-        self.arrays |= {"task_index": self.task_index}
-        self.arrays |= {"task_parameters": self.tasks.parameters, "task_weights": self.tasks.weights}
+        table = {"task_parameters": self.tasks.parameters, "task_weights": self.tasks.weights}
+        self._bound = {name: table[name] if name in table else getattr(self, name) for name in ARRAYS}
         sizes = {
             "n": self.n,
             "delay": first.delay,
@@ -260,7 +252,7 @@ class QuadcopterBatch:
         }
         self.job = np.zeros(1, dtype=JOB)
         self._job_numbers = self.job.view(np.int64)
-        for name, value in {**sizes, **{f"{name}_at": array.ctypes.data for name, array in self.arrays.items()}}.items():
+        for name, value in {**sizes, **{f"{name}_at": array.ctypes.data for name, array in self._bound.items()}}.items():
             self.job[name] = value
 
 

@@ -1,18 +1,8 @@
 """The true state of n quadcopters, the wrench that acts on them, and how both lie in memory.
 
 One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle per column, so that
-compiled loops over vehicles run over neighbouring numbers. The order of the rows is that of the tables.
-
-================  =====  ===============================================================  ======
-state             rows   meaning                                                          unit
-================  =====  ===============================================================  ======
-position          3      r, world frame                                                   m
-quaternion        4      body to world, (w, x, y, z), unit norm                           --
-velocity          3      v, world frame                                                   m/s
-body_rates        3      angular velocity, body frame (x forward, z up)                   rad/s
-rotor_speeds      4      ω of each rotor; thrust F = kF ω² (Eq. 2.4)                      rad/s
-target            3      r_T, world frame                                                 m
-================  =====  ===============================================================  ======
+compiled loops over vehicles run over neighbouring numbers. The order of the rows is that of :data:`STATE`;
+:class:`QuadcopterState` says what they are.
 
 A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N), ``torque_world`` and ``torque_body`` (N m),
 three rows each, all at the centre of mass.
@@ -29,6 +19,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.layout import row_slices
+from sb3_quad.simulation.rotation import rotation_rows
 
 STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}
 STATE_SIZE = sum(STATE.values())
@@ -43,7 +34,7 @@ FORCE_WORLD, FORCE_BODY, TORQUE_WORLD, TORQUE_BODY = row_slices(WRENCH).values()
 class QuadcopterState:
     """Read access to the true state of n vehicles; what an expert is given.
 
-    :param array: float64 of shape ``(STATE_SIZE, n)``, laid out as this module's table says. The properties are views
+    :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The properties are views
         of it with one vehicle per row, so they show later changes: copy what must last.
     """
 
@@ -61,7 +52,7 @@ class QuadcopterState:
 
     @property
     def quaternion(self) -> FloatArray:
-        """Body to world, shape (n, 4), (w, x, y, z)."""
+        """Body to world, shape (n, 4), (w, x, y, z), unit norm."""
         return self.array[QUATERNION].T
 
     @property
@@ -71,12 +62,12 @@ class QuadcopterState:
 
     @property
     def body_rates(self) -> FloatArray:
-        """Angular velocity, shape (n, 3), body frame, rad/s."""
+        """Angular velocity, shape (n, 3), body frame (x forward, z up), rad/s."""
         return self.array[BODY_RATES].T
 
     @property
     def rotor_speeds(self) -> FloatArray:
-        """Rotor speeds ω, shape (n, 4), rad/s."""
+        """Rotor speeds ω, shape (n, 4), rad/s; each gives a thrust F = kF ω² (Eq. 2.4)."""
         return self.array[ROTOR_SPEEDS].T
 
     @property
@@ -87,12 +78,7 @@ class QuadcopterState:
     @property
     def rotation(self) -> FloatArray:
         """Rotation matrices R, body to world, shape (n, 3, 3)."""
-        w, x, y, z = self.array[QUATERNION]
-        rows = (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        )
+        rows = rotation_rows.py_func(*self.array[QUATERNION])
         return np.moveaxis(np.array(rows), -1, 0)
 
     @property

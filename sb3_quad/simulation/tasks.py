@@ -59,7 +59,7 @@ class Task(Frozen):
         """What compiled code needs, in the order of :data:`TASK`, shape (columns,)."""
         nearest = self.target_distance if self.nearest_target is None else self.nearest_target
         values = {**{name: getattr(self, name) for name in TASK}, "nearest_target": nearest}
-        return np.concatenate([np.atleast_1d(np.asarray(value, dtype=np.float64)) for value in values.values()])
+        return np.hstack(list(values.values())).astype(np.float64)
 
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
@@ -86,11 +86,8 @@ TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 class TaskTable(NamedTuple):
     """The tasks an environment samples from at each reset; K rows."""
 
-    parameters: FloatArray
-    """(K, columns), see :data:`TASK`"""
-    weights: FloatArray
-    """(K,), cumulative, the last one 1"""
-    tasks: tuple[Task, ...]
+    parameters: FloatArray  # (K, columns), see TASK
+    weights: FloatArray  # (K,), cumulative, the last one 1
 
 
 def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> TaskTable:
@@ -102,7 +99,7 @@ def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) 
     weights = dict(task) if isinstance(task, Mapping) else {task: 1.0}
     if not weights:
         raise ConfigError("task: the mixture names no task; give at least one, such as {'target_tracking': 1.0}")
-    tasks = tuple(_resolve(entry, dict(task_kwargs or {})) for entry in weights)
+    parameters = np.stack([_resolve(entry, dict(task_kwargs or {})).parameters() for entry in weights])
     try:
         shares = np.array([float(share) for share in weights.values()])
     except (TypeError, ValueError):
@@ -111,7 +108,7 @@ def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) 
         raise ConfigError(f"task: the weights {shares.tolist()} must be finite, not negative and not all zero")
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0
-    return TaskTable(np.stack([entry.parameters() for entry in tasks]), cumulative, tasks)
+    return TaskTable(parameters, cumulative)
 
 
 def _resolve(entry: Any, overrides: dict[str, Any]) -> Task:

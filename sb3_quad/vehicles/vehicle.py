@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import (
-    Field,
-    ModelWrapValidatorHandler,
-    NonNegativeFloat,
-    PositiveFloat,
-    TypeAdapter,
-    ValidationError,
-    model_validator,
-)
+from pydantic import Field, ModelWrapValidatorHandler, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import CannotHover
@@ -38,7 +29,6 @@ OTHER_LIMITS = {
     "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
     "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
 }
-_PAIR = TypeAdapter(tuple[float, float])
 
 
 class Vehicle(Frozen):
@@ -89,9 +79,10 @@ class Vehicle(Frozen):
             return handler(data)
         (name,) = given
         others = {key: value for key, value in data.items() if key != name}
+        pair = data[name] if isinstance(data[name], (list, tuple)) else ()
         try:
-            least, most = _PAIR.validate_python(data[name])
-        except ValidationError:
+            least, most = (float(limit) for limit in pair)
+        except (TypeError, ValueError):
             raise ValueError(f"{name}: must be two numbers ({OTHER_LIMITS[name]})") from None
         if not 0.0 <= least < most < math.inf:
             raise ValueError(f"{name} [{least:g}, {most:g}]: must rise, from at least 0 ({OTHER_LIMITS[name]})")
@@ -115,11 +106,10 @@ class Vehicle(Frozen):
             raise ValueError(f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step}")
         if self.motor_gain * self.physics_step > 1.0:
             raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
-        try:
-            _ = self.mixer
-        except np.linalg.LinAlgError:
-            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently") from None
-        if not np.allclose(self.mixer[1:].sum(axis=1), 0.0, atol=1e-9):
+        mixer = self.mixer
+        if abs(np.linalg.det(mixer)) < 1e-12:
+            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently")
+        if not np.allclose(mixer[1:].sum(axis=1), 0.0, atol=1e-9):
             raise ValueError(
                 "rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)"
             )
@@ -143,12 +133,18 @@ class Vehicle(Frozen):
 
         Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and pitch.
         """
-        return _mixers(self.rotor_positions, self.rotor_directions, self.moment_thrust_ratio)[0]
+        x, y = np.array(self.rotor_positions).T
+        return np.stack([np.ones(4), y, -x, self.moment_thrust_ratio * np.array(self.rotor_directions)])
 
     @property
     def mixer_inverse(self) -> FloatArray:
         """Rotor thrusts from [ΣF; Mx; My; Mz], shape (4, 4)."""
-        return _mixers(self.rotor_positions, self.rotor_directions, self.moment_thrust_ratio)[1]
+        return np.asarray(np.linalg.inv(self.mixer))
+
+    @property
+    def arm_length(self) -> float:
+        """Distance of the outermost rotor from the centre of mass, m."""
+        return max(math.hypot(x, y) for x, y in self.rotor_positions)
 
     @property
     def hover_thrust(self) -> float:
@@ -197,29 +193,6 @@ class Vehicle(Frozen):
         head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
         tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius)
         return np.array([*head, *self.mixer[1:].ravel(), *tail], dtype=np.float64)
-
-
-@lru_cache(maxsize=256)
-def _mixers(positions: PerRotor, directions: tuple[int, int, int, int], ratio: float) -> tuple[FloatArray, FloatArray]:
-    """Mixer and inverse, kept outside the model, whose copies and comparisons they would otherwise disturb; read-only."""
-    x, y = np.asarray(positions, dtype=np.float64).T
-    mixer = np.stack([np.ones(4), y, -x, ratio * np.asarray(directions, dtype=np.float64)])
-    if abs(np.linalg.det(mixer)) < 1e-12:
-        raise np.linalg.LinAlgError("singular mixer")
-    inverse = np.asarray(np.linalg.inv(mixer))
-    mixer.setflags(write=False)
-    inverse.setflags(write=False)
-    return mixer, inverse
-
-
-def vehicle_names() -> list[str]:
-    """The vehicles that come with the package."""
-    return VEHICLES.names()
-
-
-def is_vehicle_file(source: str | Path) -> bool:
-    """Whether :func:`load_vehicle` takes it for the path of a file rather than for a name."""
-    return VEHICLES.is_path(source)
 
 
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:

@@ -14,7 +14,7 @@ from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.report.vehicle import authority_table, parameter_table, warnings
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.vehicles.authority import authority
+from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
@@ -27,7 +27,7 @@ def run(options: argparse.Namespace) -> int:
     except CannotHover as error:
         print(f"cannot hover: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
-    able = authority(vehicle)
+    able = Authority(vehicle)
     console().print(parameter_table(vehicle, able))
     console().print(authority_table(able))
     for warning in warnings(vehicle, able):

@@ -15,7 +15,7 @@ from numba import carray
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled, pointer
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import STATE, WRENCH_SIZE
+from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import SCORED, TASK
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
@@ -28,7 +28,7 @@ _NORMALS = -(-OBSERVATION_SIZE // 2) * 2
 
 # Of every lane: the kind of numbers, and how many or of what shape.
 _CONTENTS: dict[str, tuple[str, Any]] = {
-    **{name: ("f8", rows) for name, rows in STATE.items()},
+    "state": ("f8", STATE_SIZE),  # all its rows
     "command": ("f8", 4),  # action, then the rotor speed it commands
     "wanted_speeds": ("f8", 4),  # rotor speeds to be reached in this control step
     "wrench": ("f8", WRENCH_SIZE),
@@ -54,7 +54,11 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "word": ("u4", _WORDS),  # random
     "stream": ("u4", 4),
 }
-BLOCK = np.dtype([(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()])
+# The parts of the state lie in it, each under its name.
+_PARTS = {name: (np.dtype(("f8", (STATE[name], LANES))), 8 * LANES * row) for name, row in X._asdict().items()}
+_WHOLE = np.dtype([(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()])
+_FIELDS: Any = {**(_WHOLE.fields or {}), **_PARTS}
+BLOCK = np.dtype(_FIELDS)
 MEMORY = BLOCK.itemsize + 64  # bytes of the array that a block lies in, at a cache line
 
 
@@ -65,43 +69,23 @@ def block_in(memory):
 
 
 @compiled(forceinline=True)
-def load_rows(source, row, first, count, target):
-    """Copy rows of a (rows, n) array, from ``row`` on, to rows of a block."""
+def load_rows(source, first, count, target):
+    """Copy the first rows of a (rows, n) array to those of a block."""
     for k in range(target.shape[0]):
         if count == LANES:
             for lane in range(LANES):
-                target[k, lane] = source[row + k, first + lane]
+                target[k, lane] = source[k, first + lane]
         else:
             for lane in range(LANES):
-                target[k, lane] = source[row + k, first + min(lane, count - 1)]
-
-
-@compiled
-def load_state(b, state, first, count):
-    """The true state of a block."""
-    load_rows(state, X.position, first, count, b.position)
-    load_rows(state, X.quaternion, first, count, b.quaternion)
-    load_rows(state, X.velocity, first, count, b.velocity)
-    load_rows(state, X.body_rates, first, count, b.body_rates)
-    load_rows(state, X.rotor_speeds, first, count, b.rotor_speeds)
-    load_rows(state, X.target, first, count, b.target)
-
-
-@compiled(forceinline=True)
-def _store_rows(source, state, row, first, count):
-    for k in range(source.shape[0]):
-        for lane in range(count):
-            state[row + k, first + lane] = source[k, lane]
+                target[k, lane] = source[k, first + min(lane, count - 1)]
 
 
 @compiled
 def store_state(b, state, first, count):
-    """Back to the array of all rows; the target stays as it is."""
-    _store_rows(b.position, state, X.position, first, count)
-    _store_rows(b.quaternion, state, X.quaternion, first, count)
-    _store_rows(b.velocity, state, X.velocity, first, count)
-    _store_rows(b.body_rates, state, X.body_rates, first, count)
-    _store_rows(b.rotor_speeds, state, X.rotor_speeds, first, count)
+    """Back to the array of all rows; the target, which comes last, stays as it is."""
+    for k in range(X.target):
+        for lane in range(count):
+            state[k, first + lane] = b.state[k, lane]
 
 
 @compiled

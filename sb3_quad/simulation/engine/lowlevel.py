@@ -1,4 +1,4 @@
-"""What compiled code here needs beyond numba's own: pointers, bit casts, atomic numbers, and a decorator.
+"""What compiled code here needs beyond numba's own: pointers, atomic numbers, and a decorator.
 
 A block (:mod:`.block`) is reached through one pointer, and every array in it has a constant shape and place. LLVM then knows
 each distance between two rows, needs no test for overlap, and vectorises the loops over lanes.
@@ -7,7 +7,6 @@ each distance between two rows, needs no test for overlap, and vectorises the lo
 from __future__ import annotations
 
 import contextlib
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ def _source_stamp() -> tuple[tuple[str, float, int], ...]:
     package = Path(__file__).resolve().parents[2]
     folders = ("base", "vehicles", "simulation", "experts")
     files = sorted(path for folder in folders for path in (package / folder).rglob("*.py"))
-    return tuple((path.name, os.stat(path).st_mtime, os.stat(path).st_size) for path in files)
+    return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in files)
 
 
 @intrinsic
@@ -48,17 +47,6 @@ def pointer(typing_context: Any, address: Any) -> Any:
         return builder.inttoptr(args[0], ir.PointerType(ir.IntType(8)))
 
     return types.voidptr(types.int64), codegen
-
-
-def _bit_cast(source: Any, target: Any, form: ir.Type) -> Any:
-    @intrinsic
-    def cast(typing_context: Any, value: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            return builder.bitcast(args[0], form)
-
-        return target(source), codegen
-
-    return cast
 
 
 def _atomic(operation: str) -> Any:
@@ -73,8 +61,6 @@ def _atomic(operation: str) -> Any:
     return change
 
 
-as_float32 = _bit_cast(types.int32, types.float32, ir.FloatType())  # the float32 of 32 bits
-as_int32 = _bit_cast(types.float32, types.int32, ir.IntType(32))  # the 32 bits of a float32
 atomic_add = _atomic("add")  # (array, index, value): adds to one number of an int64 array and gives the number before
 atomic_set = _atomic("xchg")  # likewise, sets it
 

@@ -14,12 +14,14 @@ number there can be is 6.6.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
+from gymnasium.utils import seeding
 from numba import float32, int32, uint32, uint64
 
-from sb3_quad.simulation.engine.lowlevel import LANES, as_float32, as_int32, compiled
+from sb3_quad.simulation.engine.lowlevel import LANES, compiled
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 OBSERVATION_NOISE, EPISODE_START = range(2)  # purposes: the last word of the counter
@@ -31,15 +33,14 @@ _TO_UNIT = float32(2.0**-31)
 _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 
 
-def stream_key(np_random: np.random.Generator) -> int:
-    """A 64-bit key from a seeded generator (Gymnasium's ``self.np_random``)."""
-    return int(np_random.integers(2**64, dtype=np.uint64))
+def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
+    """Streams before their first episode, shape (4, n), from n seeds; None: the operating system's entropy.
 
-
-def new_streams(keys: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint32]:
-    """Streams before their first episode, shape (4, n), from 64-bit keys of shape (n,)."""
-    keys = np.asarray(keys, dtype=np.uint64)
-    streams = np.zeros((4, keys.shape[0]), dtype=np.uint32)
+    A key is the first number of the generator that Gymnasium makes of the seed.
+    """
+    generators = [seeding.np_random(None if seed is None else int(seed))[0] for seed in seeds]
+    keys = np.array([generator.integers(2**64, dtype=np.uint64) for generator in generators], dtype=np.uint64)
+    streams = np.zeros((4, keys.size), dtype=np.uint32)
     streams[KEY_LO] = keys & np.uint64(0xFFFFFFFF)
     streams[KEY_HI] = keys >> np.uint64(32)
     return streams
@@ -95,9 +96,9 @@ def random_words(b):
 @compiled(forceinline=True)
 def _log(x):
     """ln x of a positive float32: the exponent, and a polynomial on [sqrt(1/2), sqrt(2))."""
-    bits = as_int32(x)
+    bits = np.float32(x).view(np.int32)
     exponent = int32(int32(bits - int32(_SQRT_HALF_BITS)) >> int32(23))
-    m = as_float32(int32(bits - int32(exponent << int32(23)))) - float32(1.0)
+    m = np.int32(bits - int32(exponent << int32(23))).view(np.float32) - float32(1.0)
     p = float32(7.0376836292e-2)
     for coefficient in (
         *(-1.1514610310e-1, 1.1676998740e-1, -1.2420140846e-1, 1.4249322787e-1),
@@ -127,5 +128,5 @@ def standard_normals(b):
             second = cosine if odd else sine
             first_sign = int32((quadrant ^ (quadrant >> int32(1))) & int32(1)) << int32(31)
             second_sign = int32(quadrant >> int32(1)) << int32(31)
-            noise[2 * pair, lane] = radius * as_float32(int32(as_int32(first) ^ first_sign))
-            noise[2 * pair + 1, lane] = radius * as_float32(int32(as_int32(second) ^ second_sign))
+            noise[2 * pair, lane] = radius * np.int32(np.float32(first).view(np.int32) ^ first_sign).view(np.float32)
+            noise[2 * pair + 1, lane] = radius * np.int32(np.float32(second).view(np.int32) ^ second_sign).view(np.float32)

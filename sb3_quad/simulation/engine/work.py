@@ -20,7 +20,6 @@ from sb3_quad.simulation.engine.block import (
     load_rows,
     load_scaling,
     load_scored,
-    load_state,
     load_vehicles,
     store_observations,
     store_state,
@@ -112,20 +111,20 @@ def run_block(job, number, b, fresh):
         std = carray(pointer(job.std_at), (OBSERVATION_SIZE, scaling), np.float64)
         load_scaling(b, mean, std, carray(pointer(job.noise_level_at), (scaling,), np.float64), first, count)
     if job.mode > LOOK:
-        load_state(b, state, first, count)
+        load_rows(state, first, count, b.state)
         if fresh or job.vehicle_columns > 1:
             load_vehicles(b, vehicles, first, count, job.physics_step)
         if fresh or job.tasks > 1:
             load_scored(b, task_index, tasks, first, count)
         if job.mode == FLY:
-            load_rows(carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64), 0, first, count, b.wrench)
+            load_rows(carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64), first, count, b.wrench)
             load_commands(b, carray(pointer(job.actions_at), (n, 4), np.float32), queue, first, count)
             fly_block(b, job.physics_step, job.substeps)
             store_state(b, state, first, count)
         score(b)
         for lane in range(count):
             streams[STEP, first + lane] += np.uint32(1)
-        load_rows(streams, 0, first, count, b.stream)
+        load_rows(streams, first, count, b.stream)
         observe(b)
         store_observations(b, observations, first, count)
 
@@ -161,8 +160,8 @@ def run_block(job, number, b, fresh):
         if dones[i]:
             returns[i] = 0.0
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
-    load_state(b, state, first, count)
-    load_rows(streams, 0, first, count, b.stream)
+    load_rows(state, first, count, b.state)
+    load_rows(streams, first, count, b.stream)
     observe(b)
     store_observations(b, observations, first, count)
 

@@ -60,7 +60,6 @@ def _loop(control: IntArray, number: int, signal: threading.Semaphore) -> None:
 
 
 _workers = Workers()
-_own = threading.local()
 
 
 def _renew() -> None:
@@ -84,7 +83,8 @@ def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
         workers.resting -= 1
         count = 0
     if count < 1 or not workers.lock.acquire(blocking=False):
-        return bool(work(_control_of_this_thread(), -1, PATIENCE, job, *arrays) >= 0)
+        alone = np.zeros(AWAKE + LINE, dtype=np.int64)  # a control array that no worker looks at
+        return bool(work(alone, -1, PATIENCE, job, *arrays) >= 0)
     try:
         workers.wake(count)
         outcome = work(workers.control, -1, PATIENCE, job, *arrays)
@@ -95,14 +95,6 @@ def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
         return bool(outcome >= 0)
     finally:
         workers.lock.release()
-
-
-def _control_of_this_thread() -> IntArray:
-    """A control array that no worker looks at."""
-    if not hasattr(_own, "control"):
-        _own.control = np.zeros(AWAKE + LINE, dtype=np.int64)
-    control: IntArray = _own.control
-    return control
 
 
 @contextlib.contextmanager
