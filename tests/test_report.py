@@ -19,13 +19,13 @@ from rich.console import Console
 from sb3_quad.cli import main
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
+from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.metric_tables import mark_best
 from sb3_quad.evaluation.records import Failure
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render, write_report
 from sb3_quad.report.sections import sections
-from sb3_quad.report.tracks import read_tracks
 from sb3_quad.scenarios.load import parse_suite
 
 SUITE = """
@@ -190,7 +190,7 @@ def test_paths_are_the_flights(folder, parts):
         traces.setdefault(trace["name"], []).append(points_of(trace))
     lines = {line.get_label(): np.array(line.get_data_3d()).T for line in reversed(plot.figure.axes[0].lines)}
     for label in ("pid", LABEL):
-        track = read_tracks(folder, results.entry(label, "hit"))[0]
+        track = read_tracks(folder / results.entry(label, "hit").flights)[0]
         np.testing.assert_allclose(traces[label][0][[0, -1]], track.position[[0, -1]], rtol=1e-3)
         np.testing.assert_array_equal(lines[label][[0, -1]], track.position[[0, -1]])
     np.testing.assert_allclose(traces["target"][0], [[1, 1, 16]])

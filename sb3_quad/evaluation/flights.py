@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -24,7 +23,7 @@ from sb3_quad.experts.controller import Controller
 from sb3_quad.scenarios.sample import Plan
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, WRENCH_SIZE, QuadcopterState
+from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
@@ -34,39 +33,21 @@ OBSERVATIONS = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """The metrics of n episodes, one per row.
+    """The metrics of n episodes, one per row."""
 
-    ================  ==========  ==================================================================================
-    name              shape       meaning
-    ================  ==========  ==================================================================================
-    success           (n,) bool   neither collision nor out of range
-    collision         (n,) bool   the ground was touched
-    reward            (n,)        sum of the rewards
-    length            (n,)        control steps
-    flown             (n,)        s until lost or the end
-    time_to           {m: (n,)}   s until |r - r_T| is first within the tolerance; NaN if it never was. Of a course
-                                  of waypoints: of the last one, once it is the target
-    path_length       (n,)        m, over the whole episode
-    final_error       (n,)        |r - r_T| at the end, m
-    final_offset      (n, 3)      r - r_T at the end, world frame, m; NaN where the flight was lost
-    waypoint_times    (n, W)      s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
-    start             (n, 13)     position, quaternion, velocity (world frame), body rates; SI
-    target            (n, 3)      the first target, m
-    ================  ==========  ==================================================================================
-    """
-
-    success: BoolArray
-    collision: BoolArray
-    reward: FloatArray
-    length: IntArray
-    flown: FloatArray
+    success: BoolArray  # (n,), neither collision nor out of range
+    collision: BoolArray  # (n,), the ground was touched
+    reward: FloatArray  # (n,), sum of the rewards
+    length: IntArray  # (n,), control steps
+    flown: FloatArray  # (n,), s until lost or the end
+    # By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a course, to the last waypoint.
     time_to: Mapping[float, FloatArray]
-    path_length: FloatArray
-    final_error: FloatArray
-    final_offset: FloatArray
-    waypoint_times: FloatArray
-    start: FloatArray
-    target: FloatArray
+    path_length: FloatArray  # (n,), m, over the whole episode
+    final_error: FloatArray  # (n,), |r - r_T| at the end, m
+    final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    waypoint_times: FloatArray  # (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
+    start: FloatArray  # (n, 13), position, quaternion, velocity (world frame), body rates; SI
+    target: FloatArray  # (n, 3), the first target, m
 
     @property
     def n(self) -> int:
@@ -101,38 +82,28 @@ def fly(
     n_episodes: int = 240,
     seed: int = 0,
     vehicle: str | Vehicle = "itm",
-    noise: float = 0.05,
     backend: str = "batch",
-    task_kwargs: Mapping[str, Any] | None = None,
     max_steps: int = MAX_EPISODE_STEPS,
-    tolerances: tuple[float, ...] = TOLERANCES,
-    observation_std: npt.ArrayLike | None = None,
-    observation_mean: npt.ArrayLike | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
+    **environment: Any,
 ) -> Flights:
     """Fly ``n_episodes`` episodes; number k is the first one of the environment seeded with ``seed + k``.
 
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
         ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
-    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise``, ``task_kwargs``,
-        ``observation_std`` and ``observation_mean``.
+    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle`` and ``environment``:
+        ``noise``, ``task_kwargs``, ``observation_std`` and ``observation_mean``.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
+    :param tolerances: of arrival, |r - r_T|, m.
     :param hooks: are called along the way.
-    :raises ConfigError: an unknown backend, fewer than one episode, or a controller that is none of the three.
+    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller that is none of the three.
     :raises ControllerError: a controller that fails in flight.
     """
-    settings = FlightSettings().with_changes(
-        task=task,
-        task_kwargs=task_kwargs,
-        vehicle=vehicle,
-        noise=noise,
-        observation_mean=observation_mean,
-        observation_std=observation_std,
-        max_episode_steps=max_steps,
-    )
     if n_episodes < 1:
         raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
+    settings = FlightSettings().with_changes(task=task, vehicle=vehicle, max_episode_steps=max_steps, **environment)
     return fly_settings(controller, settings, range(seed, seed + n_episodes), backend, tolerances, hooks)
 
 
@@ -162,7 +133,7 @@ def _fly_fleet(
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()
-    start = np.concatenate([state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES)]).T.copy()
+    start = np.hstack([state.position, state.quaternion, state.velocity, state.body_rates])
     first_target, position, error = state.target.copy(), state.position.copy(), state.distance
     flying, success, collision = np.ones(n, dtype=np.bool_), np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
     reward, path, length = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)

@@ -116,4 +116,5 @@ def axis_name(key: str) -> str:
 def axis_label(key: str) -> str:
     """The name of a varied key with its unit, as the axes of plots carry it."""
     name = axis_name(key)
-    return f"{name} ({_UNITS[name]})" if name in _UNITS else name
+    words = name.replace("_", " ")
+    return f"{words} ({_UNITS[name]})" if name in _UNITS else words
