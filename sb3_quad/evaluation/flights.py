@@ -133,16 +133,25 @@ def _fly_fleet(
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()
-    start = np.hstack([state.position, state.quaternion, state.velocity, state.body_rates])
-    first_target, position, error = state.target.copy(), state.position.copy(), state.distance
-    flying, success, collision = np.ones(n, dtype=np.bool_), np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    reward, path, length = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
-    final_error, final_offset = error.copy(), np.full((n, 3), np.nan)
-    limits = np.array(tolerances)[:, None]
-    on_last = np.full(n, count <= 1)
+    position, error = state.position.copy(), state.distance
+    wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
+    waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
-    waypoint, waypoint_times = np.zeros(n, dtype=np.int64), np.full((n, count), np.nan)
-    wrench = np.zeros((n, WRENCH_SIZE))
+    flights = Flights(
+        success=np.ones(n, dtype=np.bool_),
+        collision=np.zeros(n, dtype=np.bool_),
+        reward=np.zeros(n),
+        length=np.zeros(n, dtype=np.int64),
+        flown=np.zeros(n),
+        time_to=dict(zip(tolerances, times, strict=True)),
+        path_length=np.zeros(n),
+        final_error=error.copy(),
+        final_offset=np.full((n, 3), np.nan),
+        waypoint_times=np.full((n, count), np.nan),
+        start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
+        target=state.target.copy(),
+    )
+    flying = flights.success  # until it is lost
     for hook in hooks:
         hook.on_start(state, fleet.vehicle)
 
@@ -155,15 +164,13 @@ def _fly_fleet(
             hook.before_step(state, observation, wrench, flying)
         observation, step_reward, lost, collided, error = fleet.step(actions, flying)
         state = fleet.true_state()
-        reward[flying] += step_reward[flying]
-        path[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
+        flights.reward[flying] += step_reward[flying]
+        flights.path_length[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
         position = state.position.copy()
-        final_error[flying] = error[flying]
-        length[flying] = step
+        flights.final_error[flying] = error[flying]
+        flights.length[flying], flights.flown[flying] = step, step * control_step
         times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
-        ended = flying & lost
-        collision |= ended & collided
-        success &= ~ended
+        flights.collision[flying & lost & collided] = True
         flying &= ~lost
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
@@ -171,27 +178,14 @@ def _fly_fleet(
             break
         if count:
             reached = np.flatnonzero(flying & (waypoint < count) & (error <= plan.radius))
-            waypoint_times[reached, waypoint[reached]] = step * control_step
+            flights.waypoint_times[reached, waypoint[reached]] = step * control_step
             waypoint[reached] += 1
             on_last |= waypoint >= count - 1
             onward = reached[waypoint[reached] < count]
             if onward.size:
                 observation = fleet.set_targets(onward, plan.waypoints[waypoint[onward]])
-    final_offset[flying] = (state.position - state.target)[flying]
-    return Flights(
-        success=success,
-        collision=collision,
-        reward=reward,
-        length=length,
-        flown=np.asarray(length * control_step, dtype=np.float64),
-        time_to=dict(zip(tolerances, times, strict=True)),
-        path_length=path,
-        final_error=final_error,
-        final_offset=final_offset,
-        waypoint_times=waypoint_times,
-        start=start,
-        target=first_target,
-    )
+    flights.final_offset[flying] = (state.position - state.target)[flying]
+    return flights
 
 
 def _ask(controller: Controller, observation: Float32Array, flying: BoolArray, time: float) -> Float32Array:

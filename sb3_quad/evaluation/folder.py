@@ -105,7 +105,7 @@ def _rows(entry: Entry, arrays: Arrays) -> Iterator[dict[str, Any]]:
 
 
 def _write(path: Path, record: Frozen) -> None:
-    write_text(path, record.model_dump_json(indent=2, by_alias=True) + "\n")
+    write_text(path, record.model_dump_json(indent=2) + "\n")
 
 
 def _read(path: Path, model: type[Model]) -> Model:

@@ -57,8 +57,8 @@ def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Metrics]
     parts = [fly(policy, "state_recovery", n_episodes, first + k * n_episodes, **settings) for k in range(N_RECOVERIES)]
     rows = {RECOVERY: summarise(Flights.concatenate(parts))}
     for distance in DISTANCES:
-        task: dict[str, Any] = {"task_kwargs": {"target_distance": distance}}
-        flown = fly(policy, "target_tracking", n_episodes, first + int(1000 * distance), **task, **settings)
+        task = {"target_distance": distance}
+        flown = fly(policy, "target_tracking", n_episodes, first + int(1000 * distance), task_kwargs=task, **settings)
         rows[f"targets {distance:.0f} m away"] = summarise(flown)
     return rows
 
