@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.records import Entry, Estimate, Metrics, Results
-from sb3_quad.scenarios.load import axis_label, axis_name
+from sb3_quad.scenarios.load import UNITS, axis_label, axis_name
 from sb3_quad.scenarios.scenario import Scenario
 
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
@@ -285,8 +285,6 @@ def _heat_map(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours
 
 def _rest(scenario: Scenario) -> str:
     """The values of all but the first two keys of a cell, with their units."""
-    parts = []
-    for key in list(scenario.cell)[2:]:
-        name, _, unit = axis_label(key).partition(" (")
-        parts.append(f"{name} {scenario.cell[key]:g} {unit.removesuffix(')')}".strip())
-    return ", ".join(parts)
+    names = {key: axis_name(key) for key in list(scenario.cell)[2:]}
+    parts = (f"{name} {scenario.cell[key]:g} {UNITS.get(name, '')}" for key, name in names.items())
+    return ", ".join(part.replace("_", " ").strip() for part in parts)

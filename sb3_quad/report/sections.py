@@ -42,7 +42,10 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:
-            tables, plots = [_metric_table(results, first, colours)], _scenario_plots(results, first, colours, folder)
+            measured = [measured_cells(results, label, first) for label in colours]
+            rows = metric_rows(first, measured, first.reference.values(), brief=True)
+            tables = [Table(_columns(colours, first.reference, results.source), rows)]
+            plots = _scenario_plots(results, first, colours, folder)
         else:
             each_of = f" in each of {len(scenarios)} cells"
             tables, plots = [], group_plots(results, scenarios, colours)
@@ -74,12 +77,6 @@ def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, 
     if any(each.entry.hit_limit is not None for each in flown):
         plots.append(hits_plot(scenario, flown))
     return plots
-
-
-def _metric_table(results: Results, scenario: Scenario, colours: Mapping[str, str]) -> Table:
-    measured = [measured_cells(results, label, scenario) for label in colours]
-    rows = metric_rows(scenario, measured, scenario.reference.values(), brief=True)
-    return Table(_columns(colours, scenario.reference, results.source), rows)
 
 
 def _success_table(
