@@ -21,7 +21,7 @@ from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.folder import load_results
-from sb3_quad.evaluation.metric_tables import mark_best
+from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, time_row
 from sb3_quad.evaluation.records import Failure
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render, write_report
@@ -255,7 +255,7 @@ values = st.floats(-10, 10, allow_nan=False)
 
 @given(
     cells=st.lists(st.tuples(values, values, values), min_size=2, max_size=5),
-    row=st.sampled_from(["success", "mean time to 1 m"]),
+    row=st.sampled_from([SUCCESS, time_row(1)]),
 )
 def test_the_best_is_better_than_all_others_for_certain(cells, row):
     made = [Cell(middle, (low, high)) for low, middle, high in map(sorted, cells)]
@@ -263,7 +263,7 @@ def test_the_best_is_better_than_all_others_for_certain(cells, row):
     for cell in marked:
         others = [other for other in marked if other is not cell]
         (low, high), ends = cell.ends, [other.ends for other in others]
-        apart = all(low > other[1] if row == "success" else high < other[0] for other in ends)
+        apart = all(low > other[1] if row == SUCCESS else high < other[0] for other in ends)
         assert cell.best == apart
 
 

@@ -82,6 +82,7 @@ def fly(
     n_episodes: int = 240,
     seed: int = 0,
     vehicle: str | Vehicle = "itm",
+    noise: float = 0.05,
     backend: str = "batch",
     max_steps: int = MAX_EPISODE_STEPS,
     tolerances: Sequence[float] = TOLERANCES,
@@ -92,8 +93,8 @@ def fly(
 
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
         ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
-    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle`` and ``environment``:
-        ``noise``, ``task_kwargs``, ``observation_std`` and ``observation_mean``.
+    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise`` and
+        ``environment``: ``task_kwargs``, ``observation_std`` and ``observation_mean``.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
     :param tolerances: of arrival, |r - r_T|, m.
@@ -103,7 +104,8 @@ def fly(
     """
     if n_episodes < 1:
         raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
-    settings = FlightSettings().with_changes(task=task, vehicle=vehicle, max_episode_steps=max_steps, **environment)
+    environment |= {"task": task, "vehicle": vehicle, "noise": noise, "max_episode_steps": max_steps}
+    settings = FlightSettings().with_changes(**environment)
     return fly_settings(controller, settings, range(seed, seed + n_episodes), backend, tolerances, hooks)
 
 

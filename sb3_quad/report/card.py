@@ -7,7 +7,7 @@ from typing import Any
 
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, metric_cells, time_row, unit_of
+from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, metric_cells, time_row
 from sb3_quad.evaluation.records import Metrics
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
@@ -78,7 +78,7 @@ def write_card(
         if task == RECOVERY:  # begins at its target
             cells[NEAR] = Cell(words="–")
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))
-    columns = [Column(f"{row}, {unit_of(row)}".removesuffix(", ")) for row in SHOWN]
+    columns = [Column(row.heading) for row in SHOWN]
     return CARD.format(
         name=name,
         vehicle=settings["vehicle"],
