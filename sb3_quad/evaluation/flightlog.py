@@ -44,7 +44,7 @@ from sb3_quad.simulation.state import FORCE_BODY, FORCE_WORLD, TORQUE_BODY, TORQ
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
-OUTCOMES = {"success": "", "collision": "touches the ground", "out_of_range": "leaves the range"}
+OUTCOMES = {"success": "", "collision": "touches the ground", "out_of_range": "leaves the range"}  # in words
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
 
 
