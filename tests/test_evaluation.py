@@ -14,7 +14,7 @@ from rich.console import Console
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly
-from sb3_quad.evaluation.metric_tables import metric_cells, metric_rows
+from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.summary import share, summarise
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.experts.pid import PIDExpert
@@ -165,7 +165,7 @@ def test_tables_say_how_many_arrived():
     for part in ("success, %", "75.0 (", "5.00 (", ", 75 % arrive", "never", "0.300", "thesis: expert", "7.75"):
         assert part in text
     one_lost = figures.model_copy(update={"success": share([False] + [True] * 3839)})
-    assert metric_cells(one_lost)["success"].number == "99.97"  # not 100
+    assert metric_cells(one_lost)[SUCCESS].number == "99.97"  # not 100
 
 
 def test_tables_stand_without_a_single_success():

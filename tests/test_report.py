@@ -19,13 +19,13 @@ from rich.console import Console
 from sb3_quad.cli import main
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
+from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.folder import load_results
-from sb3_quad.evaluation.metric_tables import mark_best
+from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, time_row
 from sb3_quad.evaluation.records import Failure
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render, write_report
 from sb3_quad.report.sections import sections
-from sb3_quad.report.tracks import read_tracks
 from sb3_quad.scenarios.load import parse_suite
 
 SUITE = """
@@ -190,7 +190,7 @@ def test_paths_are_the_flights(folder, parts):
         traces.setdefault(trace["name"], []).append(points_of(trace))
     lines = {line.get_label(): np.array(line.get_data_3d()).T for line in reversed(plot.figure.axes[0].lines)}
     for label in ("pid", LABEL):
-        track = read_tracks(folder, results.entry(label, "hit"))[0]
+        track = read_tracks(folder / results.entry(label, "hit").flights)[0]
         np.testing.assert_allclose(traces[label][0][[0, -1]], track.position[[0, -1]], rtol=1e-3)
         np.testing.assert_array_equal(lines[label][[0, -1]], track.position[[0, -1]])
     np.testing.assert_allclose(traces["target"][0], [[1, 1, 16]])
@@ -255,7 +255,7 @@ values = st.floats(-10, 10, allow_nan=False)
 
 @given(
     cells=st.lists(st.tuples(values, values, values), min_size=2, max_size=5),
-    row=st.sampled_from(["success", "mean time to 1 m"]),
+    row=st.sampled_from([SUCCESS, time_row(1)]),
 )
 def test_the_best_is_better_than_all_others_for_certain(cells, row):
     made = [Cell(middle, (low, high)) for low, middle, high in map(sorted, cells)]
@@ -263,7 +263,7 @@ def test_the_best_is_better_than_all_others_for_certain(cells, row):
     for cell in marked:
         others = [other for other in marked if other is not cell]
         (low, high), ends = cell.ends, [other.ends for other in others]
-        apart = all(low > other[1] if row == "success" else high < other[0] for other in ends)
+        apart = all(low > other[1] if row == SUCCESS else high < other[0] for other in ends)
         assert cell.best == apart
 
 

@@ -90,14 +90,13 @@ def evaluate(
     asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
     earlier = [] if before is None else before.failures
     failures = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
-    records: dict[str, ControllerRecord] = {}
+    loaded: list[tuple[ControllerSpec, ControllerRecord]] = []
     for spec in controllers:
         try:
-            records[spec.label] = describe(spec, suite.scenarios[0].vehicle)
+            loaded.append((spec, describe(spec, suite.scenarios[0].vehicle)))
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
-    loaded = [spec for spec in controllers if spec.label in records]
-    jobs = [Job(spec, records[spec.label], each, backend, folder) for each in suite.scenarios for spec in loaded]
+    jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
     missing = _missing(place, jobs, overwrite)
     done = len(jobs) - len(missing)
     try:
@@ -108,7 +107,7 @@ def evaluate(
                 failures.append(outcome)
             progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
     finally:  # an interrupt, too, leaves what is done in order
-        results = _collect(place, before, suite, list(records.values()), failures)
+        results = _collect(place, before, suite, [record for _, record in loaded], failures)
         if results.entries or results.failures:
             write_results(place, results)
     return results
@@ -176,7 +175,7 @@ def run_job(job: Job) -> Entry | Failure:
         seed=scenario.seed,
         backend=job.backend,
         seconds=round(time.perf_counter() - start, 3),
-        metrics=summarise(flights),
+        figures=summarise(flights),
         hit_limit=limit,
         flights=flights_path(label, scenario.name),
     )

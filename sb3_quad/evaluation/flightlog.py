@@ -32,6 +32,7 @@ Trajectory i is that of episode i: all episodes of a scenario that is the same e
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -43,6 +44,7 @@ from sb3_quad.simulation.state import FORCE_BODY, FORCE_WORLD, TORQUE_BODY, TORQ
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
+OUTCOMES = {"success": "", "collision": "touches the ground", "out_of_range": "leaves the range"}  # in words
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
 
 
@@ -102,10 +104,39 @@ def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     }
 
 
-def read_flights(path: str | Path, prefix: str = "") -> Arrays:
-    """The arrays of a flight file, by the names of this module's table.
+read_flights = read_arrays  # by the names of this module's table; of episodes alone with the prefix ``episode_``
 
-    :param prefix: only those whose names begin with it, such as ``episode_``; the others are not even read.
+
+class Track(NamedTuple):
+    """One flight, k samples."""
+
+    times: FloatArray  # (k,), s
+    position: FloatArray  # (k, 3), world frame, m; target likewise
+    target: FloatArray
+    wrench: FloatArray  # (k, 6), mean since the sample before: force, world frame, N; torque, body frame, N m
+    lost: str  # how it was lost, empty if it was not
+
+    @property
+    def error(self) -> FloatArray:
+        """|r - r_T|, (k,), m."""
+        return np.asarray(np.linalg.norm(self.position - self.target, axis=1))
+
+    @property
+    def targets(self) -> FloatArray:
+        """The targets, one after the other, (n, 3), m."""
+        changed = np.flatnonzero((np.diff(self.target, axis=0) != 0).any(axis=1)) + 1
+        return np.asarray(self.target[[0, *changed]])
+
+
+def read_tracks(path: str | Path) -> list[Track]:
+    """The flights of a file whose trajectories were kept.
+
     :raises ConfigError: a missing or damaged file.
     """
-    return read_arrays(path, prefix)
+    arrays = read_arrays(path)
+    tracks = []
+    for number, samples in enumerate(arrays.get("samples", ())):
+        rows = {name: arrays[name][number, :samples].astype(np.float64) for name in ("position", "target", "wrench")}
+        lost = OUTCOMES.get(str(arrays["episode_outcome"][number]), "lost")
+        tracks.append(Track(times=arrays["time"][:samples], lost=lost, **rows))
+    return tracks

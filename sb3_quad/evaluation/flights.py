@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from gymnasium import spaces
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
@@ -24,7 +23,7 @@ from sb3_quad.experts.controller import Controller
 from sb3_quad.scenarios.sample import Plan
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, WRENCH_SIZE, QuadcopterState
+from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
@@ -34,39 +33,21 @@ OBSERVATIONS = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
 
 @dataclass(frozen=True, eq=False)
 class Flights:
-    """The metrics of n episodes, one per row.
+    """The metrics of n episodes, one per row."""
 
-    ================  ==========  ==================================================================================
-    name              shape       meaning
-    ================  ==========  ==================================================================================
-    success           (n,) bool   neither collision nor out of range
-    collision         (n,) bool   the ground was touched
-    reward            (n,)        sum of the rewards
-    length            (n,)        control steps
-    flown             (n,)        s until lost or the end
-    time_to           {m: (n,)}   s until |r - r_T| is first within the tolerance; NaN if it never was. Of a course
-                                  of waypoints: of the last one, once it is the target
-    path_length       (n,)        m, over the whole episode
-    final_error       (n,)        |r - r_T| at the end, m
-    final_offset      (n, 3)      r - r_T at the end, world frame, m; NaN where the flight was lost
-    waypoint_times    (n, W)      s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
-    start             (n, 13)     position, quaternion, velocity (world frame), body rates; SI
-    target            (n, 3)      the first target, m
-    ================  ==========  ==================================================================================
-    """
-
-    success: BoolArray
-    collision: BoolArray
-    reward: FloatArray
-    length: IntArray
-    flown: FloatArray
+    success: BoolArray  # (n,), neither collision nor out of range
+    collision: BoolArray  # (n,), the ground was touched
+    reward: FloatArray  # (n,), sum of the rewards
+    length: IntArray  # (n,), control steps
+    flown: FloatArray  # (n,), s until lost or the end
+    # By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a course, to the last waypoint.
     time_to: Mapping[float, FloatArray]
-    path_length: FloatArray
-    final_error: FloatArray
-    final_offset: FloatArray
-    waypoint_times: FloatArray
-    start: FloatArray
-    target: FloatArray
+    path_length: FloatArray  # (n,), m, over the whole episode
+    final_error: FloatArray  # (n,), |r - r_T| at the end, m
+    final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    waypoint_times: FloatArray  # (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
+    start: FloatArray  # (n, 13), position, quaternion, velocity (world frame), body rates; SI
+    target: FloatArray  # (n, 3), the first target, m
 
     @property
     def n(self) -> int:
@@ -103,36 +84,28 @@ def fly(
     vehicle: str | Vehicle = "itm",
     noise: float = 0.05,
     backend: str = "batch",
-    task_kwargs: Mapping[str, Any] | None = None,
     max_steps: int = MAX_EPISODE_STEPS,
-    tolerances: tuple[float, ...] = TOLERANCES,
-    observation_std: npt.ArrayLike | None = None,
-    observation_mean: npt.ArrayLike | None = None,
+    tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
+    **environment: Any,
 ) -> Flights:
     """Fly ``n_episodes`` episodes; number k is the first one of the environment seeded with ``seed + k``.
 
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
         ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
-    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise``, ``task_kwargs``,
-        ``observation_std`` and ``observation_mean``.
+    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise`` and
+        ``environment``: ``task_kwargs``, ``observation_std`` and ``observation_mean``.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
+    :param tolerances: of arrival, |r - r_T|, m.
     :param hooks: are called along the way.
-    :raises ConfigError: an unknown backend, fewer than one episode, or a controller that is none of the three.
+    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller that is none of the three.
     :raises ControllerError: a controller that fails in flight.
     """
-    settings = FlightSettings().with_changes(
-        task=task,
-        task_kwargs=task_kwargs,
-        vehicle=vehicle,
-        noise=noise,
-        observation_mean=observation_mean,
-        observation_std=observation_std,
-        max_episode_steps=max_steps,
-    )
     if n_episodes < 1:
         raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
+    environment |= {"task": task, "vehicle": vehicle, "noise": noise, "max_episode_steps": max_steps}
+    settings = FlightSettings().with_changes(**environment)
     return fly_settings(controller, settings, range(seed, seed + n_episodes), backend, tolerances, hooks)
 
 
@@ -162,16 +135,25 @@ def _fly_fleet(
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()
-    start = np.concatenate([state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES)]).T.copy()
-    first_target, position, error = state.target.copy(), state.position.copy(), state.distance
-    flying, success, collision = np.ones(n, dtype=np.bool_), np.ones(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_)
-    reward, path, length = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
-    final_error, final_offset = error.copy(), np.full((n, 3), np.nan)
-    limits = np.array(tolerances)[:, None]
-    on_last = np.full(n, count <= 1)
+    position, error = state.position.copy(), state.distance
+    wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
+    waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
-    waypoint, waypoint_times = np.zeros(n, dtype=np.int64), np.full((n, count), np.nan)
-    wrench = np.zeros((n, WRENCH_SIZE))
+    flights = Flights(
+        success=np.ones(n, dtype=np.bool_),
+        collision=np.zeros(n, dtype=np.bool_),
+        reward=np.zeros(n),
+        length=np.zeros(n, dtype=np.int64),
+        flown=np.zeros(n),
+        time_to=dict(zip(tolerances, times, strict=True)),
+        path_length=np.zeros(n),
+        final_error=error.copy(),
+        final_offset=np.full((n, 3), np.nan),
+        waypoint_times=np.full((n, count), np.nan),
+        start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
+        target=state.target.copy(),
+    )
+    flying = flights.success  # until it is lost
     for hook in hooks:
         hook.on_start(state, fleet.vehicle)
 
@@ -184,15 +166,13 @@ def _fly_fleet(
             hook.before_step(state, observation, wrench, flying)
         observation, step_reward, lost, collided, error = fleet.step(actions, flying)
         state = fleet.true_state()
-        reward[flying] += step_reward[flying]
-        path[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
+        flights.reward[flying] += step_reward[flying]
+        flights.path_length[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
         position = state.position.copy()
-        final_error[flying] = error[flying]
-        length[flying] = step
+        flights.final_error[flying] = error[flying]
+        flights.length[flying], flights.flown[flying] = step, step * control_step
         times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
-        ended = flying & lost
-        collision |= ended & collided
-        success &= ~ended
+        flights.collision[flying & lost & collided] = True
         flying &= ~lost
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
@@ -200,27 +180,14 @@ def _fly_fleet(
             break
         if count:
             reached = np.flatnonzero(flying & (waypoint < count) & (error <= plan.radius))
-            waypoint_times[reached, waypoint[reached]] = step * control_step
+            flights.waypoint_times[reached, waypoint[reached]] = step * control_step
             waypoint[reached] += 1
             on_last |= waypoint >= count - 1
             onward = reached[waypoint[reached] < count]
             if onward.size:
                 observation = fleet.set_targets(onward, plan.waypoints[waypoint[onward]])
-    final_offset[flying] = (state.position - state.target)[flying]
-    return Flights(
-        success=success,
-        collision=collision,
-        reward=reward,
-        length=length,
-        flown=np.asarray(length * control_step, dtype=np.float64),
-        time_to=dict(zip(tolerances, times, strict=True)),
-        path_length=path,
-        final_error=final_error,
-        final_offset=final_offset,
-        waypoint_times=waypoint_times,
-        start=start,
-        target=first_target,
-    )
+    flights.final_offset[flying] = (state.position - state.target)[flying]
+    return flights
 
 
 def _ask(controller: Controller, observation: Float32Array, flying: BoolArray, time: float) -> Float32Array:

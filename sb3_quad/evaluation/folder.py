@@ -13,10 +13,9 @@ import numpy as np
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_text, write_arrays, write_text
+from sb3_quad.base.files import read_arrays, read_text, write_arrays, write_text
 from sb3_quad.base.validate import Frozen, Model, validate
 from sb3_quad.evaluation.controllers import file_name
-from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.records import Entry, Results
 
 RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
@@ -69,7 +68,7 @@ def write_results(folder: Path, results: Results) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    flights = [(entry, read_flights(folder / entry.flights, "episode_")) for entry in results.entries]
+    flights = [(entry, read_arrays(folder / entry.flights, "episode_")) for entry in results.entries]
     tolerances = sorted({float(value) for _, arrays in flights for value in arrays["episode_tolerances"]})
     waypoints = max((arrays["episode_waypoints"].shape[1] for _, arrays in flights), default=0)
     columns = [
@@ -106,7 +105,7 @@ def _rows(entry: Entry, arrays: Arrays) -> Iterator[dict[str, Any]]:
 
 
 def _write(path: Path, record: Frozen) -> None:
-    write_text(path, record.model_dump_json(indent=2, by_alias=True) + "\n")
+    write_text(path, record.model_dump_json(indent=2) + "\n")
 
 
 def _read(path: Path, model: type[Model]) -> Model:

@@ -11,27 +11,23 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.scenarios.load import axis_name
 from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 
-SUCCESS, REWARD, PATH, MEDIAN, LARGEST = "success", "mean reward", "mean path", "final error, median", "final error, largest"
-FLOWN, REACHED, COMPLETED, COURSE_TIME = "time flown", "waypoints reached", "courses completed", "time of the course"
-HIT, HIT_SIZE = "half survive up to", "which is"
-UNITS = {SUCCESS: "%", FLOWN: "s", PATH: "m", MEDIAN: "m", LARGEST: "m", COMPLETED: "%", COURSE_TIME: "s", HIT: "×"}
+# The rows, without their cells:
+SUCCESS, REWARD, FLOWN = Row("success", "%"), Row("mean reward"), Row("time flown", "s")
+PATH, MEDIAN, LARGEST = Row("mean path", "m"), Row("final error, median", "m"), Row("final error, largest", "m")
+REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
+HIT, HIT_SIZE = Row("half survive up to", "×"), Row("which is")
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
 ALWAYS_COMPARABLE = {SUCCESS, REACHED, COMPLETED, HIT}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
 MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
 
-Cells = Mapping[str, Cell]  # by the names of the rows
+Cells = Mapping[Row, Cell]  # by the rows they stand in
 
 
-def time_row(tolerance: float | str) -> str:
-    """The name of the row with the time to a tolerance."""
-    return f"{TIME} {float(tolerance):g} m"
-
-
-def unit_of(row: str) -> str:
-    """The unit of a row, empty if it has none."""
-    return "s" if row.startswith(TIME) else UNITS.get(row, "")
+def time_row(tolerance: float | str) -> Row:
+    """The row with the time to a tolerance."""
+    return Row(f"{TIME} {float(tolerance):g} m", "s")
 
 
 def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
@@ -78,21 +74,21 @@ def metric_rows(
     others = [reference_cells(reference) for reference in references]
     none_lost = all(cells is None or cells[SUCCESS].value == 100.0 for cells in measured)
     rows = []
-    for name in _row_names(scenario, brief):
-        failed = Cell(words="failed") if name == SUCCESS else Cell()
-        own = [failed if cells is None else cells.get(name, Cell()) for cells in measured]
+    for row in _rows_of(scenario, brief):
+        failed = Cell(words="failed") if row == SUCCESS else Cell()
+        own = [failed if cells is None else cells.get(row, Cell()) for cells in measured]
         if all(cell == Cell() for cell in own):
             continue
-        if none_lost or name in ALWAYS_COMPARABLE:
-            own = mark_best(name, own)
-        rows.append(Row(name, unit_of(name), [*own, *(cells.get(name, Cell()) for cells in others)]))
+        if none_lost or row in ALWAYS_COMPARABLE:
+            own = mark_best(row, own)
+        rows.append(replace(row, cells=[*own, *(cells.get(row, Cell()) for cells in others)]))
     return rows
 
 
-def mark_best(row: str, cells: Sequence[Cell]) -> list[Cell]:
+def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     """The cells of a row, the best of them marked, if its interval is apart from all others'."""
     higher = row in HIGHER_IS_BETTER
-    if not (higher or row == COURSE_TIME or row.startswith(TIME)):
+    if not (higher or row == COURSE_TIME or row.name.startswith(TIME)):
         return list(cells)
     measured = [cell for cell in cells if cell.value is not None]
     marked = []
@@ -137,7 +133,7 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
     return groups
 
 
-def _row_names(scenario: Scenario, brief: bool) -> list[str]:
+def _rows_of(scenario: Scenario, brief: bool) -> list[Row]:
     """The rows that mean something in a scenario."""
     if scenario.target.waypoints is not None:
         return [SUCCESS, REACHED, COMPLETED, COURSE_TIME]
@@ -149,10 +145,10 @@ def _row_names(scenario: Scenario, brief: bool) -> list[str]:
         kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        names = [SUCCESS, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
+        rows = [SUCCESS, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
     else:
-        names = [SUCCESS, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
-    return names + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
+        rows = [SUCCESS, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
+    return rows + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
 
 
 def _beats(cell: Cell, other: Cell, higher: bool) -> bool:

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from sb3_quad.base.validate import Frozen
+from sb3_quad.scenarios.parts import Vector
 from sb3_quad.scenarios.scenario import Scenario
 
 SCHEMA_VERSION: Literal[1] = 1
-Vector = tuple[float, float, float]
 Scaling = Literal["none", "adaptive"]
 
 
@@ -102,8 +102,6 @@ class ControllerRecord(Frozen):
 class Entry(Frozen):
     """One controller in one scenario."""
 
-    model_config = ConfigDict(populate_by_name=True)
-
     controller: str = Field(description="label")
     scenario: str = Field(description="name")
     key: str = Field(description="hash of all that the flights depend on: equal keys, equal flights")
@@ -111,14 +109,14 @@ class Entry(Frozen):
     seed: int = Field(description="of episode 0; episode k has seed + k")
     backend: str
     seconds: float = Field(description="wall-clock time it took")
-    metrics: Metrics = Field(validation_alias="figures", serialization_alias="figures")  # the key in files
+    figures: Metrics = Field(description="its metrics, by their name in files")
     hit_limit: HitLimit | None = None
     flights: str = Field(description="path of the .npz, relative to the folder")
 
     @property
-    def figures(self) -> Metrics:
-        """The metrics, by the name that files give them."""
-        return self.metrics
+    def metrics(self) -> Metrics:
+        """The metrics, which files call figures."""
+        return self.figures
 
 
 class Failure(Frozen):

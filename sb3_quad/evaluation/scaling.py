@@ -14,13 +14,12 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.controller import observation_function
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS
 
 N_FLIGHTS = 120  # to random targets, of which the final offset is the mean
-STEPS = 1500  # control steps until the offset is read: 15 s, as an episode
 ROUNDS = 3  # the offset is measured anew after each correction
 _POSITION = GROUPS["position"]
 
@@ -63,8 +62,8 @@ def hover_offset(
     :param settings: how it flies; task and episode length are those of this measurement.
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
     """
-    episodes = {"task": "target_tracking", "task_kwargs": None, "max_episode_steps": STEPS}
-    flights = fly_settings(controller, (settings or FlightSettings()).with_changes(**episodes), range(seed, seed + n_flights))
+    own = {} if settings is None else settings.in_any_task()
+    flights = fly(controller, "target_tracking", n_flights, seed, **own)
     lost = 1.0 - float(flights.success.mean())
     if lost > 0.5:
         raise ConfigError(

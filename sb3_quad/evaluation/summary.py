@@ -7,6 +7,7 @@ import math
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.records import Arrival, Course, Estimate, Metrics
 
@@ -21,15 +22,15 @@ def summarise(flights: Flights) -> Metrics:
     some, reached = bool(done.any()), np.isfinite(flights.waypoint_times)
     course = None
     if reached.shape[1]:
-        times = mean(flights.waypoint_times[:, -1])
-        course = Course(reached=_present(mean(reached.sum(axis=1))), completed=share(reached.all(axis=1)), time=times)
+        count, time = _bootstrap(reached.sum(axis=1, dtype=np.float64)), mean(flights.waypoint_times[:, -1])
+        course = Course(reached=count, completed=share(reached.all(axis=1)), time=time)
     return Metrics(
         n=flights.n,
         success=share(done),
         collisions=int(flights.collision.sum()),
         out_of_range=int((~done & ~flights.collision).sum()),
-        reward=_present(mean(flights.reward)),
-        flown=_present(mean(flights.flown)),
+        reward=_bootstrap(flights.reward),
+        flown=_bootstrap(flights.flown),
         arrivals=[
             Arrival(tolerance=tolerance, share=share(np.isfinite(times)), time=mean(times))
             for tolerance, times in sorted(flights.time_to.items())
@@ -62,17 +63,12 @@ def mean(values: npt.ArrayLike) -> Estimate | None:
     The same values give the same interval: the resamples are those of a fixed seed.
     """
     array = np.asarray(values, dtype=np.float64)
-    array = array[np.isfinite(array)]
-    n = array.size
-    if n == 0:
-        return None
-    middle = float(array.mean())
+    finite = array[np.isfinite(array)]
+    return _bootstrap(finite) if finite.size else None
+
+
+def _bootstrap(array: FloatArray) -> Estimate:
+    n, middle = array.size, float(array.mean())
     rows = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
     low, high = np.percentile(array[rows].mean(axis=1), [2.5, 97.5])
     return Estimate(value=middle, low=min(middle, float(low)), high=max(middle, float(high)), n=n)
-
-
-def _present(estimate: Estimate | None) -> Estimate:
-    if estimate is None:
-        raise ValueError("no flight has a finite value")
-    return estimate

@@ -7,7 +7,7 @@ from typing import Any
 
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, metric_cells, time_row, unit_of
+from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, metric_cells, time_row
 from sb3_quad.evaluation.records import Metrics
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
@@ -57,8 +57,8 @@ def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Metrics]
     parts = [fly(policy, "state_recovery", n_episodes, first + k * n_episodes, **settings) for k in range(N_RECOVERIES)]
     rows = {RECOVERY: summarise(Flights.concatenate(parts))}
     for distance in DISTANCES:
-        task: dict[str, Any] = {"task_kwargs": {"target_distance": distance}}
-        flown = fly(policy, "target_tracking", n_episodes, first + int(1000 * distance), **task, **settings)
+        task = {"target_distance": distance}
+        flown = fly(policy, "target_tracking", n_episodes, first + int(1000 * distance), task_kwargs=task, **settings)
         rows[f"targets {distance:.0f} m away"] = summarise(flown)
     return rows
 
@@ -78,7 +78,7 @@ def write_card(
         if task == RECOVERY:  # begins at its target
             cells[NEAR] = Cell(words="–")
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))
-    columns = [Column(f"{row}, {unit_of(row)}".removesuffix(", ")) for row in SHOWN]
+    columns = [Column(row.heading) for row in SHOWN]
     return CARD.format(
         name=name,
         vehicle=settings["vehicle"],

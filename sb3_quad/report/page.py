@@ -69,10 +69,7 @@ def render(results: Results, parts: Sequence[Section], with_pictures: bool) -> s
 
 
 def render_markdown(results: Results, parts: Sequence[Section]) -> str:
-    """The tables as text, for the pages of a repository: a heading, what it is about, and a table for each section.
-
-    An interval (95 %) stands in brackets; the best of a row is bold where its interval is apart from all others.
-    """
+    """The tables as text, for the pages of a repository: a heading, what it is about, and a table for each section."""
     blocks = [f"# Suite {results.suite}"]
     for part in parts:
         texts = (" ".join(text.split()) for text in (part.description, part.facts) if text)

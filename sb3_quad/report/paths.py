@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.report.plots import FORCE, GRID, Plot, legend, styled
-from sb3_quad.report.tracks import Flown, Track
+from sb3_quad.evaluation.flightlog import Track
+from sb3_quad.report.plots import FORCE, GRID, Flown, Plot, legend, styled
 from sb3_quad.scenarios.scenario import Scenario
 
 TARGET, START = "#1a9a45", "#8a8f98"

@@ -8,7 +8,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -16,9 +16,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.evaluation.records import Estimate, Metrics, Results
-from sb3_quad.report.tracks import Flown, Track
-from sb3_quad.scenarios.load import axis_label, axis_name
+from sb3_quad.evaluation.flightlog import Track
+from sb3_quad.evaluation.records import Entry, Estimate, Metrics, Results
+from sb3_quad.scenarios.load import UNITS, axis_label, axis_name
 from sb3_quad.scenarios.scenario import Scenario
 
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
@@ -47,6 +47,15 @@ STYLE: Any = {
 styled = matplotlib.rc_context(STYLE)
 Cells = list[tuple[Scenario, Metrics]]  # those of a varied scenario that one controller has flown
 METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # left out: the same results give the same file
+
+
+class Flown(NamedTuple):
+    """One controller in one scenario: its colour, its metrics, its sampled flights."""
+
+    label: str
+    colour: str
+    entry: Entry
+    tracks: Sequence[Track]
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +240,8 @@ def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mappin
 
 def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, str]) -> list[Plot]:
     (key,) = first.cell
-    (success, shares), (error, distances) = (_axes(HALF, _label(key), name) for name in ("success (%)", "final distance (m)"))
+    success, shares = _axes(HALF, axis_label(key), "success (%)")
+    error, distances = _axes(HALF, axis_label(key), "final distance (m)")
     for label, cells in flown.items():
         x = np.array([scenario.cell[key] for scenario, _ in cells])
         band(shares, colours[label], label, x, _ends([metrics.success for _, metrics in cells], 100.0), **POINTS)
@@ -266,21 +276,15 @@ def _heat_map(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours
             axes.set_xticks(np.arange(len(x_values)) + 0.5, [f"{value:g}" for value in x_values])
             axes.set_yticks(np.arange(len(y_values)) + 0.5, [f"{value:g}" for value in y_values])
             axes.grid(visible=False)
-            axes.set(xlabel=_label(keys[0]), ylabel=_label(keys[1]))
+            axes.set(xlabel=axis_label(keys[0]), ylabel=axis_label(keys[1]))
             axes.label_outer()
     figure.colorbar(image, ax=panels.ravel().tolist(), label="success (%)", shrink=0.9)
     names = ", ".join(axis_name(key).replace("_", " ") for key in keys)
     return Plot(f"{scenarios[0].group}_success", f"Success in % over {names}.", figure)
 
 
-def _label(key: str) -> str:
-    return axis_label(key).replace("_", " ")
-
-
 def _rest(scenario: Scenario) -> str:
     """The values of all but the first two keys of a cell, with their units."""
-    parts = []
-    for key in list(scenario.cell)[2:]:
-        name, _, unit = _label(key).partition(" (")
-        parts.append(f"{name} {scenario.cell[key]:g} {unit.removesuffix(')')}".strip())
-    return ", ".join(parts)
+    names = {key: axis_name(key) for key in list(scenario.cell)[2:]}
+    parts = (f"{name} {scenario.cell[key]:g} {UNITS.get(name, '')}" for key, name in names.items())
+    return ", ".join(part.replace("_", " ").strip() for part in parts)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from sb3_quad.drawing.labels import colours_of
+from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, measured_cells, metric_rows, reference_cells, scenario_groups
 from sb3_quad.evaluation.records import Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
-from sb3_quad.report.plots import Plot, arrivals_plot, errors_plot, group_plots, hits_plot
-from sb3_quad.report.tracks import Flown, read_tracks
+from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, group_plots, hits_plot
 from sb3_quad.scenarios.load import axis_label
 from sb3_quad.scenarios.scenario import Scenario
 
@@ -42,13 +42,16 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:
-            tables, plots = [_metric_table(results, first, colours)], _scenario_plots(results, first, colours, folder)
+            measured = [measured_cells(results, label, first) for label in colours]
+            rows = metric_rows(first, measured, first.reference.values(), brief=True)
+            tables = [Table(_columns(colours, first.reference, results.source), rows)]
+            plots = _scenario_plots(results, first, colours, folder)
         else:
             each_of = f" in each of {len(scenarios)} cells"
             tables, plots = [], group_plots(results, scenarios, colours)
             if len(first.cell) == 1:
                 cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
-                corner = f"{axis_label(next(iter(first.cell))).replace('_', ' ')}: success (%)"
+                corner = f"{axis_label(next(iter(first.cell)))}: success (%)"
                 tables.append(_success_table(results, cells, colours, corner))
         facts = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
@@ -60,7 +63,11 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
 
 def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
     entries = {label: results.entry(label, scenario.name) for label in colours}
-    flown = [Flown(label, colours[label], entry, read_tracks(folder, entry)) for label, entry in entries.items() if entry]
+    flown = [
+        Flown(label, colours[label], entry, read_tracks(Path(folder) / entry.flights))
+        for label, entry in entries.items()
+        if entry is not None
+    ]
     plots = []
     if flown and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
         plots.append(arrivals_plot(scenario, flown, results.source))
@@ -70,12 +77,6 @@ def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, 
     if any(each.entry.hit_limit is not None for each in flown):
         plots.append(hits_plot(scenario, flown))
     return plots
-
-
-def _metric_table(results: Results, scenario: Scenario, colours: Mapping[str, str]) -> Table:
-    measured = [measured_cells(results, label, scenario) for label in colours]
-    rows = metric_rows(scenario, measured, scenario.reference.values(), brief=True)
-    return Table(_columns(colours, scenario.reference, results.source), rows)
 
 
 def _success_table(

@@ -20,7 +20,7 @@ from sb3_quad.vehicles.vehicle import VEHICLES
 
 SUITES = YamlFolder("suite", "sb3_quad.scenarios.suites")
 MAX_CELLS = 1000
-_UNITS = dict(
+UNITS = dict(
     {"tilt": "deg", "velocity": "m/s", "body_rates": "rad/s", "force": "N", "torque": "N m", "distance": "m", "start": "s"},
     **dict.fromkeys(("mass", "inertia", "motor_gain"), "× the vehicle's own"),
     delay="control steps",
@@ -116,4 +116,5 @@ def axis_name(key: str) -> str:
 def axis_label(key: str) -> str:
     """The name of a varied key with its unit, as the axes of plots carry it."""
     name = axis_name(key)
-    return f"{name} ({_UNITS[name]})" if name in _UNITS else name
+    words = name.replace("_", " ")
+    return f"{words} ({UNITS[name]})" if name in UNITS else words

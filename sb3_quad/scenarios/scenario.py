@@ -203,18 +203,18 @@ class Suite(Frozen):
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
-        changes = {key: value for key, value in (("episodes", episodes), ("seed", seed)) if value is not None}
-        flown_by: dict[str, Any] = {}
+        changes: dict[str, Any] = {"episodes": episodes, "seed": seed}
+        changes = {key: value for key, value in changes.items() if value is not None}
         if vehicle is not None:
-            flown_by = {"vehicle": str(Path(vehicle).absolute()) if VEHICLES.is_path(vehicle) else vehicle, "reference": {}}
+            changes |= {"vehicle": str(Path(vehicle).absolute()) if VEHICLES.is_path(vehicle) else vehicle, "reference": {}}
         changed = []
         for scenario in self.scenarios:
             if names and scenario.name not in names and scenario.group not in names:
                 continue
-            data = {**scenario.model_dump(), **changes, **flown_by}
+            data = {**scenario.model_dump(), **changes}
             if scenario.hit_search is not None and episodes is not None:
                 data["hit_search"]["episodes"] = min(scenario.hit_search.episodes, episodes)
-            where = f"scenario {scenario.name}" + (f", flown by {vehicle}" if flown_by else "")
+            where = f"scenario {scenario.name}" + ("" if vehicle is None else f", flown by {vehicle}")
             changed.append(validate(Scenario, data, where))
         return self.model_copy(update={"scenarios": tuple(changed)})
 

@@ -28,8 +28,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.envs.registration import MAX_EPISODE_STEPS
-from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
+from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
@@ -87,8 +86,8 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
             if scale == 1.0:
                 raise
             break  # already too lively to hover
-        tracking = _fly(model, own, "target_tracking", range(seed, seed + N_TARGETS))
-        recovery = float(_fly(model, own, "state_recovery", range(seed, seed + N_RECOVERIES)).success.mean())
+        tracking = fly(model, "target_tracking", N_TARGETS, seed, **own.in_any_task())
+        recovery = float(fly(model, "state_recovery", N_RECOVERIES, seed, **own.in_any_task()).success.mean())
         reward = float(tracking.reward.mean())
         if scale == 1.0:
             needed = recovery - min(TOLERATED, 1.0 - recovery)
@@ -130,7 +129,7 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings
     at_target = _latents(model, _at_target(own, np.random.default_rng(seed)))
     at_target = at_target.reshape(N_HEADINGS, N_SAMPLES, -1).mean(dim=1)
     seen = _Observations()
-    _fly(model, own, TASKS, range(seed, seed + N_FLIGHTS), STEPS, seen)
+    fly(model, TASKS, N_FLIGHTS, seed, max_steps=STEPS, hooks=[seen], **own.in_any_task())
     flown = _latents(model, np.concatenate(seen.kept))
     hover = load_vehicle(own.vehicle).hover_action
     with th.no_grad():
@@ -150,13 +149,6 @@ def _first_layer(model: OnPolicyAlgorithm) -> th.nn.Linear:
     if not isinstance(layer, th.nn.Linear) or layer.in_features != OBSERVATION_SIZE:
         raise ConfigError("trimming needs an MlpPolicy whose first layer reads the 18 features")
     return layer
-
-
-def _fly(
-    model: OnPolicyAlgorithm, settings: FlightSettings, task: Any, seeds: range, steps: int = MAX_EPISODE_STEPS, *hooks: Hook
-) -> Flights:
-    changes = {"task": task, "task_kwargs": None, "max_episode_steps": steps}
-    return fly_settings(model, settings.with_changes(**changes), seeds, hooks=hooks)
 
 
 class _Observations(Hook):
