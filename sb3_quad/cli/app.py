@@ -12,18 +12,18 @@ from sb3_quad.cli import arguments
 from sb3_quad.cli.parser import Parser
 
 EPILOG = """examples:
-  sb3-quad train                                                          both stages, imitation then PPO with cloning
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          one training
-  sb3-quad tune --algo dagger -n 250000 --n-trials 30                     its hyperparameters
-  sb3-quad evaluate pid agent.zip --suite quick                           an agent beside an expert, in tables
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flight in a window
+  sb3-quad train                                                          both stages: imitation, then PPO with cloning
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          a single training
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30                     a search for its hyperparameters
+  sb3-quad evaluate pid agent.zip --suite quick                           an agent and an expert in one table
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flights in a window
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0 -f logs  or as a film
   sb3-quad train --help                                                   all options of a command, with examples
 
 exit codes:
   0    done
-  1    evaluated, but not every controller: a line on stderr for each that failed; or a vehicle that cannot hover
-  2    bad input, or a training that cannot go on: one line on stderr says what
+  1    some controllers of an evaluation failed (one line each on stderr), or a vehicle cannot hover
+  2    bad input, or a training that cannot continue: one line on stderr says what
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import random
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
@@ -47,20 +48,38 @@ def whole(text: str) -> int:
     return int(number)
 
 
+def natural(text: str, least: int = 0) -> int:
+    """A whole number of at least 0."""
+    if whole(text) < least:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least {least}")
+    return whole(text)
+
+
+def positive(text: str) -> int:
+    """A whole number of at least 1."""
+    return natural(text, least=1)
+
+
+def seed(text: str) -> int:
+    """A whole number; a negative one asks for a random one."""
+    number = whole(text)
+    return number if number >= 0 else random.SystemRandom().randrange(2**31)
+
+
+class Pairs(argparse.Action):
+    """Keeps ``k:v`` entries as a mapping."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """:raises ConfigError: an entry without a colon."""
+        found = {}
+        for entry in values:
+            key, colon, value = entry.partition(":")
+            if not colon or not key:
+                raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
+            found[key.strip()] = parse_value(value)
+        setattr(namespace, self.dest, found)
+
+
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of some options that are given."""
-    return {name: value for name in names if (value := getattr(options, name)) is not None}
-
-
-def pairs(entries: Sequence[str] | None, option: str) -> dict[str, Any]:
-    """``k:v`` entries as a mapping.
-
-    :raises ConfigError: an entry without a colon.
-    """
-    found: dict[str, Any] = {}
-    for entry in entries or []:
-        key, colon, value = entry.partition(":")
-        if not colon or not key:
-            raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
-        found[key.strip()] = parse_value(value)
-    return found
+    """Those of some options that a command has and that are given."""
+    return {name: value for name in names if (value := getattr(options, name, None)) is not None}

@@ -109,14 +109,11 @@ def fly_all(
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
     :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
     :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
-    :raises ConfigError: a number of steps or of episodes below one, settings that the environment refuses.
+    :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
     longest = setting.episode(seed)[0].max_episode_steps
     left = longest if n_timesteps is None else n_timesteps
-    for flag, number in (("--n-timesteps", left), ("--n-envs", n_envs)):
-        if number < 1:
-            raise ConfigError(f"{flag} {number}: must be at least 1")
     while left > 0:
         together: list[Recording] = []
         for name, controller in controllers.items():

@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import sys
 
-from sb3_quad.base.errors import CannotHover, ConfigError
+from sb3_quad.base.errors import CannotHover
+from sb3_quad.base.files import one_line
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli.compare import task_table
 from sb3_quad.cli.output import console
@@ -20,12 +21,10 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 def run(options: argparse.Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
-    if options.episodes < 0 or not 0 <= options.seed < 2**31:
-        raise ConfigError(f"--episodes {options.episodes}, --seed {options.seed}: must be at least 0")
     try:
         vehicle = load_vehicle(options.vehicle)
     except CannotHover as error:
-        print(f"cannot hover: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"cannot hover: {one_line(error)}", file=sys.stderr)
         return 1
     able = authority(vehicle)
     console().print(parameter_table(vehicle, able))
@@ -42,6 +41,6 @@ def _fly(source: str, vehicle: Vehicle, episodes: int, seed: int) -> None:
     controllers = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}
     for task in ENVIRONMENTS.values():
         settings = FlightSettings(task=task, vehicle=vehicle, noise=0.0)
-        console().print(task_table(controllers, settings, episodes, seed, "the same for both, true state"))
+        console().print(task_table(controllers, settings, episodes, seed))
     if vehicle.geometric_gains is None:
         print(f"gains found for it, mostly better ones: sb3-quad tune-expert --vehicle {source}")

@@ -16,7 +16,7 @@ from rich.progress import track
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.arguments.enjoy import DEFAULT_ENV
-from sb3_quad.cli.parser import pairs
+from sb3_quad.cli.parser import given
 from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.controllers import build, parse_controllers
@@ -80,9 +80,9 @@ def _check(options: argparse.Namespace, window: bool) -> None:
     """What can be refused before anything is flown."""
     if not (options.controllers or options.algo or options.trained_agent):
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
-    if sum(given is not None for given in (options.env, options.task, options.scenario)) > 1:
+    if len(given(options, "env", "task", "scenario")) > 1:
         raise ConfigError("--env, --task and --scenario each say what is flown; give one")
-    if (options.at is not None or options.lasting is not None) and options.force is None and options.torque is None:
+    if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
     if options.speed <= 0:
         raise ConfigError(f"--speed {options.speed:g}: must be above 0")
@@ -104,18 +104,16 @@ def _check(options: argparse.Namespace, window: bool) -> None:
 def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
     """What is flown, and who flies, by label."""
     env_id = known_environment(options)
-    given = pairs(options.env_kwargs, "--env-kwargs")
     agent = chosen_agent(options) if options.algo or options.trained_agent else None
-    push = {"force": options.force, "torque": options.torque, "start": options.at, "duration": options.lasting}
-    push = {name: value for name, value in push.items() if value is not None}
+    push = given(options, "force", "torque", "start", "duration")
     if options.scenario is not None:
-        if given or options.target or push:
+        if options.env_kwargs or options.target or push:
             raise ConfigError("--scenario says all about a flight; leave --env-kwargs, --target, --force and --torque away")
         setting = scenario_setting(options.scenario)
     else:
         named = {"task": options.task} if options.task else {}
         kept = agent[2].given() if agent else {}
-        settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **given})
+        settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **options.env_kwargs})
         setting = fixed_setting(settings, options.target, push)
     controllers: dict[str, Any] = {}
     if agent:

@@ -8,13 +8,13 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
-from sb3_quad.cli.commands.train import make_config, make_seed, prepare
+from sb3_quad.cli.commands.train import make_config, prepare
 from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console, print_line, progress_bar
-from sb3_quad.cli.parser import given, pairs
+from sb3_quad.cli.parser import given
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.config import build_config
@@ -35,8 +35,6 @@ SHOWN = 5  # trials in the table
 
 def run(options: argparse.Namespace) -> int:
     """Search, report, write. Returns the exit code."""
-    if options.n_trials < 0 or (options.max_total_trials is not None and options.max_total_trials < 1):
-        raise ConfigError("--n-trials must be at least 0, --max-total-trials at least 1")
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
@@ -62,13 +60,12 @@ def _make_search(options: argparse.Namespace) -> Search:
     """The search that a command line describes; the folder of its results is new."""
     config = make_config(options)
     if options.eval_env_kwargs is not None:  # into the settings, so that the best ones have it too
-        evaluation = {**config.eval_env_kwargs, **pairs(options.eval_env_kwargs, "--eval-env-kwargs")}
+        evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
         config = build_config(config.algo, config.env_id, {**config.settings, "eval_env_kwargs": evaluation})
     space = load_space(config.algo, config.settings, options.search_space)
     episodes = EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes
-    arguments = given(options, "device", "trained_agent", "n_eval_envs")
-    arguments |= {"config": config, "seed": make_seed(options), "eval_episodes": episodes}
-    job = validate(TrainingJob, arguments, "command line")
+    arguments = given(options, "device", "trained_agent", "n_eval_envs", "seed")
+    job = validate(TrainingJob, {**arguments, "config": config, "eval_episodes": episodes}, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     name = options.study_name or f"{config.algo}_{config.env_id}"
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
