@@ -1,4 +1,4 @@
-"""Controllers on the same episodes of a task, in a table."""
+"""Controllers on the same fresh episodes of a task, in a table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.cli.output import console
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.summary import summarise
@@ -37,6 +38,17 @@ def task_table(
     rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
     title = f"{settings.task}: {n} fresh episodes, the same for all" + ("" if settings.noise else ", true state")
     return Table(columns, rows, title=title, caption=CAPTION)
+
+
+def print_tables(
+    controllers: Mapping[str, Any], how: Mapping[str, Any], n: int, seed: int, beside: Iterable[str] = ()
+) -> None:
+    """Print a table as of :func:`task_table` for each task.
+
+    :param how: the controllers fly in any task: vehicle, noise and scaling.
+    """
+    for task in SCENARIOS:
+        console().print(task_table(controllers, FlightSettings(task=task, **how), n, seed, beside))
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:

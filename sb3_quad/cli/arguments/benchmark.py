@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sb3_quad.cli.parser import positive
+from sb3_quad.cli.parser import Parser, positive
 
 HELP = "Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop."
 EXAMPLES = """examples:
@@ -15,7 +15,7 @@ EXAMPLES = """examples:
 SIZES = (64, 240, 1024, 4096, 16384)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The benchmark's flags."""
     add = parser.add_argument
     add("--sizes", nargs="+", type=positive, default=list(SIZES), metavar="N", help="rows of the batch")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
-from sb3_quad.cli.parser import natural
+from sb3_quad.cli.parser import Parser, natural
 
 HELP = "Check whether a vehicle can hover, how much authority it has, and how well the experts fly it."
 EXAMPLES = """examples:
@@ -16,7 +14,7 @@ Exit code 1: the rotors cannot produce hover thrust. The contents of a vehicle f
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``check-vehicle``."""
     add = parser.add_argument
     add("vehicle", metavar="VEHICLE", help="name or YAML file")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
-from sb3_quad.cli.parser import Pairs, positive, whole
+from sb3_quad.cli.parser import Pairs, Parser, positive, whole
 
 DEFAULT_ENV = "QuadTargetTracking-v0"
 HELP = "Watch controllers fly: in PyBullet's window, as a film, or as poses in one picture; several side by side."
@@ -21,7 +19,7 @@ Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
     add = parser.add_argument
     add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
@@ -41,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--times", nargs="+", type=float, metavar="S", help="times of the sequence's poses, s (wherever they do not overlap)")
 
 
-def add_flight_arguments(parser: argparse.ArgumentParser) -> None:
+def add_flight_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``enjoy.py`` for an agent and its episodes, with their meanings, and those of a film."""
     add = parser.add_argument
     add("--algo", help="algorithm of a trained agent, looked up in the log folder")

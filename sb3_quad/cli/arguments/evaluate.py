@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sb3_quad.cli.parser import whole
+from sb3_quad.cli.parser import Parser, whole
 
 HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
 EXAMPLES = """controllers:
@@ -28,7 +28,7 @@ Results are kept in a folder: the same command again flies only what is missing,
 DEFAULT_FOLDER = "evaluations"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``evaluate``."""
     add = parser.add_argument
     add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
+from sb3_quad.cli.parser import Parser
 from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
@@ -21,7 +20,7 @@ ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header need
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``export``."""
     add = parser.add_argument
     add(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
+from sb3_quad.cli.parser import Parser
 
 HELP = "Draw learning curves: success and reward over timesteps and wall-clock time, with mean and range over seeds."
 EXAMPLES = """examples:
@@ -11,7 +11,7 @@ EXAMPLES = """examples:
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``plot``."""
     add = parser.add_argument
     add("groups", nargs="+", metavar="NAME=PATTERN", help="an agent's name and its run folders; quote a *")

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import argparse
-
-from sb3_quad.cli.parser import positive
+from sb3_quad.cli.parser import Parser, positive
 
 HELP = "Write a trained policy as a small zip for stock PPO, with a card: measured metrics, command, seed, versions."
 EXAMPLES = """The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 can read it too.
@@ -18,7 +16,7 @@ The zip must lie in its run folder, which records how it was trained.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``publish``."""
     add = parser.add_argument
     add("model", metavar="MODEL.zip", help="an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy")

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-
 from sb3_quad.cli.arguments.enjoy import add_flight_arguments
-from sb3_quad.cli.parser import positive
+from sb3_quad.cli.parser import Parser, positive
 from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Record a film of a trained agent, as enjoy --record does, with the flags and folders of rl-zoo's record_video."
@@ -20,7 +18,7 @@ Films need: pip install 'sb3_quad[video]'. Several controllers, scenarios and pu
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``record_video.py``, with their meanings."""
     add = parser.add_argument
     add_flight_arguments(parser)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 
+from sb3_quad.cli.parser import Parser
+
 HELP = "Make report.html from a results folder of evaluate: tables, plots, flights in 3-D; one file that needs no network."
 EXAMPLES = """examples:
   sb3-quad report evaluations/thesis
@@ -14,7 +16,7 @@ Needs: pip install 'sb3_quad[report]'.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``report``."""
     add = parser.add_argument
     add("folder", metavar="FOLDER", help="results folder of evaluate")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sb3_quad.cli.parser import Pairs, positive, seed, whole
+from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
 HELP = "Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning."
@@ -26,7 +26,7 @@ DEFAULT_PIPELINE = "geometric/two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
+def add_settings(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py`` for what is trained, with their meanings."""
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc or ppo ({DEFAULT_ALGO})")
@@ -48,7 +48,7 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
     add = parser.add_argument

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
-
 from sb3_quad.cli.arguments.train import add_settings
-from sb3_quad.cli.parser import natural, positive, seed, whole
+from sb3_quad.cli.parser import Parser, natural, positive, seed, whole
 
 HELP = "Search for hyperparameters: train with one choice after another, and write the best as a settings file."
 EXAMPLES = """examples:
@@ -21,7 +19,7 @@ The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. N
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings."""
     add_settings(parser)
     add = parser.add_argument

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from sb3_quad.cli.parser import natural, positive
+from sb3_quad.cli.parser import Parser, natural, positive
 
 HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the resulting metrics."
 EXAMPLES = """examples:
@@ -17,7 +17,7 @@ Ctrl-C writes the best gains so far; the same command continues. Needs pip insta
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of ``tune-expert``."""
     add = parser.add_argument
     add("--vehicle", default="itm", metavar="V", help="name or YAML file (itm); the search starts from its gains, if any")

@@ -23,11 +23,12 @@ from sb3_quad.evaluation.controllers import build, parse_controllers
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.episodes import Setting, find_agent, fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.episodes import Setting, fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
 from sb3_quad.show.recording import Recording
 from sb3_quad.show.sequence import sequence
 from sb3_quad.simulation.checks import check_size
+from sb3_quad.training.runs import find_run
 
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
 
@@ -66,14 +67,28 @@ def chosen_agent(options: argparse.Namespace) -> tuple[str, Path, FlightSettings
     """The agent of record-video's ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
     :return: a label, its zip, and the settings that it was judged with.
-    :raises ConfigError: there is no such run or agent.
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
     """
     if options.trained_agent is not None:
         path = Path(options.trained_agent)
         return path.stem, path, FlightSettings()
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # says so if there is none of that name
-    return find_agent(options.folder, options.algo, known_environment(options), options.exp_id, options.which)
+    run = find_run(options.folder, options.algo, known_environment(options), options.exp_id)
+    if isinstance(options.which, int):
+        path = run.checkpoint(options.which)
+    elif options.which == "last checkpoint":
+        path = run.latest_checkpoint()
+    else:
+        path = run.best_model if options.which == "best" else run.result
+    if not path.is_file():
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
+    settings, _ = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
+    return f"{options.algo} {path.name}", path, FlightSettings.beside(path)[0]
 
 
 def _check(options: argparse.Namespace, window: bool) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import importlib
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,12 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
-from sb3_quad.cli.compare import agent_and_expert, task_table
+from sb3_quad.cli.compare import agent_and_expert, print_tables
 from sb3_quad.cli.output import console, print_line, shows_progress
 from sb3_quad.cli.parser import given
-from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.experts.models import load_model
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.config import TrainingConfig, load_config
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import (
     PipelineResult,
@@ -133,7 +130,8 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
             return trained.exit_code
         times[REFERENCE] = trained.seconds
         controllers[REFERENCE] = load_model(trained.run.result)
-    print_tables(controllers, result.job)
+    how = result.job.flight_settings.in_any_task()
+    print_tables(controllers, how, FRESH_EPISODES, seed_for("table", result.job.seed), THESIS_COLUMNS)
     print_line(
         "; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; both stages together: {seconds:.0f} s"
     )
@@ -141,10 +139,3 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
         print_line(f"{name}: {entry.agent}")
     print_line(f"saved in {result.folder}")
     return 0
-
-
-def print_tables(controllers: Mapping[str, Any], job: TrainingJob) -> None:
-    """Both tasks, all controllers on the same fresh episodes; beside ITM's the thesis's metrics."""
-    for task in ENVIRONMENTS.values():
-        settings = FlightSettings(task=task, **job.flight_settings.in_any_task())
-        console().print(task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), THESIS_COLUMNS))
