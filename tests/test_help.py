@@ -26,7 +26,7 @@ def examples(text: str) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
 def test_examples_are_taken(name):
-    found = examples(COMMANDS[name].EXAMPLES if name else EPILOG)
+    found = examples(COMMANDS[name].__doc__ if name else EPILOG)
     assert found
     assert any(arguments[0] == name for arguments in found) or not name
     for arguments in found:

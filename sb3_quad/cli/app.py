@@ -31,7 +31,7 @@ COMMANDS = {
     module.name.replace("_", "-"): importlib.import_module(f"{arguments.__name__}.{module.name}")
     for module in pkgutil.iter_modules(arguments.__path__)
 }
-"""The flags of each command, by its name."""
+"""The module of each command's flags, by the command's name."""
 
 
 def make_parser() -> Parser:
@@ -39,7 +39,8 @@ def make_parser() -> Parser:
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
     subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
     for name, command in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=command.HELP, description=command.HELP, epilog=command.EXAMPLES)
+        summary, _, rest = (command.__doc__ or "").partition("\n\n")
+        subparser = subparsers.add_parser(name, help=summary, description=summary, epilog=rest)
         command.add_arguments(subparser)
     return parser
 

@@ -1,4 +1,10 @@
-"""The flags of ``benchmark``."""
+"""Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop.
+
+examples:
+  sb3-quad benchmark                                   everything, about a minute
+  sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
+  sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
+"""
 
 from __future__ import annotations
 
@@ -6,12 +12,6 @@ import argparse
 
 from sb3_quad.cli.parser import Parser, positive
 
-HELP = "Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop."
-EXAMPLES = """examples:
-  sb3-quad benchmark                                   everything, about a minute
-  sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
-  sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
-"""
 SIZES = (64, 240, 1024, 4096, 16384)
 
 

@@ -1,17 +1,16 @@
-"""The flags of ``check-vehicle``."""
+"""Check whether a vehicle can hover, how much authority it has, and how well the experts fly it.
 
-from __future__ import annotations
-
-from sb3_quad.cli.parser import Parser, natural
-
-HELP = "Check whether a vehicle can hover, how much authority it has, and how well the experts fly it."
-EXAMPLES = """examples:
+examples:
   sb3-quad check-vehicle my.yaml            your own vehicle
   sb3-quad check-vehicle crazyflie          one that comes with the package: crazyflie, hummingbird, itm
   sb3-quad check-vehicle my.yaml -n 0       from its parameters alone, without flying
 
 Exit code 1: the rotors cannot produce hover thrust. The contents of a vehicle file: docs/vehicles.md
 """
+
+from __future__ import annotations
+
+from sb3_quad.cli.parser import Parser, natural
 
 
 def add_arguments(parser: Parser) -> None:

@@ -1,12 +1,6 @@
-"""The flags of ``enjoy``."""
+"""Watch controllers fly: in PyBullet's window, as a film, or as poses in one picture; several side by side.
 
-from __future__ import annotations
-
-from sb3_quad.cli.parser import Pairs, Parser, positive, whole
-
-DEFAULT_ENV = "QuadTargetTracking-v0"
-HELP = "Watch controllers fly: in PyBullet's window, as a film, or as poses in one picture; several side by side."
-EXAMPLES = """examples:
+examples:
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs          the latest run's agent, in a window
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
   sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 --record recovery.mp4
@@ -17,6 +11,12 @@ EXAMPLES = """examples:
 A controller is pid, geometric, the path of an SB3 zip, or package.module:factory; a prefix name=… labels it.
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
+
+from __future__ import annotations
+
+from sb3_quad.cli.parser import Pairs, Parser, positive, whole
+
+DEFAULT_ENV = "QuadTargetTracking-v0"
 
 
 def add_arguments(parser: Parser) -> None:

@@ -1,13 +1,6 @@
-"""The flags of ``evaluate``."""
+"""Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.parser import Parser, whole
-
-HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
-EXAMPLES = """controllers:
+controllers:
   pid, geometric          the experts
   path/to/agent.zip       an agent of any Stable-Baselines3 algorithm
   package.module:factory  a function that takes the vehicle and returns a controller
@@ -25,6 +18,13 @@ examples:
 
 Results are kept in a folder: the same command again flies only what is missing, and further controllers are added.
 """
+
+from __future__ import annotations
+
+import argparse
+
+from sb3_quad.cli.parser import Parser, whole
+
 DEFAULT_FOLDER = "evaluations"
 
 

@@ -1,12 +1,6 @@
-"""The flags of ``export``."""
+"""Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out.
 
-from __future__ import annotations
-
-from sb3_quad.cli.parser import Parser
-from sb3_quad.pretrained_policies import agent_path
-
-HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
-EXAMPLES = """The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
+The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
 world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It returns the command for each rotor.
 Scaling and clipping are built in. The file is checked against the policy on 10,000 observations before it is written.
 
@@ -18,6 +12,11 @@ examples:
 
 ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header needs a C compiler to check it.
 """
+
+from __future__ import annotations
+
+from sb3_quad.cli.parser import Parser
+from sb3_quad.pretrained_policies import agent_path
 
 
 def add_arguments(parser: Parser) -> None:

@@ -1,14 +1,13 @@
-"""The flags of ``plot``."""
+"""Draw learning curves: success and reward over timesteps and wall-clock time, with mean and range over seeds.
+
+examples:
+  sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
+  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
+"""
 
 from __future__ import annotations
 
 from sb3_quad.cli.parser import Parser
-
-HELP = "Draw learning curves: success and reward over timesteps and wall-clock time, with mean and range over seeds."
-EXAMPLES = """examples:
-  sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
-  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
-"""
 
 
 def add_arguments(parser: Parser) -> None:

@@ -1,11 +1,6 @@
-"""The flags of ``publish``."""
+"""Write a trained policy as a small zip for stock PPO, with a card: measured metrics, command, seed, versions.
 
-from __future__ import annotations
-
-from sb3_quad.cli.parser import Parser, positive
-
-HELP = "Write a trained policy as a small zip for stock PPO, with a card: measured metrics, command, seed, versions."
-EXAMPLES = """The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 can read it too.
+The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 can read it too.
 For the card, the policy flies fresh episodes: 3,840 recoveries, and 960 targets at each of 10, 15 and 20 m.
 
 examples:
@@ -14,6 +9,10 @@ examples:
 
 The zip must lie in its run folder, which records how it was trained.
 """
+
+from __future__ import annotations
+
+from sb3_quad.cli.parser import Parser, positive
 
 
 def add_arguments(parser: Parser) -> None:

@@ -1,13 +1,6 @@
-"""The flags of ``record-video``."""
+"""Record a film of a trained agent, as enjoy --record does, with the flags and folders of rl-zoo's record_video.
 
-from __future__ import annotations
-
-from sb3_quad.cli.arguments.enjoy import add_flight_arguments
-from sb3_quad.cli.parser import Parser, positive
-from sb3_quad.pretrained_policies import agent_path
-
-HELP = "Record a film of a trained agent, as enjoy --record does, with the flags and folders of rl-zoo's record_video."
-EXAMPLES = """examples:
+examples:
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0                   the latest run, into its folder videos/
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best -n 500 -o films
   sb3-quad record-video --algo dagger --env QuadTargetTracking-v0 --load-checkpoint 500000 --n-envs 4 --seed 3
@@ -16,6 +9,12 @@ EXAMPLES = """examples:
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 Films need: pip install 'sb3_quad[video]'. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
 """
+
+from __future__ import annotations
+
+from sb3_quad.cli.arguments.enjoy import add_flight_arguments
+from sb3_quad.cli.parser import Parser, positive
+from sb3_quad.pretrained_policies import agent_path
 
 
 def add_arguments(parser: Parser) -> None:

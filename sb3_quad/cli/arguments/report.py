@@ -1,19 +1,18 @@
-"""The flags of ``report``."""
+"""Make report.html from a results folder of evaluate: tables, plots, flights in 3-D; one file that needs no network.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.parser import Parser
-
-HELP = "Make report.html from a results folder of evaluate: tables, plots, flights in 3-D; one file that needs no network."
-EXAMPLES = """examples:
+examples:
   sb3-quad report evaluations/thesis
   sb3-quad report evaluations/thesis --overwrite      again, after adding controllers
   sb3-quad report evaluations/thesis --no-pictures    only the page, and its tables as report.md
 
 Needs: pip install 'sb3_quad[report]'.
 """
+
+from __future__ import annotations
+
+import argparse
+
+from sb3_quad.cli.parser import Parser
 
 
 def add_arguments(parser: Parser) -> None:

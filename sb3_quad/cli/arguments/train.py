@@ -1,14 +1,6 @@
-"""The flags of ``train``."""
+"""Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
-from sb3_quad.pretrained_policies import agent_path
-
-HELP = "Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning."
-EXAMPLES = """examples:
+examples:
   sb3-quad train                                          both stages, in the batched environment
   sb3-quad train --conf-file two_stage.yml                both stages from the PID expert, as in the thesis
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
@@ -22,6 +14,14 @@ EXAMPLES = """examples:
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
+
+from __future__ import annotations
+
+import argparse
+
+from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
+from sb3_quad.pretrained_policies import agent_path
+
 DEFAULT_PIPELINE = "geometric/two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 

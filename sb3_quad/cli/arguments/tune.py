@@ -1,12 +1,6 @@
-"""The flags of ``tune``."""
+"""Search for hyperparameters: train with one choice after another, and write the best as a settings file.
 
-from __future__ import annotations
-
-from sb3_quad.cli.arguments.train import add_settings
-from sb3_quad.cli.parser import Parser, natural, positive, seed, whole
-
-HELP = "Search for hyperparameters: train with one choice after another, and write the best as a settings file."
-EXAMPLES = """examples:
+examples:
   sb3-quad tune --algo dagger -n 250000 --n-trials 30               around zoo_configs/dagger.yml
   sb3-quad tune --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip -n 3e6
   sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler random --pruner none --seed 1
@@ -17,6 +11,11 @@ EXAMPLES = """examples:
 
 The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. Needs: pip install 'sb3_quad[tune]'.
 """
+
+from __future__ import annotations
+
+from sb3_quad.cli.arguments.train import add_settings
+from sb3_quad.cli.parser import Parser, natural, positive, seed, whole
 
 
 def add_arguments(parser: Parser) -> None:

@@ -1,13 +1,6 @@
-"""The flags of ``tune-expert``."""
+"""Find the geometric expert's gains for a vehicle; write its YAML with them and the resulting metrics.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.parser import Parser, natural, positive
-
-HELP = "Find the geometric expert's gains for a vehicle; write its YAML with them and the resulting metrics."
-EXAMPLES = """examples:
+examples:
   sb3-quad tune-expert                                   for ITM, into itm_tuned.yaml
   sb3-quad tune-expert --vehicle my.yaml -o tuned.yaml   for your own vehicle
   sb3-quad tune-expert -n 2000                           continues the first search, up to 2000 gains in all
@@ -15,6 +8,12 @@ EXAMPLES = """examples:
 
 Ctrl-C writes the best gains so far; the same command continues. Needs pip install 'sb3_quad[tune]'.
 """
+
+from __future__ import annotations
+
+import argparse
+
+from sb3_quad.cli.parser import Parser, natural, positive
 
 
 def add_arguments(parser: Parser) -> None:
