@@ -32,7 +32,7 @@ def test_examples_are_taken(name):
     for arguments in found:
         if "--help" in arguments:
             continue
-        options = make_parser().parse(arguments)  # raises on a flag that there is not, or a bad value
+        options = make_parser().parse_args(arguments)  # raises on a flag that there is not, or a bad value
         assert options.command in COMMANDS
         if getattr(options, "algo", None) is not None:
             assert options.algo in ALGORITHMS

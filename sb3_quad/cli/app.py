@@ -52,7 +52,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise ConfigError(unknown("command", given[0], COMMANDS))
-        options = parser.parse(given)
+        options = parser.parse_args(given)
         if options.command is None:
             parser.print_help()
             return 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import random
-from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -21,23 +20,16 @@ class Parser(argparse.ArgumentParser):
         """:raises ConfigError: always."""
         raise ConfigError(message)
 
-    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
-        """The options of a command line.
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """As argparse's, but nothing unknown is passed over: the options of a command are all that there are.
 
         :raises ConfigError: an unknown option, a missing or bad value.
         """
-        options, rest = self.parse_known_args(arguments)
-        if rest:
-            name = rest[0].split("=")[0]
-            raise ConfigError(unknown("option", name, self._options(options.command)).split(" (valid:")[0] + "; see --help")
-        return options
-
-    def _options(self, command: str | None) -> list[str]:
-        parsers: list[argparse.ArgumentParser] = [self]
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction) and command in action.choices:
-                parsers.append(action.choices[command])
-        return [option for parser in parsers for action in parser._actions for option in action.option_strings]
+        options, rest = super().parse_known_args(args, namespace)
+        for text in rest:
+            valid = [option for action in self._actions for option in action.option_strings]
+            raise ConfigError(unknown("option", text.split("=")[0], valid).split("(valid:")[0].rstrip(": ") + "; see --help")
+        return options, rest
 
 
 def whole(text: str) -> int:
