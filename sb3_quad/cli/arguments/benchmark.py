@@ -16,7 +16,6 @@ SIZES = (64, 240, 1024, 4096, 16384)
 
 
 def add_arguments(parser: Parser) -> None:
-    """The benchmark's flags."""
     add = parser.add_argument
     add("--sizes", nargs="+", type=positive, default=list(SIZES), metavar="N", help="rows of the batch")
     add("--n-envs", type=positive, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")

@@ -14,7 +14,6 @@ from sb3_quad.cli.parser import Parser, natural
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``check-vehicle``."""
     add = parser.add_argument
     add("vehicle", metavar="VEHICLE", help="name or YAML file")
     add("-n", "--episodes", type=natural, default=480, metavar="N", help="episodes of each task, per expert, true state (480)")

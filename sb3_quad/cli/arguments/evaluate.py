@@ -29,7 +29,6 @@ DEFAULT_FOLDER = "evaluations"
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``evaluate``."""
     add = parser.add_argument
     add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
     add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, quick, or the path of a YAML file")

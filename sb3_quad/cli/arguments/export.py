@@ -20,7 +20,6 @@ from sb3_quad.pretrained_policies import agent_path
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``export``."""
     add = parser.add_argument
     add(
         "model",

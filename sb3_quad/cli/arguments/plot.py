@@ -11,7 +11,6 @@ from sb3_quad.cli.parser import Parser
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``plot``."""
     add = parser.add_argument
     add("groups", nargs="+", metavar="NAME=PATTERN", help="an agent's name and its run folders; quote a *")
     add("--line", action="append", default=[], metavar="NAME:SUCCESS:REWARD", help="horizontal lines: success in %%, reward")

@@ -16,7 +16,6 @@ from sb3_quad.cli.parser import Parser, positive
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``publish``."""
     add = parser.add_argument
     add("model", metavar="MODEL.zip", help="an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy")
     add("--name", required=True, metavar="NAME", help="name of the files, NAME.zip and NAME.md")

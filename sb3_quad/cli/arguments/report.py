@@ -16,7 +16,6 @@ from sb3_quad.cli.parser import Parser
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``report``."""
     add = parser.add_argument
     add("folder", metavar="FOLDER", help="results folder of evaluate")
     add("--pictures", action=argparse.BooleanOptionalAction, default=True, help="also write each plot as PNG and SVG (yes)")

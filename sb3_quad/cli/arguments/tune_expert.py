@@ -17,7 +17,6 @@ from sb3_quad.cli.parser import Parser, natural, positive
 
 
 def add_arguments(parser: Parser) -> None:
-    """The flags of ``tune-expert``."""
     add = parser.add_argument
     add("--vehicle", default="itm", metavar="V", help="name or YAML file (itm); the search starts from its gains, if any")
     add("-o", "--output", metavar="FILE", help="YAML file to write (VEHICLE_tuned.yaml)")
