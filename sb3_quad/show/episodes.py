@@ -28,7 +28,8 @@ class Setting(NamedTuple):
     """What all controllers fly."""
 
     vehicle: Any  # that experts are made for; in a scenario another one may fly
-    episode: Callable[[int], tuple[FlightSettings, Plan]]  # by seed: how it is flown, and what happens in it
+    settings: FlightSettings  # how all episodes are flown
+    plan: Callable[[int], Plan]  # what happens in an episode, by its seed
 
 
 def fixed_setting(
@@ -50,7 +51,7 @@ def fixed_setting(
     generators = [np.random.default_rng(0)]
     acting = sample_wrenches(wrenches, vehicle.control_step, settings.max_episode_steps, generators)
     plan = Plan(start, acting)
-    return Setting(settings.vehicle, lambda seed: (settings, plan))
+    return Setting(settings.vehicle, settings, lambda seed: plan)
 
 
 def scenario_setting(text: str) -> Setting:
@@ -62,8 +63,7 @@ def scenario_setting(text: str) -> Setting:
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).scenario(name)
-    settings = flown_as(scenario)
-    return Setting(scenario.vehicle, lambda seed: (settings, sample_plan(scenario, [seed])))
+    return Setting(scenario.vehicle, flown_as(scenario), lambda seed: sample_plan(scenario, [seed]))
 
 
 def fly_all(
@@ -84,19 +84,18 @@ def fly_all(
     :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
-    longest = setting.episode(seed)[0].max_episode_steps
+    longest = setting.settings.max_episode_steps
     left = longest if n_timesteps is None else n_timesteps
     while left > 0:
+        settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
         together: list[Recording] = []
         for name, controller in controllers.items():
             sampling = hasattr(controller, "predict") and not deterministic
             flown = observation_function(controller, deterministic=False) if sampling else controller
             for each in range(seed, seed + n_envs):
                 label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
-                settings, plan = setting.episode(each)
                 try:
-                    settings = settings.with_changes(max_episode_steps=min(left, longest))
-                    together.append(_record(label, colour, flown, settings, plan, each))
+                    together.append(_record(label, colour, flown, settings, setting.plan(each), each))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
         yield together

@@ -15,7 +15,7 @@ from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.compare import agent_and_expert, print_tables
-from sb3_quad.cli.output import console, print_line, shows_progress
+from sb3_quad.cli.output import console, shows_progress
 from sb3_quad.cli.parser import given
 from sb3_quad.experts.models import load_model
 from sb3_quad.experts.resolve import resolve_expert
@@ -51,8 +51,8 @@ def run(options: argparse.Namespace) -> int:
             raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
         folder = Path(options.resume)
         if is_pipeline_run(folder):
-            return _finish_stages(resume_pipeline(folder, print_line, **arguments), options.reference, start)
-        return _finish(resume(options.resume, print_line, **arguments))
+            return _finish_stages(resume_pipeline(folder, **arguments), options.reference, start)
+        return _finish(resume(options.resume, **arguments))
     arguments["unique"] = options.uuid
     conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
     if conf_file is not None and is_pipeline(conf_file):
@@ -61,12 +61,12 @@ def run(options: argparse.Namespace) -> int:
                 own = f"a pipeline's stages have their own in {conf_file}"
                 raise ConfigError(f"{flag} goes with a single run (--algo, --env); {own}")
         pipeline = with_settings(load_pipeline(conf_file), _changed_settings(options))
-        return _finish_stages(run_pipeline(pipeline, arguments, Path(conf_file).stem, print_line), options.reference, start)
+        return _finish_stages(run_pipeline(pipeline, arguments, Path(conf_file).stem), options.reference, start)
     if options.reference:
         raise ConfigError("--reference goes with a pipeline, such as train without --algo and --env")
     job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
-    print_line(describe(job))
-    return _finish(train(job, print_line))
+    print(describe(job))
+    return _finish(train(job))
 
 
 def prepare(options: argparse.Namespace) -> None:
@@ -102,8 +102,8 @@ def _finish(result: TrainingResult) -> int:
         start = time.perf_counter()
         console().print(agent_and_expert(result.job, result.model))
         told += f", flown for this table in {time.perf_counter() - start:.1f} s"
-    print_line(told)
-    print_line(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
+    print(told)
+    print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
     return 0
 
 
@@ -124,18 +124,16 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
         settings["n_timesteps"] = sum(entry.timesteps for entry in result.stages.values())
         alone = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, settings)
         job = result.job.model_copy(update={"config": alone, "trained_agent": None})
-        print_line(f"{REFERENCE}: {describe(job)}")
-        trained = train(job, print_line)
+        print(f"{REFERENCE}: {describe(job)}")
+        trained = train(job)
         if trained.exit_code != 0:
             return trained.exit_code
         times[REFERENCE] = trained.seconds
         controllers[REFERENCE] = load_model(trained.run.result)
     how = result.job.flight_settings.in_any_task()
     print_tables(controllers, how, FRESH_EPISODES, seed_for("table", result.job.seed), THESIS_COLUMNS)
-    print_line(
-        "; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; both stages together: {seconds:.0f} s"
-    )
+    print("; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; both stages together: {seconds:.0f} s")
     for name, entry in result.stages.items():
-        print_line(f"{name}: {entry.agent}")
-    print_line(f"saved in {result.folder}")
+        print(f"{name}: {entry.agent}")
+    print(f"saved in {result.folder}")
     return 0

@@ -13,7 +13,7 @@ from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.commands.train import make_config, prepare
 from sb3_quad.cli.compare import agent_and_expert
-from sb3_quad.cli.output import console, print_line, progress_bar
+from sb3_quad.cli.output import console, progress_bar
 from sb3_quad.cli.parser import given
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.experts.models import load_model
@@ -38,14 +38,14 @@ def run(options: argparse.Namespace) -> int:
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        print_line(f"study {search.name} in {search.storage}: {_count(search)}; results go to {search.job.log_folder}")
+        print(f"study {search.name} in {search.storage}: {_count(search)}; results go to {search.job.log_folder}")
         with progress_bar(options.progress) as show:
             done = count()
             show(next(done), options.n_trials, "trials")
 
             def after_each(trial: FrozenTrial) -> None:
                 write_results(search)
-                print_line(_line(search, trial))
+                print(_line(search, trial))
                 show(next(done), options.n_trials, "trials")
 
             try:
@@ -94,10 +94,10 @@ def _print_results(search: Search) -> None:
         write_plot(search)
         _print_best(search, search.best)
     written = [TRIALS] if search.best is None else [TRIALS, BEST, PLOT]
-    print_line(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
-    print_line(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
+    print(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
+    print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
     if search.best is not None:
-        print_line(f"to train: {train_command(search)}")
+        print(f"to train: {train_command(search)}")
 
 
 def _print_best(search: Search, best: FrozenTrial) -> None:
@@ -112,7 +112,7 @@ def _print_best(search: Search, best: FrozenTrial) -> None:
     if known.task is not None and path.is_dir():
         run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
         console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
-        print_line(f"agent: {run.model}")
+        print(f"agent: {run.model}")
 
 
 def _count(search: Search) -> str:
