@@ -19,7 +19,6 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.cli import compare, main
-from sb3_quad.cli.commands import stages
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
@@ -310,7 +309,6 @@ def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
 
 def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with(monkeypatch):
     monkeypatch.setattr(compare, "FRESH_EPISODES", 4)
-    monkeypatch.setattr(stages, "FRESH_EPISODES", 4)
     scaling = {"noise": 0.0, "observation_mean": [5.0] * 18, "observation_std": [2.0] * 18}
     config = build_config("ppo", ENV, {"n_timesteps": 1, "env_kwargs": {**scaling, "max_episode_steps": 2}})
     seen = []
@@ -323,5 +321,5 @@ def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_w
     compare.agent_and_expert(job, agent)
     assert np.allclose(seen[0][:, 12:], -2.5)  # an episode begins at rest: (0 - 5) / 2
     seen.clear()
-    stages.print_tables({"agent": agent}, job)
+    compare.print_tables({"agent": agent}, job.flight_settings.in_any_task(), 4, 0)
     assert np.allclose(seen[0][:, 12:], -2.5)

@@ -26,13 +26,13 @@ def examples(text: str) -> list[list[str]]:
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
 def test_examples_are_taken(name):
-    found = examples(COMMANDS[name].EXAMPLES if name else EPILOG)
+    found = examples(COMMANDS[name].__doc__ if name else EPILOG)
     assert found
     assert any(arguments[0] == name for arguments in found) or not name
     for arguments in found:
         if "--help" in arguments:
             continue
-        options = make_parser().parse(arguments)  # raises on a flag that there is not, or a bad value
+        options = make_parser().parse_args(arguments)  # raises on a flag that there is not, or a bad value
         assert options.command in COMMANDS
         if getattr(options, "algo", None) is not None:
             assert options.algo in ALGORITHMS

@@ -28,7 +28,7 @@ SMALL = {"n_steps": 32, "batch_size": 128, "learning_rate": LinearSchedule(1e-3,
 
 
 def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
-    env = QuadcopterVecEnv(16, seed=0, max_episode_steps=20)
+    env = QuadcopterVecEnv(8, seed=0, max_episode_steps=20)
     models = [
         DAgger("MlpPolicy", env, PIDExpert(), **SMALL),
         DAgger("MlpPolicy", env, PIDExpert(), clip_range_vf=0.2, **SMALL),
@@ -36,7 +36,7 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
         PPOBC("MlpPolicy", env, expert=PIDExpert(), bc_coef=LinearSchedule(1.0, 0.0, 0.5), **SMALL),
     ]
     for number, model in enumerate(models):
-        model.learn(1024, callback=CoefficientSchedule("bc_coef", 1.0, 0.0) if number == 2 else None)
+        model.learn(256, callback=CoefficientSchedule("bc_coef", 1.0, 0.0) if number == 2 else None)
         assert model.ep_info_buffer  # it is saved too, so it must not be empty here
         model.save(tmp_path / f"{number}.zip")
     observations = env.reset()
@@ -46,6 +46,6 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert result.returncode == 0, result.stderr
     actions, timesteps = json.loads(result.stdout)
-    assert timesteps == [1024] * len(models)
+    assert timesteps == [256] * len(models)
     for model, flown in zip(models, actions, strict=True):
         np.testing.assert_array_equal(np.float32(flown), model.predict(observations, deterministic=True)[0])

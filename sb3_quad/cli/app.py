@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import pkgutil
 import sys
 from collections.abc import Sequence
@@ -12,18 +13,18 @@ from sb3_quad.cli import arguments
 from sb3_quad.cli.parser import Parser
 
 EPILOG = """examples:
-  sb3-quad train                                                          both stages, imitation then PPO with cloning
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          one training
-  sb3-quad tune --algo dagger -n 250000 --n-trials 30                     its hyperparameters
-  sb3-quad evaluate pid agent.zip --suite quick                           an agent beside an expert, in tables
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flight in a window
+  sb3-quad train                                                          both stages: imitation, then PPO with cloning
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          a single training
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30                     a search for its hyperparameters
+  sb3-quad evaluate pid agent.zip --suite quick                           an agent and an expert in one table
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flights in a window
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0 -f logs  or as a film
   sb3-quad train --help                                                   all options of a command, with examples
 
 exit codes:
   0    done
-  1    evaluated, but not every controller: a line on stderr for each that failed; or a vehicle that cannot hover
-  2    bad input, or a training that cannot go on: one line on stderr says what
+  1    some controllers of an evaluation failed (one line each on stderr), or a vehicle cannot hover
+  2    bad input, or a training that cannot continue: one line on stderr says what
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """
@@ -31,7 +32,7 @@ COMMANDS = {
     module.name.replace("_", "-"): importlib.import_module(f"{arguments.__name__}.{module.name}")
     for module in pkgutil.iter_modules(arguments.__path__)
 }
-"""The flags of each command, by its name."""
+"""The module of each command's flags, by the command's name."""
 
 
 def make_parser() -> Parser:
@@ -39,7 +40,8 @@ def make_parser() -> Parser:
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
     subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
     for name, command in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=command.HELP, description=command.HELP, epilog=command.EXAMPLES)
+        summary, _, rest = (command.__doc__ or "").partition("\n\n")
+        subparser = subparsers.add_parser(name, help=summary, description=summary, epilog=rest)
         command.add_arguments(subparser)
     return parser
 
@@ -47,11 +49,13 @@ def make_parser() -> Parser:
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
     given = list(sys.argv[1:] if argv is None else argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)  # lines appear at once, also in a pipe
     parser = make_parser()
     try:
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise ConfigError(unknown("command", given[0], COMMANDS))
-        options = parser.parse(given)
+        options = parser.parse_args(given)
         if options.command is None:
             parser.print_help()
             return 0

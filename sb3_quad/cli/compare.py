@@ -1,4 +1,4 @@
-"""Controllers on the same episodes of a task, in a table."""
+"""Controllers on the same fresh episodes of a task, in a table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.cli.output import console
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.summary import summarise
@@ -21,13 +22,12 @@ SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of 
 
 
 def task_table(
-    controllers: Mapping[str, Any], settings: FlightSettings, n: int, seed: int, title: str, beside: Iterable[str] = ()
+    controllers: Mapping[str, Any], settings: FlightSettings, n: int, seed: int, beside: Iterable[str] = ()
 ) -> Table:
     """The table of some controllers over the same episodes of a task.
 
     :param settings: how all of them fly.
     :param n: how many episodes.
-    :param title: what follows the task's name and the number of fresh episodes.
     :param beside: the columns of the thesis that stand beside them; none but of the vehicle that it flew.
     """
     seeds = range(seed, seed + n)
@@ -36,7 +36,19 @@ def task_table(
     shown = [name for name in beside if name in scenario.reference and settings.vehicle == THESIS_VEHICLE]
     columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
     rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
-    return Table(columns, rows, title=f"{settings.task}: {n} fresh episodes, {title}", caption=CAPTION)
+    title = f"{settings.task}: {n} fresh episodes, the same for all" + ("" if settings.noise else ", true state")
+    return Table(columns, rows, title=title, caption=CAPTION)
+
+
+def print_tables(
+    controllers: Mapping[str, Any], how: Mapping[str, Any], n: int, seed: int, beside: Iterable[str] = ()
+) -> None:
+    """Print a table as of :func:`task_table` for each task.
+
+    :param how: the controllers fly in any task: vehicle, noise and scaling.
+    """
+    for task in SCENARIOS:
+        console().print(task_table(controllers, FlightSettings(task=task, **how), n, seed, beside))
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
@@ -47,5 +59,4 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     settings = job.flight_settings
     controllers = {"agent": model, "expert": resolve_expert(job.config.expert or "pid", settings.vehicle)}
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
-    seed = seed_for("table", job.seed)
-    return task_table(controllers, settings, FRESH_EPISODES, seed, "the same for both", (agent, "expert"))
+    return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))

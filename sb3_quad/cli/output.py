@@ -14,11 +14,6 @@ FILE_WIDTH = 140  # columns where the output is no terminal: a table there need 
 Show = Callable[[int, "int | None", str], None]
 
 
-def print_line(line: str) -> None:
-    """Print a line at once, also into a pipe."""
-    print(line, flush=True)
-
-
 def console() -> Console:
     """A console as wide as the terminal, or as wide as any table here needs in a file or pipe."""
     return Console(width=None if sys.stdout.isatty() else FILE_WIDTH)

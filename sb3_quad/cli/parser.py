@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+import random
 from typing import Any, NoReturn
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -20,23 +20,16 @@ class Parser(argparse.ArgumentParser):
         """:raises ConfigError: always."""
         raise ConfigError(message)
 
-    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
-        """The options of a command line.
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """As argparse's, but nothing unknown is passed over: the options of a command are all that there are.
 
         :raises ConfigError: an unknown option, a missing or bad value.
         """
-        options, rest = self.parse_known_args(arguments)
-        if rest:
-            name = rest[0].split("=")[0]
-            raise ConfigError(unknown("option", name, self._options(options.command)).split(" (valid:")[0] + "; see --help")
-        return options
-
-    def _options(self, command: str | None) -> list[str]:
-        parsers: list[argparse.ArgumentParser] = [self]
-        for action in self._actions:
-            if isinstance(action, argparse._SubParsersAction) and command in action.choices:
-                parsers.append(action.choices[command])
-        return [option for parser in parsers for action in parser._actions for option in action.option_strings]
+        options, rest = super().parse_known_args(args, namespace)
+        for text in rest:
+            valid = [option for action in self._actions for option in action.option_strings]
+            raise ConfigError(unknown("option", text.split("=")[0], valid).split("(valid:")[0].rstrip(": ") + "; see --help")
+        return options, rest
 
 
 def whole(text: str) -> int:
@@ -47,20 +40,38 @@ def whole(text: str) -> int:
     return int(number)
 
 
+def natural(text: str, least: int = 0) -> int:
+    """A whole number of at least 0."""
+    if whole(text) < least:
+        raise argparse.ArgumentTypeError(f"{text}: must be at least {least}")
+    return whole(text)
+
+
+def positive(text: str) -> int:
+    """A whole number of at least 1."""
+    return natural(text, least=1)
+
+
+def seed(text: str) -> int:
+    """A whole number; a negative one asks for a random one."""
+    number = whole(text)
+    return number if number >= 0 else random.SystemRandom().randrange(2**31)
+
+
+class Pairs(argparse.Action):
+    """Keeps ``k:v`` entries as a mapping."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """:raises ConfigError: an entry without a colon."""
+        found = {}
+        for entry in values:
+            key, colon, value = entry.partition(":")
+            if not colon or not key:
+                raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
+            found[key.strip()] = parse_value(value)
+        setattr(namespace, self.dest, found)
+
+
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of some options that are given."""
-    return {name: value for name in names if (value := getattr(options, name)) is not None}
-
-
-def pairs(entries: Sequence[str] | None, option: str) -> dict[str, Any]:
-    """``k:v`` entries as a mapping.
-
-    :raises ConfigError: an entry without a colon.
-    """
-    found: dict[str, Any] = {}
-    for entry in entries or []:
-        key, colon, value = entry.partition(":")
-        if not colon or not key:
-            raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
-        found[key.strip()] = parse_value(value)
-    return found
+    """Those of some options that a command has and that are given."""
+    return {name: value for name in names if (value := getattr(options, name, None)) is not None}

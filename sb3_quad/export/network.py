@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import torch as th
-from gymnasium import spaces
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.extras import require
-from sb3_quad.export.check import N_ROTORS, Reference
+from sb3_quad.evaluation.flights import ACTIONS, OBSERVATIONS
+from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
@@ -79,10 +79,10 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     policy: Any = reference.model.policy
     check_policy(policy, where)
     seen, done = reference.model.observation_space, reference.model.action_space
-    if not isinstance(seen, spaces.Box) or seen.shape != (OBSERVATION_SIZE,):
-        raise ConfigError(f"{where}: its observations are {seen}, the quadcopter's are of shape ({OBSERVATION_SIZE},)")
-    if not isinstance(done, spaces.Box) or done.shape != (N_ROTORS,) or (done.low != -1).any() or (done.high != 1).any():
-        raise ConfigError(f"{where}: its actions are {done}, the quadcopter's are Box(-1, 1, ({N_ROTORS},))")
+    if seen.shape != OBSERVATIONS.shape:
+        raise ConfigError(f"{where}: its observations are {seen}, the quadcopter's are of shape {OBSERVATIONS.shape}")
+    if done != ACTIONS:
+        raise ConfigError(f"{where}: its actions are {done}, the quadcopter's are {ACTIONS}")
     # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
     squash = [th.nn.Tanh()] if policy.squash_output else []
     layers = th.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net, *squash)

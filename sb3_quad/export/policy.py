@@ -34,7 +34,6 @@ class Export(NamedTuple):
     max_error: float  # the largest difference to the policy, in `unit`
     unit: str  # N or rad/s
     microseconds: float  # per call with one observation, on one thread
-    checked_by: str  # what ran it
     settings: Path | None  # the file that vehicle and scaling came from, where they were not given
 
 
@@ -90,7 +89,7 @@ def export_policy(
         metadata["check"] = f"largest error {error:.2g} {network.unit} in {len(observations)} observations ({by})"
         content = write(network, metadata)
     time = check.time_calls(call, observations, at_once=file_format == "c")
-    return Export(content, metadata, error, network.unit, time, by, source)
+    return Export(content, metadata, error, network.unit, time, source)
 
 
 def _describe(path: Path, algorithm: str, network: Network, reference: check.Reference) -> dict[str, str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,41 +21,15 @@ from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.recording import Recording
 from sb3_quad.simulation.checks import vector
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
-from sb3_quad.training.runs import find_run
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
-
-
-def find_agent(
-    log_folder: str, algo: str, env_id: str, exp_id: int = 0, which: str | int | None = None
-) -> tuple[str, Path, FlightSettings]:
-    """The agent of a run, by rl-zoo's names: a label, its zip, and the settings that it was judged with.
-
-    :param exp_id: number of the run; 0: the latest.
-    :param which: ``best``, ``last checkpoint``, or the timesteps of a checkpoint; None: trimmed, else best, else last.
-    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
-    """
-    run = find_run(log_folder, algo, env_id, exp_id)
-    if isinstance(which, int):
-        path = run.checkpoint(which)
-    elif which == "last checkpoint":
-        path = run.latest_checkpoint()
-    else:
-        path = run.best_model if which == "best" else run.result
-    if not path.is_file():
-        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
-        raise ConfigError(f"{path}: no such file; the run holds {zips}")
-    settings, _ = run.read_yaml()
-    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
-        if settings.get(key):
-            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    return f"{algo} {run.path.name}", path, FlightSettings.beside(path)[0]
 
 
 class Setting(NamedTuple):
     """What all controllers fly."""
 
     vehicle: Any  # that experts are made for; in a scenario another one may fly
-    episode: Callable[[int], tuple[FlightSettings, Plan]]  # by seed: how it is flown, and what happens in it
+    settings: FlightSettings  # how all episodes are flown
+    plan: Callable[[int], Plan]  # what happens in an episode, by its seed
 
 
 def fixed_setting(
@@ -78,7 +51,7 @@ def fixed_setting(
     generators = [np.random.default_rng(0)]
     acting = sample_wrenches(wrenches, vehicle.control_step, settings.max_episode_steps, generators)
     plan = Plan(start, acting)
-    return Setting(settings.vehicle, lambda seed: (settings, plan))
+    return Setting(settings.vehicle, settings, lambda seed: plan)
 
 
 def scenario_setting(text: str) -> Setting:
@@ -90,8 +63,7 @@ def scenario_setting(text: str) -> Setting:
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).scenario(name)
-    settings = flown_as(scenario)
-    return Setting(scenario.vehicle, lambda seed: (settings, sample_plan(scenario, [seed])))
+    return Setting(scenario.vehicle, flown_as(scenario), lambda seed: sample_plan(scenario, [seed]))
 
 
 def fly_all(
@@ -109,25 +81,21 @@ def fly_all(
     :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
     :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
     :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
-    :raises ConfigError: a number of steps or of episodes below one, settings that the environment refuses.
+    :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
-    longest = setting.episode(seed)[0].max_episode_steps
+    longest = setting.settings.max_episode_steps
     left = longest if n_timesteps is None else n_timesteps
-    for flag, number in (("--n-timesteps", left), ("--n-envs", n_envs)):
-        if number < 1:
-            raise ConfigError(f"{flag} {number}: must be at least 1")
     while left > 0:
+        settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
         together: list[Recording] = []
         for name, controller in controllers.items():
             sampling = hasattr(controller, "predict") and not deterministic
             flown = observation_function(controller, deterministic=False) if sampling else controller
             for each in range(seed, seed + n_envs):
                 label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
-                settings, plan = setting.episode(each)
                 try:
-                    settings = settings.with_changes(max_episode_steps=min(left, longest))
-                    together.append(_record(label, colour, flown, settings, plan, each))
+                    together.append(_record(label, colour, flown, settings, setting.plan(each), each))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
         yield together

@@ -165,44 +165,46 @@ class QuadcopterBatch:
                 )
             current[...] = array
 
-    def set_target(self, position: Any, rows: Rows = None) -> None:
-        """Targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
-        chosen = self.rows(rows)
+    def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
+        """Move targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
+        chosen = self.rows(indices)
         self.state[TARGET, chosen] = per_row("target", position, chosen.size, 3)
 
     def set_wrench(
         self,
-        force: Any = (0.0, 0.0, 0.0),
-        torque: Any = (0.0, 0.0, 0.0),
+        force: npt.ArrayLike = (0.0, 0.0, 0.0),
+        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
         force_frame: str = "world",
         torque_frame: str = "body",
-        rows: Rows = None,
+        indices: Rows = None,
     ) -> None:
-        """External force (N) and torque (N m) at the centre of mass, (3,) or (rows, 3) each; until set anew.
+        """Apply an external force (N) and torque (N m), (3,) or (rows, 3) each, at the centre of mass; until set anew.
+
+        Without arguments, nothing pushes any more.
 
         :param force_frame: ``"world"`` or ``"body"``; ``torque_frame`` likewise.
         """
-        chosen = self.rows(rows)
+        chosen = self.rows(indices)
         vectors = [per_row(name, each, chosen.size, 3).T for name, each in (("force", force), ("torque", torque))]
         self.wrench[:, chosen] = make_wrench(vectors[0], vectors[1], force_frame, torque_frame)
 
-    def set_noise(self, level: Any, rows: Rows = None) -> None:
-        """Relative standard deviation of the observation noise, () or (rows,); 0: none."""
-        chosen = self.rows(rows)
+    def set_noise(self, level: npt.ArrayLike, indices: Rows = None) -> None:
+        """Set the relative standard deviation of the observation noise, () or (rows,); 0: none."""
+        chosen = self.rows(indices)
         levels = per_row("noise", level, chosen.size, None)[0]
         if (levels < 0).any():
             raise ConfigError(f"noise {level!r}: must not be negative")
-        columns = self._columns(rows, one_for_all=np.ndim(level) == 0)
+        columns = self._columns(indices, one_for_all=np.ndim(level) == 0)
         self.noise_level[columns] = levels[: columns.size]
 
-    def set_observation_scaling(self, mean: Any = None, std: Any = None, rows: Rows = None) -> None:
-        """μ and σ of Eq. 3.16, (18,) or (rows, 18) each; None leaves one as it is."""
-        chosen = self.rows(rows)
+    def set_observation_scaling(self, mean: Any = None, std: Any = None, indices: Rows = None) -> None:
+        """Set μ and σ of Eq. 3.16, (18,) or (rows, 18) each; None leaves one as it is."""
+        chosen = self.rows(indices)
         means = None if mean is None else per_row("observation_mean", mean, chosen.size, OBSERVATION_SIZE)
         stds = None if std is None else per_row("observation_std", std, chosen.size, OBSERVATION_SIZE)
         if stds is not None and (stds <= 0).any():
             raise ConfigError("observation_std: every value must be positive")
-        columns = self._columns(rows, one_for_all=np.ndim(mean) < 2 and np.ndim(std) < 2)
+        columns = self._columns(indices, one_for_all=np.ndim(mean) < 2 and np.ndim(std) < 2)
         for array, values in ((self.mean, means), (self.std, stds)):
             if values is not None:
                 array[:, columns] = values[:, : columns.size]
@@ -212,8 +214,15 @@ class QuadcopterBatch:
         self.max_episode_steps = whole_number("max_episode_steps", steps)
         self._bind()
 
-    def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> None:
-        """The task of all episodes that begin from now on; episodes under way end as they began."""
+    def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
+        """Set the task of all episodes that begin from now on; episodes under way end as they began.
+
+        :raises ConfigError: an unknown task, or ``indices`` of less than all rows.
+        """
+        if np.unique(self.rows(indices)).size < self.n:
+            raise ConfigError(
+                "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
+            )
         new = resolve_tasks(task, task_kwargs)
         used, index = np.unique(self.task_index, return_inverse=True)
         parameters = np.concatenate([self.tasks.parameters[used], new.parameters])

@@ -1,27 +1,26 @@
-"""The flags of ``benchmark``."""
+"""Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop.
+
+examples:
+  sb3-quad benchmark                                   everything, about a minute
+  sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
+  sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
+"""
 
 from __future__ import annotations
 
 import argparse
 
-from sb3_quad.cli.parser import whole
+from sb3_quad.cli.parser import Parser, positive
 
-HELP = "Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop."
-EXAMPLES = """examples:
-  sb3-quad benchmark                                   everything, about a minute
-  sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, beside PyBullet
-  sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
-"""
 SIZES = (64, 240, 1024, 4096, 16384)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The benchmark's flags."""
+def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("--sizes", nargs="+", type=whole, default=list(SIZES), metavar="N", help="rows of the batch")
-    add("--n-envs", type=whole, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
-    add("--seconds", type=float, default=3.0, metavar="S", help="for each measurement (3)")
+    add("--sizes", nargs="+", type=positive, default=list(SIZES), metavar="N", help="rows of the batch")
+    add("--n-envs", type=positive, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
+    add("--seconds", type=float, default=3.0, metavar="S", help="duration of each measurement (3)")
     add("--algo", default="ppo_bc", help="algorithm of the training loop (ppo_bc)")
-    add("-conf", "--conf-file", metavar="FILE", help="its settings (those that train without arguments uses)")
-    add("--training", action=argparse.BooleanOptionalAction, default=True, help="measure a training loop too")
+    add("-conf", "--conf-file", metavar="FILE", help="its settings (those of train without arguments)")
+    add("--training", action=argparse.BooleanOptionalAction, default=True, help="also measure a training loop")
     add("--output", metavar="FILE", help="write everything as JSON, with machine, versions and thread counts")

@@ -1,46 +1,45 @@
-"""The flags of ``evaluate``."""
+"""Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.parser import whole
-
-HELP = "Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv."
-EXAMPLES = """controllers:
+controllers:
   pid, geometric          the experts
   path/to/agent.zip       an agent of any Stable-Baselines3 algorithm
-  package.module:factory  a function that is given the vehicle and returns a controller
-  name=…                  any of these, called so in the tables
+  package.module:factory  a function that takes the vehicle and returns a controller
+  name=…                  any of these, under that name in the tables
 
 examples:
   sb3-quad evaluate pid geometric                              the thesis's chapter 4 for both experts
   sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip" --suite thesis -o evaluations/mine
-  sb3-quad evaluate pid agent.zip --suite quick                a look, in less than a minute
+  sb3-quad evaluate pid agent.zip --suite quick                a quick look, in less than a minute
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   sb3-quad evaluate agent.zip --scaling adaptive --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
 
-Results lie in a folder: the same command again flies only what is missing, further controllers join those that are there.
+Results are kept in a folder: the same command again flies only what is missing, and further controllers are added.
 """
+
+from __future__ import annotations
+
+import argparse
+
+from sb3_quad.cli.parser import Parser, whole
+
 DEFAULT_FOLDER = "evaluations"
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags of ``evaluate``."""
+def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
     add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, quick, or the path of a YAML file")
     add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
-    add("--episodes", type=whole, metavar="N", help="of every scenario, instead of its own number")
-    add("--seed", type=whole, metavar="N", help="of the first episode of every scenario, instead of its own")
-    add("--vehicle", metavar="V", help="name or YAML file that flies all scenarios, instead of their own")
+    add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
+    add("--seed", type=whole, metavar="N", help="seed of each scenario's first episode, instead of its own")
+    add("--vehicle", metavar="V", help="vehicle for all scenarios, by name or YAML file")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
-    add("--overwrite", action="store_true", help="replace results of these controllers that were flown otherwise")
-    add("--report", action=argparse.BooleanOptionalAction, default=True, help="renew report.html and its plots (yes)")
+    add("--overwrite", action="store_true", help="replace results of these controllers from other settings")
+    add("--report", action=argparse.BooleanOptionalAction, default=True, help="update report.html and its plots (yes)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")

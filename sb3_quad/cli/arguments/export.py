@@ -1,15 +1,8 @@
-"""The flags of ``export``."""
+"""Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.pretrained_policies import agent_path
-
-HELP = "Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out."
-EXAMPLES = """The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
-world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It gives the command of each rotor.
-Scaling and clipping are inside. It is checked against the policy on 10,000 observations before it is written.
+The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
+world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It returns the command for each rotor.
+Scaling and clipping are built in. The file is checked against the policy on 10,000 observations before it is written.
 
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --format onnx
@@ -17,12 +10,16 @@ examples:
   sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
 
-ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header needs a C compiler, which checks it.
+ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header needs a C compiler to check it.
 """
 
+from __future__ import annotations
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags of ``export``."""
+from sb3_quad.cli.parser import Parser
+from sb3_quad.pretrained_policies import agent_path
+
+
+def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add(
         "model",
@@ -31,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy, or a name such as itm-recovery",
     )
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
-    add("-o", metavar="FILE", dest="file", help="where it goes (beside the zip, ending in .onnx, .pt or .h)")
+    add("-o", metavar="FILE", dest="file", help="file to write (beside the zip, ending in .onnx, .pt or .h)")
     add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
-    add("--vehicle", metavar="VEHICLE", help="name or .yaml file (that of the zip's run folder, or else itm)")
-    add("--name", metavar="NAME", help="the C function is called NAME_policy (the file's name, less its ending)")
-    add("--overwrite", action="store_true", help="replace FILE if it is there")
+    add("--vehicle", metavar="VEHICLE", help="name or YAML file (the one in the zip's run folder, else itm)")
+    add("--name", metavar="NAME", help="name the C function NAME_policy (the file's name without its ending)")
+    add("--overwrite", action="store_true", help="replace FILE if it exists")

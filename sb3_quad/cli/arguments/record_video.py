@@ -1,32 +1,29 @@
-"""The flags of ``record-video``."""
+"""Record a film of a trained agent, as enjoy --record does, with the flags and folders of rl-zoo's record_video.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.arguments.enjoy import add_flight_arguments
-from sb3_quad.cli.parser import whole
-from sb3_quad.pretrained_policies import agent_path
-
-HELP = "Record a trained agent as a film; as enjoy --record does, with the flags and folders of rl-zoo's record_video."
-EXAMPLES = """examples:
+examples:
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0                   the latest run, into its folder videos/
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best -n 500 -o films
   sb3-quad record-video --algo dagger --env QuadTargetTracking-v0 --load-checkpoint 500000 --n-envs 4 --seed 3
   sb3-quad record-video --env QuadStateRecovery-v0 -i path/to/agent.zip --stochastic --size 320x240
 
-Without --load-…, a run's agent is trimmed_model.zip, else best_model.zip, else <Env>.zip.
-Films need pip install 'sb3_quad[video]'. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
+Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
+Films need: pip install 'sb3_quad[video]'. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
 """
 
+from __future__ import annotations
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+from sb3_quad.cli.arguments.enjoy import add_flight_arguments
+from sb3_quad.cli.parser import Parser, positive
+from sb3_quad.pretrained_policies import agent_path
+
+
+def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``record_video.py``, with their meanings."""
     add = parser.add_argument
     add_flight_arguments(parser)
-    agent = "an agent of any SB3 algorithm, or a name such as itm-recovery, instead of one of the log folder"
+    agent = "an agent of any SB3 algorithm, or a name such as itm-recovery, instead of one from the log folder"
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=agent)
-    add("-n", "--n-timesteps", type=whole, default=1000, metavar="N", help="control steps, over as many episodes (1000)")
+    add("-n", "--n-timesteps", type=positive, default=1000, metavar="N", help="control steps, over as many episodes (1000)")
     add("-o", "--output-folder", metavar="DIR", help="where the film goes (videos, beside the agent's zip)")
-    parser.set_defaults(controllers=[], task=None, scenario=None, target=None, force=None, torque=None, at=None, lasting=None)
-    parser.set_defaults(sequence=None, times=None, no_render=False)
+    only_enjoy = ("task", "scenario", "target", "force", "torque", "start", "duration", "sequence", "times")
+    parser.set_defaults(**dict.fromkeys(only_enjoy), controllers=[], no_render=False)

@@ -1,22 +1,22 @@
-"""The flags of ``report``."""
+"""Make report.html from a results folder of evaluate: tables, plots, flights in 3-D; one file that needs no network.
+
+examples:
+  sb3-quad report evaluations/thesis
+  sb3-quad report evaluations/thesis --overwrite      again, after adding controllers
+  sb3-quad report evaluations/thesis --no-pictures    only the page, and its tables as report.md
+
+Needs: pip install 'sb3_quad[report]'.
+"""
 
 from __future__ import annotations
 
 import argparse
 
-HELP = "Make report.html from a folder that evaluate has filled: tables, plots, flights to turn; one file, needs no network."
-EXAMPLES = """examples:
-  sb3-quad report evaluations/thesis
-  sb3-quad report evaluations/thesis --overwrite      again, after more controllers have joined
-  sb3-quad report evaluations/thesis --no-pictures    the page and its tables as report.md alone
-
-Needs pip install 'sb3_quad[report]'.
-"""
+from sb3_quad.cli.parser import Parser
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The flags of ``report``."""
+def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("folder", metavar="FOLDER", help="what evaluate wrote")
+    add("folder", metavar="FOLDER", help="results folder of evaluate")
     add("--pictures", action=argparse.BooleanOptionalAction, default=True, help="also write each plot as PNG and SVG (yes)")
-    add("--overwrite", action="store_true", help="replace the report that is there")
+    add("--overwrite", action="store_true", help="replace an existing report")

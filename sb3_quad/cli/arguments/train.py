@@ -1,19 +1,11 @@
-"""The flags of ``train``."""
+"""Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning.
 
-from __future__ import annotations
-
-import argparse
-
-from sb3_quad.cli.parser import whole
-from sb3_quad.pretrained_policies import agent_path
-
-HELP = "Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning."
-EXAMPLES = """examples:
-  sb3-quad train                                          both stages, on the batched environment
+examples:
+  sb3-quad train                                          both stages, in the batched environment
   sb3-quad train --conf-file two_stage.yml                both stages from the PID expert, as in the thesis
-  sb3-quad train --reference                              and PPO alone on the same budget, in the same table
+  sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger                            stage one alone
-  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, one process each
+  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
@@ -22,11 +14,19 @@ EXAMPLES = """examples:
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
+
+from __future__ import annotations
+
+import argparse
+
+from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
+from sb3_quad.pretrained_policies import agent_path
+
 DEFAULT_PIPELINE = "geometric/two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
-def add_settings(parser: argparse.ArgumentParser) -> None:
+def add_settings(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py`` for what is trained, with their meanings."""
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc or ppo ({DEFAULT_ALGO})")
@@ -36,29 +36,29 @@ def add_settings(parser: argparse.ArgumentParser) -> None:
     add("--n-envs", type=whole, metavar="N", help="environments side by side")
     add("--vec-env", metavar="KIND", help="batch (compiled), dummy (PyBullet, one process) or subproc (one process each)")
     add("--expert", metavar="SPEC", help="pid, geometric, path/to/model.zip or package.module:factory")
-    add("-params", "--hyperparams", nargs="+", metavar="K:V", help="settings to change, such as n_steps:500")
-    add("--env-kwargs", nargs="+", metavar="K:V", help="keywords of the environment, such as noise:0")
-    add("--eval-env-kwargs", nargs="+", metavar="K:V", help="the same, for the evaluation's environments only")
+    add("-params", "--hyperparams", action=Pairs, nargs="+", metavar="K:V", help="settings to change, such as n_steps:500")
+    add("--env-kwargs", action=Pairs, nargs="+", metavar="K:V", help="environment keywords, such as noise:0")
+    add("--eval-env-kwargs", action=Pairs, nargs="+", metavar="K:V", help="the same, for evaluations only")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
-    start = "agent to start from: policy and critic of an SB3 on-policy zip, or a name such as itm-recovery"
+    start = "agent to start from (policy and critic): an SB3 on-policy zip, or a name such as itm-recovery"
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
-    add("--n-eval-envs", type=whole, metavar="N", help="environments to evaluate in (batch: one per episode; else 1)")
+    add("--n-eval-envs", type=whole, metavar="N", help="environments of an evaluation (batch: one per episode; else 1)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
     add("--device", help="cpu (default), cuda or auto")
-    add("--num-threads", type=whole, metavar="N", help="threads of PyTorch (its own choice)")
+    add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
     add = parser.add_argument
     add("--reference", action="store_true", help="with a pipeline: also train PPO alone on the same budget, for comparison")
-    add("--resume", metavar="RUN_FOLDER", help="go on with an interrupted run; all its settings are kept")
-    add("-f", "--log-folder", metavar="DIR", help="where run folders go (logs)")
+    add("--resume", metavar="RUN_FOLDER", help="continue an interrupted run with all its settings")
+    add("-f", "--log-folder", metavar="DIR", help="folder for the run folders (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a UUID to the run folder's name")
-    add("--seed", type=int, help="seed (0); negative: a random one, noted in args.yml")
+    add("--seed", type=seed, help="seed (0); negative: a random one, recorded in args.yml")
     add("--eval-freq", type=whole, metavar="N", help="timesteps between evaluations (250000); below 1: one at the end")
-    add("--eval-episodes", type=whole, metavar="N", help="episodes of an evaluation (48); 0: no evaluations")
+    add("--eval-episodes", type=whole, metavar="N", help="episodes per evaluation (48); 0: no evaluations")
     add("--save-freq", type=whole, metavar="N", help="timesteps between checkpoints (none)")
     add("--log-interval", type=whole, metavar="N", help="rollouts between two tables of --verbose 1 (1)")
     add("-tb", "--tensorboard-log", metavar="DIR", help="folder for TensorBoard")

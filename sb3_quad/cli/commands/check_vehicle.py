@@ -5,27 +5,24 @@ from __future__ import annotations
 import argparse
 import sys
 
-from sb3_quad.base.errors import CannotHover, ConfigError
+from sb3_quad.base.errors import CannotHover
+from sb3_quad.base.files import one_line
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.cli.compare import task_table
+from sb3_quad.cli.compare import print_tables
 from sb3_quad.cli.output import console
-from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.report.vehicle import authority_table, parameter_table, warnings
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.vehicles.authority import Authority
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 def run(options: argparse.Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
-    if options.episodes < 0 or not 0 <= options.seed < 2**31:
-        raise ConfigError(f"--episodes {options.episodes}, --seed {options.seed}: must be at least 0")
     try:
         vehicle = load_vehicle(options.vehicle)
     except CannotHover as error:
-        print(f"cannot hover: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"cannot hover: {one_line(error)}", file=sys.stderr)
         return 1
     able = Authority(vehicle)
     console().print(parameter_table(vehicle, able))
@@ -33,15 +30,10 @@ def run(options: argparse.Namespace) -> int:
     for warning in warnings(vehicle, able):
         print(f"unusual: {warning}")
     if options.episodes:
-        _fly(options.vehicle, vehicle, options.episodes, seed_for("expert", options.seed))
+        gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
+        controllers = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}
+        true_state = {"vehicle": vehicle, "noise": 0.0}
+        print_tables(controllers, true_state, options.episodes, seed_for("expert", options.seed))
+        if vehicle.geometric_gains is None:
+            print(f"to search for gains, which are mostly better: sb3-quad tune-expert --vehicle {options.vehicle}")
     return 0
-
-
-def _fly(source: str, vehicle: Vehicle, episodes: int, seed: int) -> None:
-    gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
-    controllers = {"PID": PIDExpert(vehicle), f"geometric, gains {gains}": GeometricExpert(vehicle)}
-    for task in ENVIRONMENTS.values():
-        settings = FlightSettings(task=task, vehicle=vehicle, noise=0.0)
-        console().print(task_table(controllers, settings, episodes, seed, "the same for both, true state"))
-    if vehicle.geometric_gains is None:
-        print(f"gains found for it, mostly better ones: sb3-quad tune-expert --vehicle {source}")

@@ -16,18 +16,19 @@ from rich.progress import track
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.arguments.enjoy import DEFAULT_ENV
-from sb3_quad.cli.parser import pairs
+from sb3_quad.cli.parser import given
 from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.controllers import build, parse_controllers
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.episodes import Setting, find_agent, fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.episodes import Setting, fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
 from sb3_quad.show.recording import Recording
 from sb3_quad.show.sequence import sequence
 from sb3_quad.simulation.checks import check_size
+from sb3_quad.training.runs import find_run
 
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
 
@@ -66,23 +67,37 @@ def chosen_agent(options: argparse.Namespace) -> tuple[str, Path, FlightSettings
     """The agent of record-video's ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
     :return: a label, its zip, and the settings that it was judged with.
-    :raises ConfigError: there is no such run or agent.
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
     """
     if options.trained_agent is not None:
         path = Path(options.trained_agent)
         return path.stem, path, FlightSettings()
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # says so if there is none of that name
-    return find_agent(options.folder, options.algo, known_environment(options), options.exp_id, options.which)
+    run = find_run(options.folder, options.algo, known_environment(options), options.exp_id)
+    if isinstance(options.which, int):
+        path = run.checkpoint(options.which)
+    elif options.which == "last checkpoint":
+        path = run.latest_checkpoint()
+    else:
+        path = run.best_model if options.which == "best" else run.result
+    if not path.is_file():
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
+    settings, _ = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
+    return f"{options.algo} {path.name}", path, FlightSettings.beside(path)[0]
 
 
 def _check(options: argparse.Namespace, window: bool) -> None:
     """What can be refused before anything is flown."""
     if not (options.controllers or options.algo or options.trained_agent):
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
-    if sum(given is not None for given in (options.env, options.task, options.scenario)) > 1:
+    if len(given(options, "env", "task", "scenario")) > 1:
         raise ConfigError("--env, --task and --scenario each say what is flown; give one")
-    if (options.at is not None or options.lasting is not None) and options.force is None and options.torque is None:
+    if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
     if options.speed <= 0:
         raise ConfigError(f"--speed {options.speed:g}: must be above 0")
@@ -104,18 +119,16 @@ def _check(options: argparse.Namespace, window: bool) -> None:
 def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
     """What is flown, and who flies, by label."""
     env_id = known_environment(options)
-    given = pairs(options.env_kwargs, "--env-kwargs")
     agent = chosen_agent(options) if options.algo or options.trained_agent else None
-    push = {"force": options.force, "torque": options.torque, "start": options.at, "duration": options.lasting}
-    push = {name: value for name, value in push.items() if value is not None}
+    push = given(options, "force", "torque", "start", "duration")
     if options.scenario is not None:
-        if given or options.target or push:
+        if options.env_kwargs or options.target or push:
             raise ConfigError("--scenario says all about a flight; leave --env-kwargs, --target, --force and --torque away")
         setting = scenario_setting(options.scenario)
     else:
         named = {"task": options.task} if options.task else {}
         kept = agent[2].given() if agent else {}
-        settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **given})
+        settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **options.env_kwargs})
         setting = fixed_setting(settings, options.target, push)
     controllers: dict[str, Any] = {}
     if agent:

@@ -22,8 +22,6 @@ from sb3_quad.training.runs import RunFolder, open_run
 
 def run(options: argparse.Namespace) -> int:
     """Slim, fly, write. Returns the exit code."""
-    if options.episodes < 1:
-        raise ConfigError(f"--episodes {options.episodes}: must be at least 1")
     if Path(options.name).name != options.name:
         raise ConfigError(f"--name {options.name}: a name without folders; they are for -o")
     zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))

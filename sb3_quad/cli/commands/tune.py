@@ -8,13 +8,13 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
-from sb3_quad.cli.commands.train import make_config, make_seed, prepare
+from sb3_quad.cli.commands.train import make_config, prepare
 from sb3_quad.cli.compare import agent_and_expert
-from sb3_quad.cli.output import console, print_line, progress_bar
-from sb3_quad.cli.parser import given, pairs
+from sb3_quad.cli.output import console, progress_bar
+from sb3_quad.cli.parser import given
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.config import build_config
@@ -35,19 +35,17 @@ SHOWN = 5  # trials in the table
 
 def run(options: argparse.Namespace) -> int:
     """Search, report, write. Returns the exit code."""
-    if options.n_trials < 0 or (options.max_total_trials is not None and options.max_total_trials < 1):
-        raise ConfigError("--n-trials must be at least 0, --max-total-trials at least 1")
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        print_line(f"study {search.name} in {search.storage}: {_count(search)}; results go to {search.job.log_folder}")
+        print(f"study {search.name} in {search.storage}: {_count(search)}; results go to {search.job.log_folder}")
         with progress_bar(options.progress) as show:
             done = count()
             show(next(done), options.n_trials, "trials")
 
             def after_each(trial: FrozenTrial) -> None:
                 write_results(search)
-                print_line(_line(search, trial))
+                print(_line(search, trial))
                 show(next(done), options.n_trials, "trials")
 
             try:
@@ -62,13 +60,12 @@ def _make_search(options: argparse.Namespace) -> Search:
     """The search that a command line describes; the folder of its results is new."""
     config = make_config(options)
     if options.eval_env_kwargs is not None:  # into the settings, so that the best ones have it too
-        evaluation = {**config.eval_env_kwargs, **pairs(options.eval_env_kwargs, "--eval-env-kwargs")}
+        evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
         config = build_config(config.algo, config.env_id, {**config.settings, "eval_env_kwargs": evaluation})
     space = load_space(config.algo, config.settings, options.search_space)
     episodes = EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes
-    arguments = given(options, "device", "trained_agent", "n_eval_envs")
-    arguments |= {"config": config, "seed": make_seed(options), "eval_episodes": episodes}
-    job = validate(TrainingJob, arguments, "command line")
+    arguments = given(options, "device", "trained_agent", "n_eval_envs", "seed")
+    job = validate(TrainingJob, {**arguments, "config": config, "eval_episodes": episodes}, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
     name = options.study_name or f"{config.algo}_{config.env_id}"
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
@@ -97,10 +94,10 @@ def _print_results(search: Search) -> None:
         write_plot(search)
         _print_best(search, search.best)
     written = [TRIALS] if search.best is None else [TRIALS, BEST, PLOT]
-    print_line(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
-    print_line(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
+    print(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
+    print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
     if search.best is not None:
-        print_line(f"to train: {train_command(search)}")
+        print(f"to train: {train_command(search)}")
 
 
 def _print_best(search: Search, best: FrozenTrial) -> None:
@@ -115,7 +112,7 @@ def _print_best(search: Search, best: FrozenTrial) -> None:
     if known.task is not None and path.is_dir():
         run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
         console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
-        print_line(f"agent: {run.model}")
+        print(f"agent: {run.model}")
 
 
 def _count(search: Search) -> str:

@@ -21,8 +21,6 @@ FRESH_EPISODES, FRESH_SETS = 960, 4
 
 def run(options: argparse.Namespace) -> int:
     """Search, measure on fresh episodes, write. Returns the exit code."""
-    if min(options.trials, options.starts, options.targets) < 1 or options.seed < 0:
-        raise ConfigError("--trials, --starts and --targets must be at least 1, --seed at least 0")
     vehicle, (text, _) = load_vehicle(options.vehicle), VEHICLES.text(options.vehicle)
     output = Path(options.output or f"{vehicle.name}_tuned.yaml")
     if output.suffix not in (".yaml", ".yml"):
