@@ -156,7 +156,6 @@ class PPOBC(PPO):
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
         if self._rollout_bc_coef != 0.0:
-            self._check_cloning()
             labeller, buffer = Controller.for_env(self.expert, env), cast(ExpertRolloutBuffer, rollout_buffer)
 
             def label() -> None:
