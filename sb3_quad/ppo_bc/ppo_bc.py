@@ -95,7 +95,6 @@ class PPOBC(PPO):
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
         self._n_rollouts_trained = 0
-        self._next_bc_coef: float | None = None  # set by set_bc_coef, holds from the next rollout on
         self._rollout_bc_coef = 0.0  # the weight in the update on the present rollout, which is labelled if there is one
 
         if _init_setup_model:
@@ -133,7 +132,7 @@ class PPOBC(PPO):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if bc_coef > 0.0:
             self._check_cloning()
-        self._next_bc_coef = float(bc_coef)  # not now: the rollout that is under way was labelled, or not, by the old one
+        self.bc_coef = FloatSchedule(bc_coef)  # a rollout under way keeps the weight by which it was labelled, or not
 
     def _will_clone(self) -> bool:
         """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell."""
@@ -150,8 +149,6 @@ class PPOBC(PPO):
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        if self._next_bc_coef is not None:
-            self.bc_coef, self._next_bc_coef = FloatSchedule(self._next_bc_coef), None
         # The update on this rollout comes at its end, and with the weight of that time: that weight decides about labels.
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
