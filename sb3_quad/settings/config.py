@@ -20,7 +20,7 @@ from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping, parse_number
-from sb3_quad.settings.values import check, convert, qualified_classes
+from sb3_quad.settings.values import as_list, check, convert, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import is_vehicle_file
 
@@ -35,10 +35,6 @@ def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
     return str(value)
 
 
-def _as_list(value: Any) -> Any:
-    return [] if value is None else value if isinstance(value, (list, tuple)) else [value]
-
-
 Whole: TypeAlias = Annotated[
     int, BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name))
 ]
@@ -47,7 +43,7 @@ Classes: TypeAlias = Annotated[
     list[tuple[str, dict[str, Any]]], BeforeValidator(lambda value, info: qualified_classes(value, info.field_name))
 ]
 VecEnvKind: TypeAlias = Annotated[str, BeforeValidator(lambda value, info: _one_of(VEC_ENVS, value, info))]
-Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(_as_list)]
+Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
 
 
 class TrainingConfig(Frozen):

@@ -15,7 +15,7 @@ from sb3_quad.settings.literals import ZooLoader, parse_mapping
 
 
 class FlightSettings(Frozen):
-    """What an agent is flown with: keywords of the quadcopter environments, ``env_kwargs`` in YAML."""
+    """What an agent is flown with: keywords of the quadcopter environments, ``env_kwargs`` in YAML; ``dict`` gives them."""
 
     task: Any = Field(default="target_tracking", description="name, Task, or mixture {name: weight}")
     task_kwargs: dict[str, Any] | None = Field(default=None, description="fields of the task to override")
@@ -24,10 +24,6 @@ class FlightSettings(Frozen):
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
     observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
     max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, description="control steps of an episode")
-
-    def keywords(self) -> dict[str, Any]:
-        """Keywords of an environment."""
-        return dict(self)
 
     def given(self) -> dict[str, Any]:
         """The keywords that are not left at their defaults."""
@@ -44,7 +40,7 @@ class FlightSettings(Frozen):
 
         :raises ConfigError: an unknown field, or a value that does not fit.
         """
-        return validate(FlightSettings, {**self.keywords(), **changes}, "env_kwargs")
+        return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
     @staticmethod
     def beside(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:

@@ -61,13 +61,18 @@ def takes_whole(parameter: inspect.Parameter) -> bool:
     return _takes(parameter.annotation, 2) and not _takes(parameter.annotation, 0.5)
 
 
+def as_list(value: Any) -> Any:
+    """A list or tuple as it is, None as an empty list, anything else as the only entry of one."""
+    return [] if value is None else value if isinstance(value, (list, tuple)) else [value]
+
+
 def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
     """``package.module.Class`` and keywords, of rl-zoo's three forms: a name, ``{name: keywords}``, or a list of both.
 
     :raises ConfigError: another form.
     """
     found = []
-    for entry in value if isinstance(value, list) else [] if value is None else [value]:
+    for entry in as_list(value):
         form = {entry: None} if isinstance(entry, str) else entry
         if not isinstance(form, dict) or len(form) != 1:
             raise ConfigError(f"{where}: {entry!r} must be package.module.Class, or {{package.module.Class: {{…}}}}")
