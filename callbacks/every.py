@@ -26,16 +26,14 @@ class EveryTimesteps(EventCallback):
         for name, value in {"every": every, **counts}.items():
             if value < 1:
                 raise ConfigError(f"{type(self).__name__}: {name} is {value}, must be at least 1")
-        self._every, self._next = every, every
+        self._every, self._passed = every, 0  # multiples that the training has passed
 
     def _on_training_start(self) -> None:
-        self._next = (self.num_timesteps // self._every + 1) * self._every
+        self._passed = self.num_timesteps // self._every
 
     def _on_step(self) -> bool:
-        if self.num_timesteps < self._next:
-            return True
-        self._next = (self.num_timesteps // self._every + 1) * self._every
-        return self._on_event()
+        before, self._passed = self._passed, self.num_timesteps // self._every
+        return self._passed == before or self._on_event()
 
 
 class Checkpoint(EveryTimesteps):

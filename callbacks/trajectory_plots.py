@@ -9,13 +9,12 @@ from matplotlib.figure import Figure as Picture
 from stable_baselines3.common.logger import Figure
 
 from sb3_quad.base.arrays import Arrays
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.flights import ACTIONS, OBSERVATIONS, fly_settings
+from sb3_quad.experts.controller import Controller
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 
 class TrajectoryPlots(EveryTimesteps):
@@ -56,9 +55,7 @@ class TrajectoryPlots(EveryTimesteps):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        shapes = self.model.observation_space.shape, self.model.action_space.shape
-        if shapes != ((OBSERVATION_SIZE,), (4,)):
-            raise ConfigError(f"TrajectoryPlots: observations and actions of shape {shapes}, must be those of the quadcopter")
+        Controller(self.model, ACTIONS, OBSERVATIONS, kind="TrajectoryPlots: policy")
 
     def _on_event(self) -> bool:
         recorder = Recorder(len(self._seeds))

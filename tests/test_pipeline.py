@@ -15,6 +15,8 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
+from sb3_quad.pretrained_policies import load_pretrained
+from sb3_quad.training import trim as trim_module
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trim import scale_position, shift_position, trim
 
@@ -98,17 +100,15 @@ def test_an_agent_that_crashes_cannot_be_trimmed():
 
 
 @pytest.mark.slow
-def test_trimming_cancels_the_offset_of_a_trained_agent():
-    from sb3_quad.dagger import DAgger
-    from sb3_quad.experts.pid import PIDExpert
-
-    env = QuadcopterVecEnv(120, seed=0)
-    model = DAgger("MlpPolicy", env, expert=PIDExpert(), n_steps=250, batch_size=2048, gradient_steps=60, n_epochs=1, seed=0)
-    model.learn(300_000)
+def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
+    for name, fewer in (("SCALES", (1.0, 0.85)), ("ROUNDS", 2), ("N_TARGETS", 60), ("N_RECOVERIES", 60)):
+        monkeypatch.setattr(trim_module, name, fewer)
+    monkeypatch.setattr("sb3_quad.evaluation.scaling.STEPS", 700)  # 7 s are enough to arrive
+    model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
     result = trim(model)
-    assert result.before > 0.4 and result.after < 0.05 and result.scale <= 1.0
+    assert result.before > 0.4 and result.after < 0.05 and result.scale in trim_module.SCALES
 
 
 def test_scaling_the_position_is_seen_by_the_actor_as_a_longer_way():

@@ -137,7 +137,7 @@ def test_two_processes_share_a_study(command):
 
 
 def test_pruned_trials_end_early_and_are_never_the_best(command, monkeypatch, capsys):
-    monkeypatch.setattr(search_module, "make_pruner", lambda *arguments: optuna.pruners.ThresholdPruner(lower=10.0))
+    monkeypatch.setitem(search_module.PRUNERS, "median", lambda *arguments: optuna.pruners.ThresholdPruner(lower=10.0))
     assert main([*command, "--n-trials", "2"]) == 0
     assert "pruned after 1 evaluations" in capsys.readouterr().out
     rows = trials()

@@ -30,30 +30,27 @@ class AggregatedDataset:
         # np.empty takes no memory before it is written to, so a large capacity costs what is in use.
         self._observations = th.from_numpy(np.empty((capacity, *observation_shape), dtype=dtype))
         self._actions = th.from_numpy(np.empty((capacity, action_dim), dtype=np.float32))
-        self._size = 0
-        self._oldest = 0
+        self._added = 0  # since it was empty
 
     def __len__(self) -> int:
-        return self._size
+        return min(self._added, self.capacity)
 
     def clear(self) -> None:
         """Forget every pair."""
-        self._size = self._oldest = 0
+        self._added = 0
 
     def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
         observations, actions = observations[-self.capacity :], actions[-self.capacity :]
-        rows = (self._oldest + self._size + np.arange(len(actions))) % self.capacity
+        rows = (self._added + np.arange(len(actions))) % self.capacity
         self._observations.numpy()[rows] = observations
         self._actions.numpy()[rows] = actions
-        overwritten = max(0, self._size + len(actions) - self.capacity)
-        self._size += len(actions) - overwritten
-        self._oldest = (self._oldest + overwritten) % self.capacity
+        self._added += len(actions)
 
     def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Observations (b, ...) and expert actions (b, action_dim) of rows (b,), counted from the oldest."""
-        if self._oldest:
-            rows = (rows + self._oldest) % self.capacity
+        if self._added > self.capacity:
+            rows = (rows + self._added) % self.capacity
         return self._observations.index_select(0, rows), self._actions.index_select(0, rows)
 
     def save(self, path: str | Path) -> None:
@@ -61,7 +58,7 @@ class AggregatedDataset:
 
         :raises ConfigError: a place that cannot be written to
         """
-        observations, actions = self.pairs(th.arange(self._size))
+        observations, actions = self.pairs(th.arange(len(self)))
         write_arrays(_npz(path), observations=observations.numpy(), actions=actions.numpy())
 
     def load(self, path: str | Path) -> None:

@@ -37,7 +37,7 @@ class BatchFleet:
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        self._batch = QuadcopterBatch(len(seeds), **{**settings.keywords(), **ENDLESS}, autoreset=False)
+        self._batch = QuadcopterBatch(len(seeds), **{**dict(settings), **ENDLESS}, autoreset=False)
         self._batch.seed(seeds)
         self.vehicle = self._batch.vehicle_list[0]
 
@@ -84,7 +84,7 @@ class PyBulletFleet:
                 f"n_episodes {len(seeds)}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts"
             )
         self._seeds = seeds
-        self._envs = [QuadcopterEnv(**{**settings.keywords(), **ENDLESS}) for _ in seeds]
+        self._envs = [QuadcopterEnv(**{**dict(settings), **ENDLESS}) for _ in seeds]
         self.vehicle = self._envs[0].vehicle
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:

@@ -76,7 +76,7 @@ def export_policy(
     algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), FlightSettings.beside(path)
     changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
-    row = QuadcopterBatch(1, **settings.keywords(), n_threads=1)  # it checks them
+    row = QuadcopterBatch(1, **dict(settings), n_threads=1)  # it checks them
     reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output)
     network = build_network(reference, f"model {path}")
     metadata = _describe(Path(path), algorithm, network, reference)

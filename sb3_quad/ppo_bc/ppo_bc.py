@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Callable, Generator, Mapping
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -12,21 +12,23 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import MaybeCallback, RolloutBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from torch.nn import functional as F
 
 from sb3_quad import common
+from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
-from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 BC_FILTERS = ("none", "negative_advantage", "agreement")
 AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
+Samples = tuple[RolloutBufferSamples, th.Tensor]  # SB3's, and the expert's actions, (batch_size, action_dim)
 
 
 class PPOBC(PPO):
@@ -93,10 +95,7 @@ class PPOBC(PPO):
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
         self._n_rollouts_trained = 0
-        self._next_bc_coef: float | None = None  # set by set_bc_coef, holds from the next rollout on
         self._rollout_bc_coef = 0.0  # the weight in the update on the present rollout, which is labelled if there is one
-        self._labeller: Controller | None = None
-        self._labels: Any = None
 
         if _init_setup_model:
             self._setup_model()
@@ -117,8 +116,7 @@ class PPOBC(PPO):
             self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["expert", "_labeller", "_labels", "rollout_buffer_class", "rollout_buffer_kwargs"]
-        return [*super()._excluded_save_params(), *own]
+        return [*super()._excluded_save_params(), "expert", "rollout_buffer_class", "rollout_buffer_kwargs"]
 
     def set_expert(self, expert: Any) -> None:
         """Clone ``expert`` from the next rollout on, as a model must that was loaded without one."""
@@ -134,7 +132,7 @@ class PPOBC(PPO):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if bc_coef > 0.0:
             self._check_cloning()
-        self._next_bc_coef = float(bc_coef)  # not now: the rollout that is under way was labelled, or not, by the old one
+        self.bc_coef = FloatSchedule(bc_coef)  # a rollout under way keeps the weight by which it was labelled, or not
 
     def _will_clone(self) -> bool:
         """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell."""
@@ -148,42 +146,21 @@ class PPOBC(PPO):
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        if self._will_clone():
-            self._check_cloning()
-        return super()._setup_learn(*args, **kwargs)
-
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
-        if self._next_bc_coef is not None:
-            self.bc_coef, self._next_bc_coef = FloatSchedule(self._next_bc_coef), None
         # The update on this rollout comes at its end, and with the weight of that time: that weight decides about labels.
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
         if self._rollout_bc_coef != 0.0:
-            self._check_cloning()
-            self._labeller = Controller.for_env(self.expert, env)
-            if self._labeller.needs_state:
+            labeller, buffer = Controller.for_env(self.expert, env), cast(ExpertRolloutBuffer, rollout_buffer)
+
+            def label() -> None:
                 observation: Any = self._last_obs
-                self._labels = self._labeller.labels(observation)  # the first step's state, before it
+                buffer.expert_actions[buffer.pos] = labeller.labels(observation)
+
+            env = _BeforeStep(env, label)
         return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        """Called by ``collect_rollouts`` after ``env.step`` and before ``rollout_buffer.add``: writes the step's labels.
-
-        They belong to the state before the step: an expert on observations is asked now, since ``_last_obs`` is still that
-        observation; an expert on the true state was asked before the step, and now for the step to come.
-        """
-        super()._update_info_buffer(infos, dones)
-        if self._rollout_bc_coef == 0.0:
-            return
-        assert self._labeller is not None and isinstance(self.rollout_buffer, ExpertRolloutBuffer)
-        observation: Any = self._last_obs
-        labels = self._labeller.labels(observation)
-        if self._labeller.needs_state:
-            labels, self._labels = self._labels, labels
-        self.rollout_buffer.expert_actions[self.rollout_buffer.pos] = labels
 
     def train(self) -> None:
         """One update on the rollout just flown: PPO's loop, with what is added to it marked by ``+``."""
@@ -326,9 +303,51 @@ class PPOBC(PPO):
         progress_bar: bool = False,
     ) -> Self:
         """As ``PPO.learn``; see the class for what it raises."""
+        if self._will_clone():
+            self._check_cloning()
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
         )
+
+
+class ExpertRolloutBuffer(RolloutBuffer):
+    """SB3's rollout buffer with a row of expert actions beside each row of actions; :meth:`get` yields both.
+
+    ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills; the algorithm writes row
+    ``pos`` before it calls :meth:`add` for the same step.
+    """
+
+    expert_actions: Float32Array
+
+    def reset(self) -> None:
+        self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32)
+        super().reset()
+
+    def get(self, batch_size: int | None = None) -> Generator[Samples, None, None]:  # type: ignore[override]
+        if not self.generator_ready:
+            self.expert_actions = self.swap_and_flatten(self.expert_actions)
+        yield from super().get(batch_size)  # type: ignore[misc]
+
+    def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> Samples:  # type: ignore[override]
+        return super()._get_samples(batch_inds, env), self.to_torch(self.expert_actions[batch_inds])
+
+
+class _BeforeStep(VecEnvWrapper):
+    """Calls a function before each step: where an expert can still see the state that the step leaves."""
+
+    def __init__(self, env: VecEnv, call: Callable[[], None]) -> None:
+        super().__init__(env)
+        self._call = call
+
+    def reset(self) -> VecEnvObs:
+        return self.venv.reset()
+
+    def step_async(self, actions: np.ndarray) -> None:
+        self._call()
+        self.venv.step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        return self.venv.step_wait()
 
 
 def _gradient_norms(terms: Mapping[str, th.Tensor], parameters: list[th.nn.Parameter]) -> dict[str, float]:

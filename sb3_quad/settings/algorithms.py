@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib
 import inspect
+import pkgutil
 import typing
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
@@ -29,8 +29,7 @@ def get_algorithm(name: str) -> type[OnPolicyAlgorithm]:
     """
     if name not in ALGORITHMS:
         raise ConfigError(unknown("algorithm", name, ALGORITHMS))
-    module, _, attribute = ALGORITHMS[name].partition(":")
-    return getattr(importlib.import_module(module), attribute)  # type: ignore[no-any-return]
+    return pkgutil.resolve_name(ALGORITHMS[name])  # type: ignore[no-any-return]
 
 
 def constructor_parameters(algorithm: type[OnPolicyAlgorithm]) -> dict[str, inspect.Parameter]:

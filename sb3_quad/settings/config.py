@@ -1,33 +1,17 @@
 """The settings of one training job, from rl-zoo's YAML: one file per algorithm, top keys environment ids.
 
-====================  ============================================================================================
-key                   meaning
-====================  ============================================================================================
-n_timesteps           timesteps to train on, over all environments
-n_envs                environments flown side by side (1)
-vec_env               batch (default for this package's environments), dummy (default for others) or subproc
-env_kwargs            keywords of the environment's constructor
-eval_env_kwargs       put over them in the evaluation's environments
-eval_tasks            further tasks to evaluate on, for the curves; the environment's own decides which model is best
-eval_expert           whether evaluations fly the expert too, once, for ``eval/reward_against_expert`` (false)
-policy                name of a policy, MlpPolicy by default
-policy_kwargs         mapping, or a string such as "dict(net_arch=[64, 64], activation_fn=nn.Tanh)"
-expert                pid, geometric, path/to/model.zip or package.module:factory, for algorithms that learn from one
-callback              callbacks as package.module.Class, one or a list; with keywords as {package.module.Class: {…}}
-env_wrapper           wrappers around each environment, likewise (dummy and subproc)
-vec_env_wrapper       wrappers around the vectorised environment, likewise
-anything else         a keyword of the algorithm's constructor; ``lin_1e-3`` falls linearly to 0 over the training
-====================  ============================================================================================
+:class:`TrainingConfig` lists the keys of a job; any other key is a keyword of the algorithm's constructor, where ``lin_1e-3``
+falls linearly to 0 over the training.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import gymnasium
-from pydantic import BeforeValidator, Field, StrictBool, ValidationInfo, field_validator, model_validator
+from pydantic import BeforeValidator, Field, PositiveInt, StrictBool, ValidationInfo, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import Frozen, validate
@@ -35,8 +19,8 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.settings.literals import parse_mapping
-from sb3_quad.settings.values import convert, positive_whole, qualified_classes
+from sb3_quad.settings.literals import parse_mapping, parse_number
+from sb3_quad.settings.values import as_list, check, convert, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -51,37 +35,40 @@ def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
     return str(value)
 
 
-def _as_list(value: Any) -> Any:
-    return [] if value is None else value if isinstance(value, (list, tuple)) else [value]
-
-
-Whole: TypeAlias = Annotated[int, BeforeValidator(lambda value, info: positive_whole(value, info.field_name))]
+Whole: TypeAlias = Annotated[
+    int, BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name))
+]
 Keywords: TypeAlias = Annotated[dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))]
 Classes: TypeAlias = Annotated[
     list[tuple[str, dict[str, Any]]], BeforeValidator(lambda value, info: qualified_classes(value, info.field_name))
 ]
+VecEnvKind: TypeAlias = Annotated[str, BeforeValidator(lambda value, info: _one_of(VEC_ENVS, value, info))]
+Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
 
 
 class TrainingConfig(Frozen):
-    """One job's settings, checked. ``settings`` holds them as given: plain values that YAML can hold."""
+    """One job's settings, checked. ``settings`` holds them as given: plain values that YAML can hold.
+
+    Classes are given as ``package.module.Class``, one or a list; with keywords as ``{package.module.Class: {…}}``.
+    """
 
     algo: str
     env_id: str
-    n_timesteps: Whole
-    n_envs: Whole = 1
-    vec_env: Annotated[str, BeforeValidator(lambda value, info: _one_of(VEC_ENVS, value, info))]
-    env_kwargs: Keywords = Field(default_factory=dict)
-    eval_env_kwargs: Keywords = Field(default_factory=dict)
-    eval_tasks: Annotated[tuple[str, ...], BeforeValidator(_as_list)] = ()
-    eval_expert: StrictBool = Field(default=False, description="true or false")
+    n_timesteps: Whole = Field(description="timesteps to train on, over all environments")
+    n_envs: Whole = Field(default=1, description="environments flown side by side")
+    vec_env: VecEnvKind = Field(description="batch by default for this package's environments, dummy for others")
+    env_kwargs: Keywords = Field(default={}, description="keywords of the environment's constructor")
+    eval_env_kwargs: Keywords = Field(default={}, description="put over env_kwargs in the evaluation's environments")
+    eval_tasks: Tasks = Field(default=(), description="further tasks to evaluate on; the own one decides which model is best")
+    eval_expert: StrictBool = Field(default=False, description="true or false: whether the expert is evaluated, too")
     policy: str = "MlpPolicy"
-    policy_kwargs: Keywords = Field(default_factory=dict)
-    expert: Any = None
-    callback: Classes = Field(default_factory=list)
-    env_wrapper: Classes = Field(default_factory=list)
-    vec_env_wrapper: Classes = Field(default_factory=list)
+    policy_kwargs: Keywords = Field(default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'")
+    expert: Any = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory, to learn from")
+    callback: Classes = Field(default=[], description="callbacks of the training")
+    env_wrapper: Classes = Field(default=[], description="wrappers around each environment, of dummy and subproc")
+    vec_env_wrapper: Classes = Field(default=[], description="wrappers around the vectorised environment")
     normalize: Any = None
-    hyperparams: dict[str, Any]
+    hyperparams: dict[str, Any] = Field(description="keywords of the algorithm's constructor, converted")
     settings: dict[str, Any] = Field(repr=False)
 
     @property
@@ -93,10 +80,6 @@ class TrainingConfig(Frozen):
     def flight_settings(self) -> FlightSettings:
         """How an agent of this job flies, of an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
-
-    def for_evaluation(self, changes: Mapping[str, Any] | None = None) -> TrainingConfig:
-        """The settings with the environments as evaluations have them, and ``changes`` to their keywords."""
-        return self.model_copy(update={"env_kwargs": {**self.env_kwargs, **self.eval_env_kwargs, **(changes or {})}})
 
     @field_validator("policy", mode="before")
     @classmethod

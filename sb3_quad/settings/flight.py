@@ -15,7 +15,7 @@ from sb3_quad.settings.literals import ZooLoader, parse_mapping
 
 
 class FlightSettings(Frozen):
-    """What an agent is flown with: keywords of the quadcopter environments, ``env_kwargs`` in YAML."""
+    """What an agent is flown with: keywords of the quadcopter environments, ``env_kwargs`` in YAML; ``dict`` gives them."""
 
     task: Any = Field(default="target_tracking", description="name, Task, or mixture {name: weight}")
     task_kwargs: dict[str, Any] | None = Field(default=None, description="fields of the task to override")
@@ -24,10 +24,6 @@ class FlightSettings(Frozen):
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
     observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
     max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, description="control steps of an episode")
-
-    def keywords(self) -> dict[str, Any]:
-        """Keywords of an environment."""
-        return dict(self)
 
     def given(self) -> dict[str, Any]:
         """The keywords that are not left at their defaults."""
@@ -44,16 +40,17 @@ class FlightSettings(Frozen):
 
         :raises ConfigError: an unknown field, or a value that does not fit.
         """
-        return validate(FlightSettings, {**self.keywords(), **changes}, "env_kwargs")
+        return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
     @staticmethod
     def beside(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
         """How the agent in a zip flies, from the run folder that it lies in, and the file that says so; None: there is none.
 
-        A zip itself holds no such settings.
+        A zip itself holds no such settings. ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the
+        agent was judged with; without it, that is in its ``config.yml``.
 
-        :raises ConfigError: several run folders' settings lie there, they cannot be read, or they hold statistics of
-            VecNormalize, which are no part of a zip.
+        :raises ConfigError: several run folders' settings lie there, they cannot be read or do not fit, or they hold
+            statistics of VecNormalize, which are no part of a zip.
         """
         folder = Path(zip_file).parent
         statistics = sorted(folder.glob("*/vecnormalize.pkl"))
@@ -64,24 +61,9 @@ class FlightSettings(Frozen):
             return FlightSettings(), None
         if len(files) > 1:
             raise ConfigError(f"{zip_file}: several config.yml files lie beside it ({', '.join(map(str, files))})")
-        return flight_settings(parse_mapping_file(files[0], ZooLoader), _arguments(files[0]), str(files[0])), files[0]
-
-
-def flight_settings(settings: dict[str, Any], arguments: dict[str, Any], where: str) -> FlightSettings:
-    """How a run flies, from its ``config.yml`` and ``args.yml``, also those of rl_zoo3.
-
-    ``env_kwargs`` in ``args.yml`` is what the agent was judged with; without it, that is in ``config.yml``.
-
-    :param where: what messages call them.
-    :raises ConfigError: values that do not fit.
-    """
-    given = parse_mapping(arguments.get("env_kwargs"), f"{where}: env_kwargs")
-    if arguments.get("env_kwargs") is None:
-        parts = [parse_mapping(settings.get(key), f"{where}: {key}") for key in ("env_kwargs", "eval_env_kwargs")]
-        given = {**parts[0], **parts[1]}
-    return validate(FlightSettings, given, f"{where}: env_kwargs")
-
-
-def _arguments(config: Path) -> dict[str, Any]:
-    file = config.with_name("args.yml")
-    return parse_mapping_file(file, ZooLoader) if file.is_file() else {}
+        settings, where = parse_mapping_file(files[0], ZooLoader), f"{files[0]}: env_kwargs"
+        file = files[0].with_name("args.yml")
+        judged = parse_mapping_file(file, ZooLoader).get("env_kwargs") if file.is_file() else None
+        parts = [judged] if judged is not None else [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
+        given = {name: value for part in parts for name, value in parse_mapping(part, where).items()}
+        return validate(FlightSettings, given, where), files[0]

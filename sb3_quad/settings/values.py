@@ -8,19 +8,34 @@ import pkgutil
 from contextlib import suppress
 from typing import Any
 
-from pydantic import ConfigDict, PositiveInt, PydanticUserError, TypeAdapter, ValidationError
+from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 
 
-def positive_whole(value: Any, where: str) -> int:
-    """``value`` as a whole number of at least 1; ``1e6`` will do.
+def check(kind: Any, value: Any, where: str) -> Any:
+    """``value`` as the type ``kind``, by pydantic.
 
-    :raises ConfigError: anything else.
+    :raises ConfigError: it is none; the message says what it must be.
     """
-    return int(_validate(PositiveInt, parse_number(value), where))
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(f"{where} is {value}, must be finite")
+    try:
+        adapter = TypeAdapter(kind, config=ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False))
+        return adapter.validate_python(value, strict=isinstance(value, bool))  # True is not 1
+    except PydanticUserError:  # a type that pydantic does not know how to check
+        return value
+    except ValidationError as error:
+        found = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}  # one for each type of a union
+    if isinstance(value, str) and "is" in found:
+        return value  # the name of a class, which rl_zoo3 imports
+    number = "a number or lin_<number>" if "callable" in found else "a number"
+    expected = {"greater": "at least 1", "float": number, "int": "a whole number"}
+    others = [message.removeprefix("Input should be ") for message in found.values()]
+    must_be = next((text for kind, text in expected.items() if kind in found), others[0])
+    raise ConfigError(f"{where} is {value!r}, must be {must_be}")
 
 
 def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
@@ -31,7 +46,7 @@ def convert(value: Any, parameter: inspect.Parameter, where: str) -> Any:
     :raises ConfigError: text where a number belongs, a fraction where a whole number does, another type; NaN or infinity.
     """
     if not isinstance(value, str) or not value.startswith("lin_"):
-        return _validate(parameter.annotation, parse_value(value) if isinstance(value, str) else value, where)
+        return check(parameter.annotation, parse_value(value) if isinstance(value, str) else value, where)
     start = parse_number(value.removeprefix("lin_"))
     if isinstance(start, str) or not math.isfinite(start):
         raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
@@ -46,13 +61,18 @@ def takes_whole(parameter: inspect.Parameter) -> bool:
     return _takes(parameter.annotation, 2) and not _takes(parameter.annotation, 0.5)
 
 
+def as_list(value: Any) -> Any:
+    """A list or tuple as it is, None as an empty list, anything else as the only entry of one."""
+    return [] if value is None else value if isinstance(value, (list, tuple)) else [value]
+
+
 def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]]:
     """``package.module.Class`` and keywords, of rl-zoo's three forms: a name, ``{name: keywords}``, or a list of both.
 
     :raises ConfigError: another form.
     """
     found = []
-    for entry in value if isinstance(value, list) else [] if value is None else [value]:
+    for entry in as_list(value):
         form = {entry: None} if isinstance(entry, str) else entry
         if not isinstance(form, dict) or len(form) != 1:
             raise ConfigError(f"{where}: {entry!r} must be package.module.Class, or {{package.module.Class: {{…}}}}")
@@ -73,26 +93,6 @@ def import_class(path: str, where: str) -> Any:
 
 def _takes(kind: Any, value: Any) -> bool:
     with suppress(ConfigError):
-        _validate(kind, value, "")
+        check(kind, value, "")
         return True
     return False
-
-
-def _validate(kind: Any, value: Any, where: str) -> Any:
-    """``value`` as the type ``kind``, by pydantic; :raises ConfigError: it is none, and what it must be."""
-    if isinstance(value, float) and not math.isfinite(value):
-        raise ConfigError(f"{where} is {value}, must be finite")
-    try:
-        adapter = TypeAdapter(kind, config=ConfigDict(arbitrary_types_allowed=True, allow_inf_nan=False))
-        return adapter.validate_python(value, strict=isinstance(value, bool))  # True is not 1
-    except PydanticUserError:  # a type that pydantic does not know how to check
-        return value
-    except ValidationError as error:
-        found = {item["type"].partition("_")[0]: item["msg"] for item in error.errors()}  # one for each type of a union
-    if isinstance(value, str) and "is" in found:
-        return value  # the name of a class, which rl_zoo3 imports
-    number = "a number or lin_<number>" if "callable" in found else "a number"
-    expected = {"greater": "at least 1", "float": number, "int": "a whole number"}
-    others = [message.removeprefix("Input should be ") for message in found.values()]
-    must_be = next((text for kind, text in expected.items() if kind in found), others[0])
-    raise ConfigError(f"{where} is {value!r}, must be {must_be}")

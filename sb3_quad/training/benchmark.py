@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import platform
 import re
 import time
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from timeit import Timer
 from typing import Any
 
 import gymnasium
@@ -61,21 +63,15 @@ def vectorised(kind: str, n_envs: int, seconds: float) -> Measurement:
 
 
 def _measure(name: str, n_envs: int, step: Callable[[Any], Any], shape: tuple[int, ...], seconds: float) -> Measurement:
-    actions = np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32)
-
-    def fly(steps: int) -> float:
-        start = time.perf_counter()
-        for number in range(steps):
-            step(actions[number % 16])
-        return time.perf_counter() - start
-
-    fly(3)  # compiles, fills caches
+    actions = itertools.cycle(np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32))
+    timer = Timer(lambda: step(next(actions)))
+    timer.timeit(3)  # compiles, fills caches
     steps, elapsed = 1, 0.0
     while elapsed < seconds / 20:  # how many steps a repetition takes
         steps *= 2
-        elapsed = fly(steps)
+        elapsed = timer.timeit(steps)
     steps = max(1, round(steps * seconds / REPETITIONS / elapsed))
-    rates = [steps * n_envs / fly(steps) for _ in range(REPETITIONS)]
+    rates = [steps * n_envs / repetition for repetition in timer.repeat(REPETITIONS, steps)]
     return Measurement(name, n_envs, float(np.median(rates)), rates)
 
 
@@ -122,8 +118,3 @@ def machine() -> dict[str, Any]:
         "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }
-
-
-def as_dict(measurements: list[Measurement]) -> dict[str, Any]:
-    """What ``--output`` writes."""
-    return {"machine": machine(), "results": [asdict(measurement) for measurement in measurements]}

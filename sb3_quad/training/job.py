@@ -31,19 +31,20 @@ class TrainingJob(Frozen):
     verbose: int = Field(default=0, description="as in SB3")
     unique: bool = Field(default=False, description="add a UUID to the run folder's name")
 
-    @property
-    def for_evaluation(self) -> TrainingConfig:
-        """The settings with the environments as evaluations have them."""
-        return self.config.for_evaluation(self.eval_env_kwargs)
+    def for_evaluation(self, **changes: Any) -> TrainingConfig:
+        """The settings with the environments as evaluations have them, and ``changes`` to their keywords."""
+        keywords = {**self.config.env_kwargs, **self.config.eval_env_kwargs, **(self.eval_env_kwargs or {}), **changes}
+        return self.config.model_copy(update={"env_kwargs": keywords})
 
     @property
     def flight_settings(self) -> FlightSettings:
         """How the agent is judged, in an environment of this package."""
-        return self.for_evaluation.flight_settings
+        return self.for_evaluation().flight_settings
 
     def arguments(self) -> dict[str, Any]:
-        """What args.yml holds: everything but the settings, which config.yml holds."""
-        return {"algo": self.config.algo, "env": self.config.env_id, **self.model_dump(exclude={"config"})}
+        """What args.yml holds: everything but the settings, which config.yml holds; and how evaluations fly."""
+        names = {"algo": self.config.algo, "env": self.config.env_id, "env_kwargs": self.for_evaluation().env_kwargs}
+        return {**names, **self.model_dump(exclude={"config"})}
 
 
 def describe(job: TrainingJob) -> str:

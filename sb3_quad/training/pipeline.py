@@ -38,6 +38,10 @@ from sb3_quad.training.trainer import resume, train
 from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
+TRIMS = {  # by the name that a stage gives: what trims, and what is reported of it
+    "position": (trim, "steady offset {0.before:.3f} m, now {0.after:.3f} m; position scale {0.scale:g}"),
+    "hover": (trim_hover, "action at the target {0.before:.4f} from hover, now {0.after:.4f}"),
+}
 
 
 class Requirement(Frozen):
@@ -221,13 +225,8 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[
     if stage.trim is None:
         return agent
     model = get_algorithm(job.config.algo).load(agent, device=job.device)
-    seed, settings = seed_for("trim", job.seed), job.flight_settings
-    if stage.trim == "hover":
-        did = trim_hover(model, seed, settings)
-        line = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
-    else:
-        did = trim(model, seed, settings)
-        line = f"steady offset {did.before:.3f} m, now {did.after:.3f} m; position scale {did.scale:g}"
+    trimmed, words = TRIMS[stage.trim]
+    did = trimmed(model, seed_for("trim", job.seed), job.flight_settings)
     save_model(model, run.trimmed_model)
-    report(f"trimmed: {line}: {run.trimmed_model}")
+    report(f"trimmed: {words.format(did)}: {run.trimmed_model}")
     return run.trimmed_model

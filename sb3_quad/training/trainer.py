@@ -1,4 +1,8 @@
-"""Running a training job: from its settings to a run folder with a model, whatever happens on the way."""
+"""Running a training job: from its settings to a run folder with a model, whatever happens on the way.
+
+The snapshot of an interrupted run lies between two rollouts. Where the environments can be restored (the batched one can), the
+resumed run is bit for bit the one that was not interrupted; elsewhere episodes start anew.
+"""
 
 from __future__ import annotations
 
@@ -14,14 +18,14 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import one_line, save_model, write_bytes
+from sb3_quad.base.files import one_line, read_arrays, save_model, write_arrays, write_bytes
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import LastGoodModel
+from sb3_quad.callbacks.interruption import ENVIRONMENT, LastGoodModel, Snapshot, set_random_state
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
@@ -29,7 +33,6 @@ from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.resume import load_snapshot, write_snapshot
 from sb3_quad.training.runs import RunFolder, claim_run, open_run
 
 Report = Callable[[str], None]
@@ -73,7 +76,7 @@ def train(
         if job.trained_agent is not None:
             transfer_policy(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
-        run.write_yaml(config.settings, {**job.arguments(), "env_kwargs": job.for_evaluation.env_kwargs})
+        run.write_yaml(config.settings, job.arguments())
         on_start(run)
         return _learn(job, run, model, eval_envs, signals, report, should_continue)
 
@@ -93,7 +96,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
-        model = load_snapshot(run, config.algo, env, job.device, **attributes)
+        model = _load_snapshot(run, config.algo, env, job.device, **attributes)
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         return _learn(job, run, model, eval_envs, signals, report)
 
@@ -111,7 +114,7 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
             for task in (None, *config.eval_tasks):
-                settings = config.for_evaluation({**(job.eval_env_kwargs or {}), **({} if task is None else {"task": task})})
+                settings = job.for_evaluation() if task is None else job.for_evaluation(task=task)
                 made = make_environments(settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed))
                 evaluating[task] = stack.enter_context(closing(made))
         yield env, evaluating
@@ -195,7 +198,7 @@ def _learn(
             only_interrupted.unlink(missing_ok=True)
         return TrainingResult(job, run, model, seconds)
     if last_good.snapshot is not None:
-        write_snapshot(run, last_good.snapshot, model)
+        _write_snapshot(run, last_good.snapshot, model)
         report(
             f"interrupted by {signals.name} after {last_good.snapshot.timesteps:,} timesteps: model saved to {run.model}; "
             f"to go on: --resume {run.path}"
@@ -219,3 +222,47 @@ def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, 
         raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate; {where}") from error
     if hasattr(error, "add_note"):  # Python 3.11 and later
         error.add_note(where)
+
+
+def _write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm) -> None:
+    """Write the snapshot's model, random numbers and environments, and the dataset if there is one.
+
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    if hasattr(model, "save_dataset"):
+        model.save_dataset(run.dataset)
+    state: dict[str, Any] = {"timesteps": snapshot.timesteps, **snapshot.state}
+    write_arrays(run.resume_state, **state)
+    write_bytes(run.model, snapshot.model)
+
+
+def _load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> OnPolicyAlgorithm:
+    """The model of an interrupted run, ready for ``learn(…, reset_num_timesteps=False)``.
+
+    :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
+    :raises ConfigError: a file that is missing or damaged.
+    """
+    if not run.resume_state.is_file():
+        raise ConfigError(f"run folder {run.path}: holds no interrupted run; to train its model further use -i {run.model}")
+    state = read_arrays(run.resume_state)
+    environment = {name.removeprefix(ENVIRONMENT): array for name, array in state.items() if name.startswith(ENVIRONMENT)}
+    try:
+        model = get_algorithm(algo).load(run.model, env=env, device=device, force_reset=not environment, **attributes)
+    except ConfigError:
+        raise
+    except Exception as error:  # what a damaged archive raises depends on where the damage is
+        raise ConfigError(f"{run.model}: not a complete SB3 zip ({one_line(error)})") from None
+    if model.num_timesteps != int(state["timesteps"]):
+        raise ConfigError(
+            f"run folder {run.path}: {run.model.name} is after {model.num_timesteps:,} timesteps, "
+            f"{run.resume_state.name} after {int(state['timesteps']):,}; they belong to different interruptions"
+        )
+    if hasattr(model, "load_dataset"):
+        model.load_dataset(run.dataset)
+    batch: Any = getattr(env.unwrapped, "batch", None)
+    if environment and batch is None:
+        raise ConfigError(f"{run.resume_state}: holds the state of batched environments; use the run's own settings")
+    if environment:
+        batch.restore(environment)
+    set_random_state(state)
+    return model

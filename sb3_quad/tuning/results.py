@@ -36,7 +36,20 @@ def write_results(search: Search) -> None:
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     folder, best = Path(search.job.log_folder), search.best
-    write_text(folder / TRIALS, trials_csv(search))
+    text = io.StringIO()
+    head = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds", *search.space.dimensions, RUN, ERROR]
+    writer = csv.DictWriter(text, head, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    for trial in search.trials():
+        own = {
+            "number": trial.number,
+            "state": trial.state.name,
+            "value": trial.value if trial.state.name == "COMPLETE" else None,
+            "evaluations": len(trial.intermediate_values),
+            "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 2),
+        }
+        writer.writerow({**trial.user_attrs, **varied(search, trial), **own})
+    write_text(folder / TRIALS, text.getvalue())
     if best is not None:
         head = [
             f"Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.name}.",
@@ -71,24 +84,6 @@ def train_command(search: Search) -> str:
     config, file = search.job.config, Path(search.job.log_folder, BEST)
     start = f" -i {search.job.trained_agent}" if search.job.trained_agent else ""
     return f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {file}{start}"
-
-
-def trials_csv(search: Search) -> str:
-    """All trials that ended, a line each."""
-    text = io.StringIO()
-    head = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds", *search.space.dimensions, RUN, ERROR]
-    writer = csv.DictWriter(text, head, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    for trial in search.trials():
-        own = {
-            "number": trial.number,
-            "state": trial.state.name,
-            "value": trial.value if trial.state.name == "COMPLETE" else None,
-            "evaluations": len(trial.intermediate_values),
-            "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 2),
-        }
-        writer.writerow({**trial.user_attrs, **varied(search, trial), **own})
-    return text.getvalue()
 
 
 @styled

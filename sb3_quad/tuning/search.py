@@ -17,7 +17,7 @@ from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace, current
-from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, load_optuna, make_pruner, open_study
+from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, load_optuna, open_study
 
 if TYPE_CHECKING:
     from optuna import Trial
@@ -65,7 +65,7 @@ class Search:
         self.sampler, self.n_startup_trials, self.n_evaluations = sampler, n_startup_trials, n_evaluations
         wanted = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
         self.study, known = open_study(name, storage, "maximize", (BEGUN_WITH, wanted), space.start())
-        self.study.pruner = make_pruner(pruner, n_startup_trials, n_evaluations)
+        self.study.pruner = PRUNERS[pruner](load_optuna().pruners, n_startup_trials, n_evaluations)
         where = f"study {name} in {storage}"
         if not isinstance(known, dict):
             raise ConfigError(f"{where}: is not of tune; give another --study-name")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -17,9 +17,18 @@ from sb3_quad.base.files import one_line
 if TYPE_CHECKING:
     from optuna import Study, Trial
     from optuna.pruners import BasePruner
+    from optuna.samplers import BaseSampler
 
-SAMPLERS = ("tpe", "random", "cmaes")
-PRUNERS = ("median", "halving", "none")
+SAMPLERS: Mapping[str, Callable[[Any, int, int], BaseSampler]] = {  # of optuna.samplers, a seed and n_startup_trials
+    "tpe": lambda samplers, seed, n: samplers.TPESampler(seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True),
+    "random": lambda samplers, seed, n: samplers.RandomSampler(seed=seed),
+    "cmaes": lambda samplers, seed, n: samplers.CmaEsSampler(seed=seed, n_startup_trials=n, warn_independent_sampling=False),
+}
+PRUNERS: Mapping[str, Callable[[Any, int, int], BasePruner]] = {  # of optuna.pruners, n_startup_trials, n_evaluations
+    "median": lambda pruners, n, evaluations: pruners.MedianPruner(n_startup_trials=n, n_warmup_steps=evaluations // 3),
+    "halving": lambda pruners, n, evaluations: pruners.SuccessiveHalvingPruner(min_resource=1),
+    "none": lambda pruners, n, evaluations: pruners.NopPruner(),
+}
 PATIENCE = 10.0  # s to wait for the process that begins a study to say what it began with
 
 
@@ -82,29 +91,9 @@ def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
     :param n_startup_trials: sampled at random first.
     """
     optuna = load_optuna()
-    samplers = optuna.samplers
-    study.sampler = samplers.RandomSampler()  # proposes nothing yet: the trial's number is to be known first
+    study.sampler = optuna.samplers.RandomSampler()  # proposes nothing yet: the trial's number is to be known first
     trial = study.ask()
     own = int(np.random.SeedSequence([seed, trial.number]).generate_state(1)[0])
-    study.sampler = {
-        "tpe": samplers.TPESampler(seed=own, n_startup_trials=n_startup_trials, multivariate=True, constant_liar=True),
-        "random": samplers.RandomSampler(seed=own),
-        "cmaes": samplers.CmaEsSampler(seed=own, n_startup_trials=n_startup_trials, warn_independent_sampling=False),
-    }[sampler]
+    study.sampler = SAMPLERS[sampler](optuna.samplers, own, n_startup_trials)
     sampled: Trial = optuna.trial.Trial(study, trial._trial_id)
     return sampled
-
-
-def make_pruner(name: str, n_startup_trials: int, n_evaluations: int) -> BasePruner:
-    """One of :data:`PRUNERS`, with rl-zoo's settings.
-
-    :param n_startup_trials: trials that ``median`` lets finish first.
-    :param n_evaluations: of a trial; ``median`` prunes none before a third of them.
-    """
-    pruners = load_optuna().pruners
-    chosen: BasePruner = {
-        "median": pruners.MedianPruner(n_startup_trials=n_startup_trials, n_warmup_steps=n_evaluations // 3),
-        "halving": pruners.SuccessiveHalvingPruner(min_resource=1, reduction_factor=4, min_early_stopping_rate=0),
-        "none": pruners.NopPruner(),
-    }[name]
-    return chosen

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.cli.output import console
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.settings.config import SETTINGS, load_config
-from sb3_quad.training.benchmark import ENV_ID, as_dict, single, training_loop, vectorised
+from sb3_quad.training.benchmark import ENV_ID, machine, single, training_loop, vectorised
 
 
 def run(options: argparse.Namespace) -> int:
@@ -35,6 +36,7 @@ def run(options: argparse.Namespace) -> int:
     rows = ((each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements)
     screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
     if options.output is not None:
-        write_text(options.output, json.dumps(as_dict(measurements), indent=2) + "\n")
+        content = {"machine": machine(), "results": [asdict(each) for each in measurements]}
+        write_text(options.output, json.dumps(content, indent=2) + "\n")
         print(f"written to {options.output}")
     return 0
