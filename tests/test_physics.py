@@ -117,6 +117,7 @@ def vehicles(draw):
     size = draw(st.floats(0.3, 3.0))
     spread = draw(st.tuples(st.floats(0.8, 1.2), st.floats(0.8, 1.2), st.floats(0.8, 1.2)))
     arm = 0.17 * size
+    least = draw(st.just(0.0) | st.floats(0.01, 0.8))  # a rotor's speed is a root, which magnifies the rounding of almost 0
     return Vehicle(
         name="random",
         mass=1.7 * size**3,
@@ -127,7 +128,7 @@ def vehicles(draw):
         thrust_coefficient=draw(st.floats(1e-7, 1e-4)),
         motor_gain=draw(st.floats(5.0, 60.0)),
         gravity=draw(st.floats(1.6, 12.0)),
-        thrust_limits=(draw(st.floats(0.0, 0.8)), draw(st.floats(1.2, 1.5))),
+        thrust_limits=(least, draw(st.floats(1.2, 1.5))),
         delay=draw(st.integers(0, 3)),
         collision_radius=0.1,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from stable_baselines3 import PPO
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.pretrained_policies import load_pretrained
@@ -103,7 +105,7 @@ def test_an_agent_that_crashes_cannot_be_trimmed():
 def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     for name, fewer in (("SCALES", (1.0, 0.85)), ("ROUNDS", 2), ("N_TARGETS", 60), ("N_RECOVERIES", 60)):
         monkeypatch.setattr(trim_module, name, fewer)
-    monkeypatch.setattr("sb3_quad.evaluation.scaling.STEPS", 700)  # 7 s are enough to arrive
+    monkeypatch.setattr("sb3_quad.evaluation.scaling.fly", partial(fly, max_steps=700))  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4

@@ -276,6 +276,8 @@ def test_spaces_that_are_none_are_refused(tmp_path, space, message):
 
 
 def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
+    for name in [name for name in sys.modules if name.startswith(("sb3_quad.tuning", "sb3_quad.cli.commands.tune"))]:
+        monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert main(command) == 2
     assert "pip install 'sb3_quad[tune]'" in one_line_of_error(capsys)

@@ -10,10 +10,12 @@ import json
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
+from optuna import Study, Trial
+from optuna.samplers import CmaEsSampler
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError
@@ -21,12 +23,9 @@ from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.tuning.study import load_optuna, open_study
+from sb3_quad.tuning.study import open_study
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
-
-if TYPE_CHECKING:
-    from optuna import Study, Trial
 
 NEAR = 0.1  # m
 CLOSE = 1.5  # m; the height above ground over which coming close to it loses its weight, by e
@@ -132,7 +131,7 @@ class ExpertSearch:
         if known != settings:
             other = "is of a search for another vehicle, or with other gains, sizes or seed"
             raise ConfigError(f"journal {journal}: {other}; give another one")
-        self.study.sampler = load_optuna().samplers.CmaEsSampler(seed=seed, popsize=16)
+        self.study.sampler = CmaEsSampler(seed=seed, popsize=16)
 
     @property
     def trials_done(self) -> int:

@@ -7,19 +7,17 @@ import io
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 from matplotlib.figure import Figure
+from optuna.trial import FrozenTrial
 
 from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.report.plots import picture, styled
 from sb3_quad.tuning.search import ERROR, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import Choice, Interval, current
-
-if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
 
 BEST, TRIALS, PLOT = "best.yml", "trials.csv", "trials.png"
 COLUMNS = 4  # panels of the plot side by side

@@ -8,7 +8,11 @@ import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from optuna import Trial
+from optuna.exceptions import OptunaError
+from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
@@ -17,11 +21,7 @@ from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace, current
-from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, load_optuna, open_study
-
-if TYPE_CHECKING:
-    from optuna import Trial
-    from optuna.trial import FrozenTrial
+from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, open_study
 
 BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
@@ -65,7 +65,7 @@ class Search:
         self.sampler, self.n_startup_trials, self.n_evaluations = sampler, n_startup_trials, n_evaluations
         wanted = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
         self.study, known = open_study(name, storage, "maximize", (BEGUN_WITH, wanted), space.start())
-        self.study.pruner = PRUNERS[pruner](load_optuna().pruners, n_startup_trials, n_evaluations)
+        self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
         where = f"study {name} in {storage}"
         if not isinstance(known, dict):
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
@@ -97,7 +97,7 @@ class Search:
                 failures += ended.state.name == "FAIL" and signals.received is None
                 if failures == number + 1 == HOPELESS:
                     raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {ended.user_attrs[ERROR]}")
-        except (OSError, load_optuna().exceptions.OptunaError) as error:
+        except (OSError, OptunaError) as error:
             raise ConfigError(f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})") from error
 
     def trials(self, *states: str) -> list[FrozenTrial]:
@@ -120,7 +120,7 @@ class Search:
         finally:
             if state == "FAIL":
                 trial.set_user_attr(ERROR, error)
-            self.study.tell(trial, value, state=load_optuna().trial.TrialState[state])
+            self.study.tell(trial, value, state=TrialState[state])
             if state == "FAIL" and error == INTERRUPTED and trial.params:
                 self.study.enqueue_trial(trial.params)
 

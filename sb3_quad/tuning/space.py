@@ -20,8 +20,9 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from optuna import Trial
 from pydantic import Field, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -30,9 +31,6 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
 from sb3_quad.settings.literals import parse_number, parse_value
 from sb3_quad.settings.values import takes_whole
-
-if TYPE_CHECKING:
-    from optuna import Trial
 
 SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
 MINIBATCHES = "n_minibatches"

@@ -3,45 +3,34 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+import optuna
+from optuna import Study, Trial
+from optuna.exceptions import DuplicatedStudyError
+from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
+from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.extras import require
 from sb3_quad.base.files import one_line
 
-if TYPE_CHECKING:
-    from optuna import Study, Trial
-    from optuna.pruners import BasePruner
-    from optuna.samplers import BaseSampler
-
-SAMPLERS: Mapping[str, Callable[[Any, int, int], BaseSampler]] = {  # of optuna.samplers, a seed and n_startup_trials
-    "tpe": lambda samplers, seed, n: samplers.TPESampler(seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True),
-    "random": lambda samplers, seed, n: samplers.RandomSampler(seed=seed),
-    "cmaes": lambda samplers, seed, n: samplers.CmaEsSampler(seed=seed, n_startup_trials=n, warn_independent_sampling=False),
+SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {  # from a seed and n_startup_trials
+    "tpe": lambda seed, n: TPESampler(seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True),
+    "random": lambda seed, n: RandomSampler(seed=seed),
+    "cmaes": lambda seed, n: CmaEsSampler(seed=seed, n_startup_trials=n, warn_independent_sampling=False),
 }
-PRUNERS: Mapping[str, Callable[[Any, int, int], BasePruner]] = {  # of optuna.pruners, n_startup_trials, n_evaluations
-    "median": lambda pruners, n, evaluations: pruners.MedianPruner(n_startup_trials=n, n_warmup_steps=evaluations // 3),
-    "halving": lambda pruners, n, evaluations: pruners.SuccessiveHalvingPruner(min_resource=1),
-    "none": lambda pruners, n, evaluations: pruners.NopPruner(),
+PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {  # from n_startup_trials and n_evaluations
+    "median": lambda n, evaluations: MedianPruner(n_startup_trials=n, n_warmup_steps=evaluations // 3),
+    "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
+    "none": lambda n, evaluations: NopPruner(),
 }
 PATIENCE = 10.0  # s to wait for the process that begins a study to say what it began with
-
-
-def load_optuna() -> Any:
-    """Optuna, without its log and without warnings that parts of it are experimental.
-
-    :raises ConfigError: Optuna or cmaes is missing; the message says what to install.
-    """
-    require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
-    optuna = require("optuna", "tune", "a search")
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    warnings.filterwarnings("ignore", category=optuna.exceptions.ExperimentalWarning)
-    return optuna
 
 
 def open_study(
@@ -56,17 +45,17 @@ def open_study(
     :param storage: a database's URL (with ``://``), or else the path of a journal file; None: nothing is remembered.
     :param begun_with: the settings of a new study, after the name of the user attribute that holds them.
     :param first: parameters of a new study's first trial.
-    :raises ConfigError: Optuna is missing; a storage that cannot be used, such as a file that is no journal.
+    :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is no journal.
     """
-    optuna = load_optuna()
+    require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
     opened: Any = None if storage is None else str(storage)
     try:
         if storage is not None and "://" not in str(storage):
             Path(storage).parent.mkdir(parents=True, exist_ok=True)
-            opened = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend(opened))
+            opened = JournalStorage(JournalFileBackend(str(opened)))
         try:
             study, new = optuna.create_study(study_name=name, storage=opened, direction=direction), True
-        except optuna.exceptions.DuplicatedStudyError:
+        except DuplicatedStudyError:
             study, new = optuna.load_study(study_name=name, storage=opened), False
     except Exception as error:  # databases and damaged journals raise what they like
         reason = f"{type(error).__name__}: {one_line(error)}"
@@ -90,10 +79,8 @@ def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
     :param sampler: one of :data:`SAMPLERS`.
     :param n_startup_trials: sampled at random first.
     """
-    optuna = load_optuna()
-    study.sampler = optuna.samplers.RandomSampler()  # proposes nothing yet: the trial's number is to be known first
+    study.sampler = RandomSampler()  # proposes nothing yet: the trial's number is to be known first
     trial = study.ask()
     own = int(np.random.SeedSequence([seed, trial.number]).generate_state(1)[0])
-    study.sampler = SAMPLERS[sampler](optuna.samplers, own, n_startup_trials)
-    sampled: Trial = optuna.trial.Trial(study, trial._trial_id)
-    return sampled
+    study.sampler = SAMPLERS[sampler](own, n_startup_trials)
+    return Trial(study, trial._trial_id)

@@ -6,7 +6,8 @@ import argparse
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+from optuna.trial import FrozenTrial
 
 from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.signals import StopSignals
@@ -23,9 +24,6 @@ from sb3_quad.training.runs import claim_folder, file_name, open_run
 from sb3_quad.tuning.results import BEST, PLOT, TRIALS, in_words, settings_of, train_command, varied, write_plot, write_results
 from sb3_quad.tuning.search import ERROR, REWARD, RUN, SUCCESS, Search
 from sb3_quad.tuning.space import load_space
-
-if TYPE_CHECKING:
-    from optuna.trial import FrozenTrial
 
 JOURNAL = "study.log"
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
