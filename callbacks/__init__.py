@@ -1,10 +1,8 @@
 """Callbacks for any Stable-Baselines3 algorithm; docs/callbacks.md lists them."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
-from sb3_quad.base.lazy import lazy_names
+from sb3_quad.base.imports import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.callbacks.best_model import BestModel as BestModel

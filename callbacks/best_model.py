@@ -1,7 +1,5 @@
 """Evaluation along the way, and the best model kept: by success first, then by mean reward."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A coefficient of the algorithm that follows how well the training goes."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The training's episodes: each in a file, and how the latest flights ended in the log."""
 
-from __future__ import annotations
-
 import time
 from collections import deque
 from pathlib import Path

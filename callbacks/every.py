@@ -1,7 +1,5 @@
 """Callbacks that do something every so many timesteps: their base class, and the simplest one."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

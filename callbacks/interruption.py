@@ -1,7 +1,5 @@
 """Trainings that end before their time: neither a signal nor a diverging loss costs the model."""
 
-from __future__ import annotations
-
 import random
 from dataclasses import dataclass
 from pathlib import Path

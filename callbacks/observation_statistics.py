@@ -1,7 +1,5 @@
 """Mean and deviation of what is observed while training: the σ by which observations are scaled (thesis 3.3.1)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

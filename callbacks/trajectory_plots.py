@@ -1,7 +1,5 @@
 """Flights of the policy as it is, as plots in TensorBoard."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

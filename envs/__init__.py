@@ -1,10 +1,8 @@
 """Gymnasium and Stable-Baselines3 environments of the quadcopter."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
-from sb3_quad.base.lazy import lazy_names
+from sb3_quad.base.imports import lazy_names
 
 if TYPE_CHECKING:
     from sb3_quad.envs.gym_vector import QuadcopterVectorEnv

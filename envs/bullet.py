@@ -1,7 +1,5 @@
 """PyBullet's part of ``QuadcopterEnv``: the rigid body, and pictures of its flight."""
 
-from __future__ import annotations
-
 import sys
 import time
 import weakref

@@ -1,7 +1,5 @@
 """``QuadcopterVectorEnv``: n quadcopters as one Gymnasium vector environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 

@@ -1,7 +1,5 @@
 """What all environments can be asked and told in flight."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -17,11 +15,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[Concatenate[InFlight, P], T]:
+def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[Concatenate["InFlight", P], T]:
     """The method of an environment that is this one of its batch."""
 
     @functools.wraps(method)
-    def call(self: InFlight, /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def call(self: "InFlight", /, *args: P.args, **kwargs: P.kwargs) -> T:
         return method(self.batch, *args, **kwargs)
 
     return call

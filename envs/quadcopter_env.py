@@ -1,7 +1,5 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

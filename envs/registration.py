@@ -1,7 +1,5 @@
 """Registers the environments with Gymnasium, by module paths, so that nothing heavy is imported before it is used."""
 
-from __future__ import annotations
-
 import gymnasium
 
 MAX_EPISODE_STEPS = 1500  # 15 s of control steps of 0.01 s (4.2.3)

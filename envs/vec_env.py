@@ -1,7 +1,5 @@
 """``QuadcopterVecEnv``: n quadcopters as one Stable-Baselines3 vectorised environment."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any

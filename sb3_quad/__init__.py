@@ -1,7 +1,5 @@
 """Quadcopter environments, experts, DAgger and PPO with behavioural cloning for Stable-Baselines3."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +9,7 @@ _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
     __path__.append(str(_checkout))
 
-from sb3_quad.base.lazy import lazy_names  # noqa: E402
+from sb3_quad.base.imports import lazy_names  # noqa: E402
 from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:

@@ -4,8 +4,6 @@ Every function takes and gives tensors; ``b`` is the mini-batch, ``a`` the actio
 a training step does not need, and agree with the policy's own methods to rounding.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, Literal
 

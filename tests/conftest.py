@@ -1,7 +1,5 @@
 """What every test starts from: the CPU, one thread of torch, fixed seeds, no display."""
 
-from __future__ import annotations
-
 import os
 import random
 

@@ -1,7 +1,5 @@
 """Every public callback shows how it is used, and the example does what it says."""
 
-from __future__ import annotations
-
 import doctest
 import importlib
 import re

@@ -1,7 +1,5 @@
 """Callbacks: with any algorithm and environment, each does its one thing."""
 
-from __future__ import annotations
-
 import random
 import signal
 

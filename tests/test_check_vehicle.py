@@ -1,7 +1,5 @@
 """Authority from the parameters alone, checked by trying it; and the command that tells of it."""
 
-from __future__ import annotations
-
 import re
 
 import numpy as np

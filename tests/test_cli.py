@@ -1,7 +1,5 @@
 """The command line: one line and code 2 on bad input, nothing lost on interruption, a run that resumes as if nothing was."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

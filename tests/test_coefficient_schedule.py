@@ -1,7 +1,5 @@
 """CoefficientSchedule: where the coefficient is, for any course of what it follows, and what it leaves in the model."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Expert labels: whom the labeller asks, with what, and which answers it accepts."""
 
-from __future__ import annotations
-
 import pickle
 
 import gymnasium as gym

@@ -1,7 +1,5 @@
 """DAgger: who flies, what is labelled, what is learnt, and what survives an interruption."""
 
-from __future__ import annotations
-
 import gymnasium as gym
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The aggregated dataset: a ring that forgets the oldest, and its file."""
 
-from __future__ import annotations
-
 import os
 
 import numpy as np

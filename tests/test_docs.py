@@ -1,7 +1,5 @@
 """The Python of the README and of docs/ runs as it stands there."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -1,8 +1,6 @@
 """What version 0.1 has left on a disk still opens: an interrupted run goes on to the same agent, a zip flies the same,
 results are read, and nothing in them is flown again."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

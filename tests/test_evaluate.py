@@ -1,7 +1,5 @@
 """``evaluate``: every controller on the same episodes, nothing flown twice or lost, failures in one line."""
 
-from __future__ import annotations
-
 import csv
 import functools
 import json

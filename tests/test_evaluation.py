@@ -1,7 +1,5 @@
 """Flights: what is measured is the true flight of the episodes that were asked for, in either environment."""
 
-from __future__ import annotations
-
 import io
 import itertools
 

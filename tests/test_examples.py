@@ -1,7 +1,5 @@
 """The scripts in examples/, run as a newcomer would run them, but for a short while."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 from pathlib import Path

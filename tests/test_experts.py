@@ -1,7 +1,5 @@
 """The experts fly as the specification measured (section 8), and answer SB3's ``predict`` as they answer the true state."""
 
-from __future__ import annotations
-
 import sys
 import types
 

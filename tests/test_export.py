@@ -1,7 +1,5 @@
 """Exported policies compute what the trained ones do, in physical units, and fly without this package."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

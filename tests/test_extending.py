@@ -1,7 +1,5 @@
 """The diffs of docs/extending.md, applied to a copy of the source tree: they are what they say, and fly as PyBullet does."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """FlightMetrics: the metrics that evaluation measures, of the training's own flights."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

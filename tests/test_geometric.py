@@ -1,7 +1,5 @@
 """The geometric expert: its symmetries, its equilibrium, and that it keeps to what the 18 features hold."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The Gymnasium vector environment: the same flights, with Gymnasium's autoreset."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Every command's help shows examples, and these are command lines that the command takes."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Trimming at the hover: the agent gives hover thrust at its target with every heading, and flies elsewhere as before."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch as th

@@ -1,7 +1,5 @@
 """What `make` does to environments, with a Python in them that only notes what it is asked for."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """ObservationStatistics: NumPy's mean and deviation of all observations, in physical units, whatever the sets."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Training, flying and evaluating a vehicle that is not the default one: by name, or by the file of a user's own."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

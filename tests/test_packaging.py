@@ -1,7 +1,5 @@
 """The package as others get it: built, installed in an environment of its own, used from anywhere."""
 
-from __future__ import annotations
-
 import ast
 import configparser
 import json

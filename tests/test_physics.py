@@ -1,7 +1,5 @@
 """The compiled control step against PyBullet, and its independence of batch size and position."""
 
-from __future__ import annotations
-
 import numpy as np
 import pybullet
 import pytest

@@ -1,7 +1,5 @@
 """Pipelines: stages hand their agents on, interruptions go on where they were, and trimming cancels an offset."""
 
-from __future__ import annotations
-
 import os
 import signal
 from functools import partial

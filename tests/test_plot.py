@@ -1,7 +1,5 @@
 """Learning curves: what a run's evaluations hold is what is drawn, and bad input is one line."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

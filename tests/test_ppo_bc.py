@@ -1,7 +1,5 @@
 """PPO with behavioural cloning: what it adds moves the right parameters, and switched off it is PPO."""
 
-from __future__ import annotations
-
 import csv
 import inspect
 

@@ -1,7 +1,5 @@
 """Policies that come with the package, and the command that makes them."""
 
-from __future__ import annotations
-
 import base64
 import io
 import json

@@ -1,7 +1,5 @@
 """The PyBullet environment: Gymnasium's and SB3's contracts, its physics against written-out equations, bad input."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import warnings

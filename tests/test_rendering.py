@@ -1,7 +1,5 @@
 """Pictures: without a display, of the asked size, showing what is there, and without touching the flight."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gymnasium

@@ -1,7 +1,5 @@
 """The report: the metrics of the results, every plot as page, PNG and SVG, and a page that a browser shows without help."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

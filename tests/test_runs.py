@@ -1,7 +1,5 @@
 """Run folders: no two runs share one, files are whole or absent, and a run can be read again."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor

@@ -3,8 +3,6 @@
 https://stable-baselines3.readthedocs.io, pages Getting Started, Examples, Callbacks, Vectorized Environments, PPO.
 """
 
-from __future__ import annotations
-
 import importlib
 import warnings
 

@@ -1,7 +1,5 @@
 """Flights of scenarios: the same in either environment, and physics where it can be said beforehand."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

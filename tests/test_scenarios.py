@@ -1,7 +1,5 @@
 """Scenarios: what a file says is what is flown, impossible ones are refused in one line, the shipped suites hold together."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """No training sees an episode that judges it, or that judges any other."""
 
-from __future__ import annotations
-
 import typing
 
 from hypothesis import example, given

@@ -1,7 +1,5 @@
 """Flights to look at: recordings are the flights, cameras see what they must, files are whole and never lost."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import shutil

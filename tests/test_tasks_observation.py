@@ -1,7 +1,5 @@
 """Tasks, observations and random numbers: what the compiled array functions must be, worked out again in numpy."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Settings: what rl-zoo's YAML may hold arrives as the algorithm's arguments; everything else is one clear error."""
 
-from __future__ import annotations
-
 import inspect
 from typing import Any, Literal
 
@@ -195,7 +193,7 @@ def test_the_types_of_every_algorithm_are_resolved(algorithm):
 class Foreign:
     """A constructor whose annotations are strings, one of them of a name that is not there."""
 
-    def __init__(self, steps: int, rate: float | Missing, plain=1):  # noqa: F821
+    def __init__(self, steps: int, rate: "float | Missing", plain=1):  # noqa: F821
         pass
 
 

@@ -1,7 +1,5 @@
 """TrajectoryPlots: at its steps, of the policy as it is, and without a trace in the training."""
 
-from __future__ import annotations
-
 import gymnasium
 import numpy as np
 import pytest

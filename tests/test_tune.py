@@ -1,7 +1,5 @@
 """The search for hyperparameters: trials that are trainings, in a study that is shared, resumed and never lost."""
 
-from __future__ import annotations
-
 import csv
 import os
 import signal

@@ -1,7 +1,5 @@
 """The search for gains: it finds better ones, goes on where it was left, and loses no file."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

@@ -1,7 +1,5 @@
 """Validation: data becomes a frozen model, or one line says which key is wrong, how, and what it means."""
 
-from __future__ import annotations
-
 from typing import Literal
 
 import pytest

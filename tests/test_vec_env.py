@@ -1,7 +1,5 @@
 """QuadcopterVecEnv: the same flights as QuadcopterEnv, rows apart from each other, and Stable-Baselines3's interface."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Vehicles: derived values, thrust and actions, and files that are wrong in every way."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

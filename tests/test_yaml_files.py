@@ -1,7 +1,5 @@
 """YAML files by name or path: which of the two a text is, and one line for whatever is wrong."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

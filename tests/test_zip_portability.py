@@ -1,7 +1,5 @@
 """The saved zips fly in stock Stable-Baselines3, where sb3_quad is not installed."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -3,8 +3,6 @@
 rl_zoo3 patches Gymnasium where it is imported, so everything of it runs in processes of its own; skipped where it is missing.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """Run folders of rl_zoo3 in ours: their YAML, and agents of algorithms that we do not train. Needs no rl_zoo3."""
 
-from __future__ import annotations
-
 from collections import OrderedDict
 
 import pytest

@@ -1,7 +1,5 @@
 """PyBullet, imported without the line about its build that it prints: ``from sb3_quad.base.bullet import p``."""
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 Each message is one line that names the thing and the way out; the command line prints it and leaves with code 2.
 """
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Iterable
 
@@ -17,7 +15,7 @@ class ConfigError(SB3QuadError, ValueError):
     """A file, key or value that does not fit: says which one, what is wrong and what is allowed."""
 
 
-class MissingExtra(ConfigError):
+class MissingExtra(ConfigError, ImportError):
     """A package that is not installed: says what needs it, and which extra brings it."""
 
 

@@ -1,7 +1,5 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
-from __future__ import annotations
-
 import io
 import os
 from pathlib import Path

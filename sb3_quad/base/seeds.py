@@ -4,8 +4,6 @@ A seed names an environment's stream of random numbers. Each purpose has ``ROOM`
 run takes the i-th after it.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from sb3_quad.base.errors import ConfigError

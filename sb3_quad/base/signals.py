@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM as a request to stop, answered where the training can be left cleanly."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from types import FrameType, TracebackType
@@ -31,7 +29,7 @@ class StopSignals:
         """The signal's name, empty if none came."""
         return signal.Signals(self.received).name if self.received else ""
 
-    def __enter__(self) -> StopSignals:
+    def __enter__(self) -> "StopSignals":
         if threading.current_thread() is threading.main_thread():
             self._previous = {number: signal.signal(number, self._note) for number in SIGNALS}
         return self

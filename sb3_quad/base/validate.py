@@ -1,7 +1,5 @@
 """Validated data: one base class for records and settings, and errors of one line."""
 
-from __future__ import annotations
-
 import typing
 from collections.abc import Callable, Mapping
 from typing import Any, ClassVar, TypeVar

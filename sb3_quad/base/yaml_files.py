@@ -1,7 +1,5 @@
 """YAML files by name, where they come with the package, or by path."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath

@@ -1,7 +1,5 @@
 """Subcommands, errors and exit codes."""
 
-from __future__ import annotations
-
 import importlib
 import io
 import pkgutil

@@ -1,7 +1,5 @@
 """Controllers on the same fresh episodes of a task, in a table."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

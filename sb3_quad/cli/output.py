@@ -1,7 +1,5 @@
 """Where lines, tables and progress are shown."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Argument parsing with one-line errors, and the kinds of arguments rl-zoo has."""
 
-from __future__ import annotations
-
 import argparse
 import random
 from typing import Any, NoReturn

@@ -1,10 +1,8 @@
 """DAgger, data aggregation, as a Stable-Baselines3 algorithm (thesis 3.1.2, 4.2.1, Algorithm 3)."""
 
-from __future__ import annotations
-
 import secrets
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,15 +18,13 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
+from typing_extensions import Self
 
 from sb3_quad import common
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 

@@ -1,7 +1,5 @@
 """The aggregated dataset: visited observations with the expert's action for each."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Cameras, and where to put them so that everything is in the picture. The world frame has z up; lengths are in m."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

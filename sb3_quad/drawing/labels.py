@@ -1,7 +1,5 @@
 """Words in pictures, in the font that comes with matplotlib, and the colours that tell controllers apart."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The shapes that vehicles, targets and arrows are drawn with, as PyBullet bodies without mass that touch nothing; m."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -3,8 +3,6 @@
 Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its top.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 

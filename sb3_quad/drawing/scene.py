@@ -1,7 +1,5 @@
 """Scenes, and pictures of them: vehicles in poses, their targets and arrows, in a PyBullet client."""
 
-from __future__ import annotations
-
 import math
 import weakref
 from collections.abc import Sequence

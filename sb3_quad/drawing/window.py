@@ -1,7 +1,5 @@
 """PyBullet's window."""
 
-from __future__ import annotations
-
 import math
 import os
 import sys

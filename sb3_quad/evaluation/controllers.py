@@ -1,7 +1,5 @@
 """The controllers of an evaluation: what a command line names, who they are, and how they are asked."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import inspect

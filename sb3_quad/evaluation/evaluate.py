@@ -1,7 +1,5 @@
 """A suite for any number of controllers: what is not in the folder yet is flown, the rest is kept."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

@@ -1,7 +1,5 @@
 """What an expert that sees the true state reaches: the metrics beside its gains, and its recoveries by how they begin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

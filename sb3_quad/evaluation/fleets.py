@@ -1,7 +1,5 @@
 """The same n episodes in either environment, side by side in one process, for :mod:`sb3_quad.evaluation.flights`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 

@@ -29,8 +29,6 @@ episode_waypoints     (n, W)             s until each waypoint was reached; NaN:
 Trajectory i is that of episode i: all episodes of a scenario that is the same each time, the first few of others.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ Conventions, found by the expert's figures in the thesis (4.3.1): the time to a 
 step after which |r - r_T| is within it; the path is that of the whole episode, 15 s, not of the way until arrival.
 """
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Mapping, Sequence
 from contextlib import closing
@@ -55,7 +53,7 @@ class Flights:
         return int(self.success.size)
 
     @staticmethod
-    def concatenate(parts: Sequence[Flights]) -> Flights:
+    def concatenate(parts: Sequence["Flights"]) -> "Flights":
         """Several parts as one, in order."""
         names = [entry.name for entry in dataclasses.fields(Flights) if entry.name != "time_to"]
         columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}

@@ -1,7 +1,5 @@
 """The folder of an evaluation's results, as ``records.py`` lays it out; every file appears whole or not at all."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

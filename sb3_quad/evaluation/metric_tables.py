@@ -1,7 +1,5 @@
 """Tables of metrics: a column for each controller, and others' metrics beside them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby

@@ -10,8 +10,6 @@ A folder of results holds
 A number that does not exist is None, never NaN.
 """
 
-from __future__ import annotations
-
 from typing import Literal
 
 from pydantic import Field

@@ -4,8 +4,6 @@ An agent hovers beside its target, by the same vector wherever the target is. Mo
 vector cancels it; multiplying those of σ by α, below 1 near the target, lets the last metre seem longer than it is.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

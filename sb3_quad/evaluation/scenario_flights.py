@@ -1,7 +1,5 @@
 """Flying the episodes of a scenario, and finding how large a hit a controller survives there."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

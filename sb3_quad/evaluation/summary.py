@@ -1,7 +1,5 @@
 """Many flights in a few metrics, with 95 % intervals: Wilson's for shares, the bootstrap for means."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """One table for terminals (``rich``), Markdown and the page of a report: metrics with their intervals, or words."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal

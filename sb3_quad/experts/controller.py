@@ -1,7 +1,5 @@
 """One way to ask a controller, whatever it is: an expert, an SB3 model, a function."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -71,7 +69,7 @@ class Controller:
             )
 
     @staticmethod
-    def for_env(expert: Any, env: VecEnv) -> Controller:
+    def for_env(expert: Any, env: VecEnv) -> "Controller":
         """An expert that labels the states of a vector environment; with ``VecNormalize`` it sees normalised observations.
 
         :raises ExpertError: an expert that is none of the three, or whose spaces do not fit the environment.

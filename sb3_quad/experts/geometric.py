@@ -1,7 +1,5 @@
 """A geometric controller for large angles: it recovers from nearly every attitude, spin and fall, and flies to targets."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,16 +1,13 @@
 """Loading a saved SB3 model without being told which algorithm made it."""
 
-from __future__ import annotations
-
 import json
 import zipfile
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import stable_baselines3
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.base_class import BaseAlgorithm
 
 # The module of the saved policy class tells the algorithm's family.
 _ACTOR_CRITIC = "stable_baselines3.common.policies"
@@ -52,8 +49,6 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an unknown family.
     """
-    import stable_baselines3
-
     file = Path(path)
     algorithm = saved_algorithm(file)
     stock = "PPO" if algorithm in _OURS.values() else algorithm

@@ -1,7 +1,5 @@
 """The nested PID controller of the thesis (2.1.2, 3.2.1, Table A.1), for a batch of vehicles at once."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

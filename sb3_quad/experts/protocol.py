@@ -1,7 +1,5 @@
 """What an expert is, and how it answers both with the true state and behind SB3's ``predict``."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Experts by name, as YAML and the command line give them."""
 
-from __future__ import annotations
-
 import pkgutil
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A policy as a C header: C99, float32, nothing but ``tanhf`` and ``sqrtf`` of math.h, no memory but the stack."""
 
-from __future__ import annotations
-
 import re
 import textwrap
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """An exported file, run as its users run it, against the policy it came from: the largest difference, the time of a call."""
 
-from __future__ import annotations
-
 import ctypes
 import io
 import itertools
@@ -20,7 +18,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError, ExportError
-from sb3_quad.base.extras import require
+from sb3_quad.base.imports import require
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle

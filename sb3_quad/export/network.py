@@ -1,7 +1,5 @@
 """What a policy computes, as one torch module, and what torch traces of it: TorchScript and ONNX."""
 
-from __future__ import annotations
-
 import copy
 import io
 import itertools
@@ -15,7 +13,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.extras import require
+from sb3_quad.base.imports import require
 from sb3_quad.evaluation.flights import ACTIONS, OBSERVATIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import OBSERVATION_SIZE

@@ -1,24 +1,24 @@
-"""``export_policy``: a trained zip as a file of one of the formats, checked against the policy and timed."""
-
-from __future__ import annotations
+"""A trained zip for others: as a file that flies by itself, checked and timed, or as a small zip of stock PPO."""
 
 import hashlib
+import io
 import re
 import warnings
 from collections.abc import Callable, Iterable
 from functools import partial
 from itertools import groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy.typing as npt
+from stable_baselines3 import PPO
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.export import check
 from sb3_quad.export.c_header import c_name, write_header
-from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
+from sb3_quad.export.network import Network, build_network, check_policy, write_onnx, write_torchscript
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -121,3 +121,27 @@ def _describe(path: Path, algorithm: str, network: Network, reference: check.Ref
 def _compact(values: Iterable[float]) -> str:
     """Equal numbers in a row once, with how many they are: ``5.7735 (3 times), 1.73205 (9 times)``."""
     return ", ".join(f"{word} ({len(list(group))} times)" for word, group in groupby(f"{value:.6g}" for value in values))
+
+
+def slim_bytes(path: str | Path) -> bytes:
+    """The zip of a stock PPO model with the policy of an on-policy agent's zip, to hand on; SB3 2.4 and later read it.
+
+    Gone are the optimizer's moments, the last observations and the episodes' statistics; the settings are PPO's own, as plain
+    numbers, since SB3's classes of schedules differ from version to version. The weights are the same.
+
+    :raises ConfigError: a file that cannot be read, or whose policy is not ``MlpPolicy`` of an on-policy algorithm.
+    """
+    source: Any = load_model(path)
+    check_policy(source.policy, f"model {path}")
+    if source.use_sde:
+        raise ConfigError(f"model {path}: was trained with gSDE (use_sde), which is not handed on")
+    kwargs = {key: value for key, value in source.policy_kwargs.items() if key in ("net_arch", "activation_fn")}
+    model: Any = PPO("MlpPolicy", None, policy_kwargs=kwargs, device="cpu", _init_setup_model=False)  # type: ignore[arg-type]
+    model.observation_space, model.action_space, model.n_envs = source.observation_space, source.action_space, 1
+    model._setup_model()
+    model.policy.load_state_dict(source.policy.state_dict())
+    model.num_timesteps = source.num_timesteps
+    model.clip_range = 0.2  # plain numbers, of which loading makes the schedules of its own version
+    buffer = io.BytesIO()
+    model.save(buffer, exclude=["lr_schedule", "clip_range_vf", "start_time"])
+    return buffer.getvalue()

@@ -1,10 +1,8 @@
 """PPO with a weighted behavioural-cloning loss towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable, Generator, Mapping
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -17,14 +15,12 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper, VecNormalize
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 from torch.nn import functional as F
+from typing_extensions import Self
 
 from sb3_quad import common
 from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 BC_FILTERS = ("none", "negative_advantage", "agreement")
 AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2

@@ -4,8 +4,6 @@ The card says what it flies, how it was trained (command, seed, commit) and what
 ``sb3-quad publish`` writes both.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -37,7 +35,7 @@ def pretrained(name: str) -> Path:
     return path
 
 
-def load_pretrained(name: str, **kwargs: Any) -> PPO:
+def load_pretrained(name: str, **kwargs: Any) -> "PPO":
     """A policy that comes with the package, as a stock PPO model.
 
     It reads the 18 features of :class:`~sb3_quad.envs.QuadcopterEnv`, scaled as there, and gives 4 actions in [-1, 1].

@@ -1,7 +1,5 @@
 """The card of a trained policy: what was measured, how it was made, how it is loaded; in Markdown, as model hubs show it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Learning curves from run folders: success and reward over timesteps and over wall-clock time (Figs. 4.3 and 4.4)."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,15 +1,13 @@
 """``report.html``: one file that needs nothing else; its tables as ``report.md`` and the plots as pictures beside it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.extras import require
 from sb3_quad.base.files import refuse_existing, write_bytes, write_text
+from sb3_quad.base.imports import require
 from sb3_quad.drawing.labels import colours_of
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.records import Results

@@ -1,7 +1,5 @@
 """Flights in space: a picture by matplotlib, and the same for Plotly, to be turned in the page."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple

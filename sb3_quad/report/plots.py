@@ -1,7 +1,5 @@
 """The plots of a report, drawn by matplotlib: bars, lines and heat maps of a scenario's results."""
 
-from __future__ import annotations
-
 import io
 import itertools
 import re

@@ -1,7 +1,5 @@
 """A report's content in order: an overview, then a section for each scenario, or for the cells that ``vary`` makes of one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

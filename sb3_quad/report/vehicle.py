@@ -1,7 +1,5 @@
 """A vehicle on one page: what its parameters say it can do, and what is odd about them."""
 
-from __future__ import annotations
-
 import math
 
 from sb3_quad.evaluation.tables import Table, text_table

@@ -3,8 +3,6 @@
 With ``vary``, one scenario is written down and a grid of them is flown, for heat maps and sweeps.
 """
 
-from __future__ import annotations
-
 import copy
 import itertools
 import math

@@ -1,7 +1,5 @@
 """What a scenario is made of: start, target, wrenches, the vehicle's changes. Units SI, angles in degrees where said."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -27,7 +25,7 @@ class OneOf(Frozen):
         return {cls.ways[0]: data} if isinstance(data, (list, tuple)) else data
 
     @model_validator(mode="after")
-    def _exactly_one(self) -> OneOf:
+    def _exactly_one(self) -> "OneOf":
         given = [name for name in self.ways if getattr(self, name) is not None]
         if len(given) != 1:
             but = f", not {' and '.join(given)}" if given else ""
@@ -96,9 +94,7 @@ class Start(Frozen):
     position: Vector = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
     attitude: Attitude = Field(default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}")
     velocity: VectorDistribution = Field(default=ZERO, description="world frame, m/s: [x, y, z], {std: …} or {magnitude: …}")
-    body_rates: VectorDistribution = Field(
-        default=ZERO, description="body frame, rad/s: [x, y, z], {std: …} or {magnitude: …}"
-    )
+    body_rates: VectorDistribution = Field(default=ZERO, description="body frame, rad/s: given as velocity is")
 
     @field_validator("velocity", "body_rates")
     @classmethod
@@ -121,12 +117,10 @@ class Target(OneOf):
     waypoints: tuple[Vector, ...] | None = Field(
         default=None, min_length=1, description="targets one after the other, world frame, m"
     )
-    radius: PositiveFloat | None = Field(
-        default=None, description="the next waypoint is the target once |r - r_T| is within this, m (0.5)"
-    )
+    radius: PositiveFloat | None = Field(default=None, description="a waypoint counts as reached within this, m (0.5)")
 
     @model_validator(mode="after")
-    def _radius_with_waypoints(self) -> Target:
+    def _radius_with_waypoints(self) -> "Target":
         if self.radius is not None and self.waypoints is None:
             raise ValueError("radius goes with waypoints; the tolerances of a single target are the scenario's tolerances")
         return self
@@ -151,15 +145,11 @@ class Wrench(Frozen):
 class VehicleChanges(Frozen):
     """How the vehicle that flies differs from the one its controller was made for; motors and limits stay what they are."""
 
-    mass: Factor = Field(
-        default=1.0, description="is a factor: 1.3 is 30 % more than the vehicle's own; thrust limits in N stay"
-    )
+    mass: Factor = Field(default=1.0, description="is a factor: 1.3 is 30 % more; thrust limits in N stay")
     inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         default=1.0, description="factor of Ixx, Iyy and Izz, or one for each"
     )
-    motor_gain: Factor = Field(
-        default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more than the vehicle's own"
-    )
+    motor_gain: Factor = Field(default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more")
     delay: Annotated[int, Field(ge=0, le=100)] | None = Field(
         default=None, description="control steps from a command to its effect; left out: the vehicle's own"
     )

@@ -1,7 +1,5 @@
 """What happens in the episodes of a scenario, sampled from their seeds; the same for every controller and backend."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

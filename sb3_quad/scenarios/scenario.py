@@ -1,7 +1,5 @@
 """A scenario: one way to judge a controller, flown many times; and a suite of them."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence
@@ -80,7 +78,7 @@ class Scenario(Frozen):
         return tuple(sorted(set(value)))
 
     @model_validator(mode="after")
-    def _possible(self) -> Scenario:
+    def _possible(self) -> "Scenario":
         vehicle = self.flown_vehicle()
         self._check_way(vehicle)
         step = vehicle.control_step
@@ -191,7 +189,7 @@ class Suite(Frozen):
 
     def with_changes(
         self, names: Sequence[str] = (), episodes: int | None = None, seed: int | None = None, vehicle: str | None = None
-    ) -> Suite:
+    ) -> "Suite":
         """A suite with some of these scenarios, other numbers of episodes or seeds, or another vehicle.
 
         :param names: of scenarios, or of those whose cells ``vary`` makes; none: all.
@@ -219,7 +217,7 @@ class Suite(Frozen):
         return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")
-    def _unique(self) -> Suite:
+    def _unique(self) -> "Suite":
         names = [scenario.name for scenario in self.scenarios]
         for name in names:
             if names.count(name) > 1:

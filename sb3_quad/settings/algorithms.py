@@ -1,17 +1,14 @@
 """The algorithms that can be trained, imported when first needed."""
 
-from __future__ import annotations
-
 import inspect
 import pkgutil
 import typing
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from sb3_quad.base.errors import ConfigError, unknown
-
-if TYPE_CHECKING:
-    from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 ALGORITHMS = {
     "dagger": "sb3_quad.dagger.dagger:DAgger",

@@ -4,8 +4,6 @@
 falls linearly to 0 over the training.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, TypeAlias
@@ -109,7 +107,7 @@ class TrainingConfig(Frozen):
         return value
 
     @model_validator(mode="after")
-    def _consistent(self) -> TrainingConfig:
+    def _consistent(self) -> "TrainingConfig":
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
         if not takes_expert(get_algorithm(self.algo)):

@@ -1,7 +1,5 @@
 """How a run flies: the one record of it, written by training, read by all that flies its agent."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +33,7 @@ class FlightSettings(Frozen):
             name: value for name, value in self.given().items() if name not in ("task", "task_kwargs", "max_episode_steps")
         }
 
-    def with_changes(self, **changes: Any) -> FlightSettings:
+    def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed.
 
         :raises ConfigError: an unknown field, or a value that does not fit.
@@ -43,7 +41,7 @@ class FlightSettings(Frozen):
         return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
     @staticmethod
-    def beside(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
+    def beside(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:
         """How the agent in a zip flies, from the run folder that it lies in, and the file that says so; None: there is none.
 
         A zip itself holds no such settings. ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the

@@ -1,7 +1,5 @@
 """Values from YAML and the command line: literals and a few named classes, never evaluated as code."""
 
-from __future__ import annotations
-
 import ast
 import pkgutil
 import re

@@ -1,7 +1,5 @@
 """One value of the settings at a time: checked against the type it is for, and converted."""
 
-from __future__ import annotations
-
 import inspect
 import math
 import pkgutil

@@ -1,7 +1,5 @@
 """Recorded flights in motion: a film with a panel for each, or PyBullet's window with all vehicles together, in real time."""
 
-from __future__ import annotations
-
 import math
 import tempfile
 import time
@@ -16,14 +14,14 @@ from matplotlib.colors import to_rgb
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.extras import require
 from sb3_quad.base.files import write_bytes
+from sb3_quad.base.imports import require
 from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
 from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
 from sb3_quad.drawing.window import disconnect, open_window, point_window, start_drawing
-from sb3_quad.show.recording import Recording
+from sb3_quad.show.episodes import Recording
 
 FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s

@@ -1,7 +1,5 @@
 """The motion sequence of a flight in one picture: several poses with their times (cf. the thesis's Fig. A.1)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import closing
 from typing import NamedTuple
@@ -14,7 +12,7 @@ from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_ta
 from sb3_quad.drawing.models import span
 from sb3_quad.drawing.picture import Overlay
 from sb3_quad.drawing.scene import Scene
-from sb3_quad.show.recording import Recording
+from sb3_quad.show.episodes import Recording
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least

@@ -1,7 +1,5 @@
 """n quadcopters as arrays: what all environments are made of."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias, TypedDict
 

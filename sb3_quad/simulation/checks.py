@@ -3,8 +3,6 @@
 :raises ConfigError: by every function.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How episodes begin."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Row numbers that follow from names, so that none is counted by hand."""
 
-from __future__ import annotations
-
 from collections import namedtuple
 from collections.abc import Mapping
 from itertools import accumulate

@@ -3,8 +3,6 @@
 :data:`FEATURES` names them and :func:`features` computes them: a new one is a line in the table and its formula.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

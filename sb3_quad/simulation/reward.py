@@ -1,7 +1,5 @@
 """What a control step is worth (Eqs. 4.5-4.9). The coefficients are fields of :class:`~sb3_quad.simulation.tasks.Task`."""
 
-from __future__ import annotations
-
 import math
 
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled

@@ -1,7 +1,5 @@
 """Rotation matrices and quaternions (w, x, y, z; body to world)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray

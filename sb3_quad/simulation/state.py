@@ -8,8 +8,6 @@ A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N)
 three rows each, all at the centre of mass.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -87,12 +85,12 @@ class QuadcopterState:
         error = self.array[POSITION] - self.array[TARGET]
         return np.asarray(np.sqrt(np.einsum("in,in->n", error, error)))
 
-    def copy(self) -> QuadcopterState:
+    def copy(self) -> "QuadcopterState":
         """A state of its own memory, unaffected by later flight."""
         return QuadcopterState(self.array.copy())
 
     @staticmethod
-    def concatenate(states: Sequence[QuadcopterState]) -> QuadcopterState:
+    def concatenate(states: Sequence["QuadcopterState"]) -> "QuadcopterState":
         """Several states as one batch, in order."""
         return QuadcopterState(np.concatenate([state.array for state in states], axis=1))
 

@@ -3,8 +3,6 @@
 A task is data. :mod:`.episodes` begins episodes by it, :mod:`.reward` scores their control steps.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypeAlias
 
@@ -50,7 +48,7 @@ class Task(Frozen):
         return value
 
     @model_validator(mode="after")
-    def _nearest_first(self) -> Task:
+    def _nearest_first(self) -> "Task":
         if self.nearest_target is not None and self.nearest_target > self.target_distance:
             raise ValueError(f"nearest_target {self.nearest_target} exceeds target_distance {self.target_distance}")
         return self

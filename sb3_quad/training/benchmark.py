@@ -1,7 +1,5 @@
 """Control steps per second of every way to fly, and of a whole training loop, measured in one process after another."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import platform

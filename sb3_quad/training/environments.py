@@ -1,7 +1,5 @@
 """The vectorised environment of a job: batched, one process, or one process each; the same learning problem in all."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Starting from a trained agent: its policy and critic, in a new algorithm with a fresh optimiser."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import torch as th

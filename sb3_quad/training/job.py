@@ -1,7 +1,5 @@
 """What one training run is asked to do, beyond its settings."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, Field, PositiveInt

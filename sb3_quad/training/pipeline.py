@@ -13,8 +13,6 @@ A pipeline's file names its stages in order; :class:`Stage` lists the keys::
         require: {success_rate: 0.9}
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 import uuid

@@ -4,8 +4,6 @@ The snapshot of an interrupted run lies between two rollouts. Where the environm
 resumed run is bit for bit the one that was not interrupted; elsewhere episodes start anew.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager

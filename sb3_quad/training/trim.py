@@ -16,8 +16,6 @@ with h the input of that layer and a 1, h̄(ψ) its mean over the observation no
 action there less that of hover, and s the states of flights: a change is cheap where the agent never is.
 """
 
-from __future__ import annotations
-
 from copy import deepcopy
 from typing import Any, NamedTuple
 

@@ -2,7 +2,7 @@
 
 import warnings
 
-from sb3_quad.base.extras import require
+from sb3_quad.base.imports import require
 
 optuna = require("optuna", "tune", "a search")
 optuna.logging.set_verbosity(optuna.logging.WARNING)

@@ -3,8 +3,6 @@
 Gains are judged by recoveries first, then the way to a target, then the reward.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re
@@ -92,7 +90,7 @@ class ExpertObjective:
         value = LOST * lost + TOO_LOW * low + settling - TRACKING_REWARD * rewards[0] - RECOVERY_REWARD * rewards[1]
         return Cost(float(value), float(lost), low, settling, *rewards)
 
-    def _fly(self, expert: GeometricExpert, task: str, seeds: Sequence[int], steps: int) -> tuple[Flights, _Way]:
+    def _fly(self, expert: GeometricExpert, task: str, seeds: Sequence[int], steps: int) -> tuple[Flights, "_Way"]:
         """The first episode of each seed, on the true state."""
         settings, way = FlightSettings(task=task, vehicle=self.vehicle, noise=0.0, max_episode_steps=steps), _Way()
         return fly_settings(expert, settings, seeds, hooks=[way]), way

@@ -1,7 +1,5 @@
 """What a search leaves: the best settings as YAML, all trials as CSV and as a plot."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

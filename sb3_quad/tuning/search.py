@@ -1,7 +1,5 @@
 """The search for hyperparameters: trials, each a training of its own, in a study that may be shared and resumed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

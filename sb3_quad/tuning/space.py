@@ -13,8 +13,6 @@ Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapp
 whole numbers are known to fit get whole numbers; ``whole: true`` beside ``low`` asks for them elsewhere.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Mapping
@@ -61,7 +59,7 @@ class Interval(Frozen):
     schedule: bool = False
 
     @model_validator(mode="after")
-    def _check(self) -> Interval:
+    def _check(self) -> "Interval":
         if self.low >= self.high:
             raise ValueError(f"low {self.low:g} must be below high {self.high:g}")
         if self.log and self.low <= 0:

@@ -1,7 +1,5 @@
 """Optuna's studies: where they are remembered, what proposes their trials, what cuts them short."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,8 +15,8 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.extras import require
 from sb3_quad.base.files import one_line
+from sb3_quad.base.imports import require
 
 SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {  # from a seed and n_startup_trials
     "tpe": lambda seed, n: TPESampler(seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True),

@@ -1,7 +1,5 @@
 """What a vehicle can do, from its parameters alone: how hard its rotors lift and turn it, and how soon they answer."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The gains of the geometric expert as a vehicle's YAML holds them, and how well the expert flies with them."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import numpy as np
@@ -34,9 +32,7 @@ class GeometricGains(Frozen):
     height_position: PositiveFloat = Field(description="desired speed per height error near the target, 1/s")
     height_velocity: PositiveFloat = Field(description="acceleration per error of vertical velocity, 1/s")
     deceleration: PositiveFloat = Field(description="horizontal deceleration that the approach plans with, m/s²")
-    height_deceleration: PositiveFloat = Field(
-        description="vertical deceleration that the approach from below plans with, m/s²"
-    )
+    height_deceleration: PositiveFloat = Field(description="vertical deceleration planned from below, m/s²")
     descent: PositiveFloat = Field(description="greatest desired acceleration downwards, below g, m/s²")
     tilt: PositiveFloat = Field(description="tangent of the greatest desired tilt")
     attitude: PositiveFloat = Field(description="desired body rate per small angle of thrust direction error, 1/s")

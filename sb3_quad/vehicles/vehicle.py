@@ -1,7 +1,5 @@
 """Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files that hold them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -70,7 +68,7 @@ class Vehicle(Frozen):
 
     @model_validator(mode="wrap")
     @classmethod
-    def _limits_as_published(cls, data: Any, handler: ModelWrapValidatorHandler[Vehicle]) -> Vehicle:
+    def _limits_as_published(cls, data: Any, handler: ModelWrapValidatorHandler["Vehicle"]) -> "Vehicle":
         """``rotor_thrust_limits`` or ``rotor_speed_limits`` as ``thrust_limits`` (F = kF ω²)."""
         given = [key for key in ("thrust_limits", *OTHER_LIMITS) if isinstance(data, Mapping) and key in data]
         if len(given) > 1:
@@ -92,7 +90,7 @@ class Vehicle(Frozen):
         return handler({**others, "thrust_limits": (least / vehicle.hover_thrust, most / vehicle.hover_thrust)})
 
     @model_validator(mode="after")
-    def _consistent(self) -> Vehicle:
+    def _consistent(self) -> "Vehicle":
         low, high = self.thrust_limits
         if not low < 1.0 < high:
             raise CannotHover(f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover")
@@ -115,7 +113,7 @@ class Vehicle(Frozen):
             )
         return self
 
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Vehicle:
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> "Vehicle":
         """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated.
 
         ``geometric_gains`` were found for this vehicle: one that differs in more than its name has none, unless ``update``

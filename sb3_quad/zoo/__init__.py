@@ -7,16 +7,13 @@ module ``custom_envs`` if there is one: a file ``custom_envs.py`` that holds ``i
 
 Never imported by the rest of this package: rl_zoo3 replaces Gymnasium's ``TimeLimit`` when it is imported.
 
-:raises ImportError: rl_zoo3 is not installed (the extra ``zoo``).
+:raises MissingExtra: rl_zoo3 is not installed (the extra ``zoo``).
 """
 
-from __future__ import annotations
+from sb3_quad.base.imports import require
 
-try:
-    import rl_zoo3  # noqa: F401
-except ImportError as error:
-    raise ImportError(f"rl_zoo3 cannot be imported ({error}); install it by: pip install 'sb3_quad[zoo]'") from error
+require("rl_zoo3", "zoo", "sb3_quad.zoo")
 
-from sb3_quad.zoo.registration import register
+from sb3_quad.zoo.registration import register  # noqa: E402
 
 register()

@@ -1,7 +1,5 @@
 """``python -m sb3_quad.zoo SCRIPT …``: rl_zoo3's scripts, with our algorithms and settings known to them."""
 
-from __future__ import annotations
-
 import importlib
 import runpy
 import sys

@@ -3,8 +3,6 @@
 What differs holds for our algorithms and for any algorithm on our environments; everything else is as it was.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from importlib import resources

@@ -1,7 +1,5 @@
 """What rl_zoo3 looks up by name: algorithms, search spaces, and the class that sets a training up."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ examples:
   sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
 """
 
-from __future__ import annotations
-
 import argparse
 
 from sb3_quad.cli.parser import Parser, positive

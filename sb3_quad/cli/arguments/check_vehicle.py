@@ -8,8 +8,6 @@ examples:
 Exit code 1: the rotors cannot produce hover thrust. The contents of a vehicle file: docs/vehicles.md
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.parser import Parser, natural
 
 

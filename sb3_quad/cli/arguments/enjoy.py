@@ -12,8 +12,6 @@ A controller is pid, geometric, the path of an SB3 zip, or package.module:factor
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.parser import Pairs, Parser, positive, whole
 
 DEFAULT_ENV = "QuadTargetTracking-v0"

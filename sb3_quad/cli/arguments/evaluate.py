@@ -19,8 +19,6 @@ examples:
 Results are kept in a folder: the same command again flies only what is missing, and further controllers are added.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from sb3_quad.cli.parser import Parser, whole

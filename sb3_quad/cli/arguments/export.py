@@ -13,8 +13,6 @@ examples:
 ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header needs a C compiler to check it.
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.parser import Parser
 from sb3_quad.pretrained_policies import agent_path
 

@@ -5,8 +5,6 @@ examples:
   sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.parser import Parser
 
 

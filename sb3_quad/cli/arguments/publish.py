@@ -10,8 +10,6 @@ examples:
 The zip must lie in its run folder, which records how it was trained.
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.parser import Parser, positive
 
 

@@ -10,8 +10,6 @@ Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip
 Films need: pip install 'sb3_quad[video]'. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.arguments.enjoy import add_flight_arguments
 from sb3_quad.cli.parser import Parser, positive
 from sb3_quad.pretrained_policies import agent_path

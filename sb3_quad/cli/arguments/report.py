@@ -8,8 +8,6 @@ examples:
 Needs: pip install 'sb3_quad[report]'.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from sb3_quad.cli.parser import Parser

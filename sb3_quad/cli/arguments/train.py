@@ -15,8 +15,6 @@ examples:
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
 
-from __future__ import annotations
-
 import argparse
 
 from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole

@@ -12,8 +12,6 @@ examples:
 The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. Needs: pip install 'sb3_quad[tune]'.
 """
 
-from __future__ import annotations
-
 from sb3_quad.cli.arguments.train import add_settings
 from sb3_quad.cli.parser import Parser, natural, positive, seed, whole
 

@@ -9,8 +9,6 @@ examples:
 Ctrl-C writes the best gains so far; the same command continues. Needs pip install 'sb3_quad[tune]'.
 """
 
-from __future__ import annotations
-
 import argparse
 
 from sb3_quad.cli.parser import Parser, natural, positive

@@ -1,7 +1,5 @@
 """``benchmark``: control steps per second, in a table and as JSON."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """``check-vehicle``: whether a vehicle's file describes something that flies, and how the experts fly it."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 

@@ -1,7 +1,5 @@
 """``enjoy``: flights to look at, in a window, as a film or as poses in one picture."""
 
-from __future__ import annotations
-
 import argparse
 import io
 import sys
@@ -23,9 +21,8 @@ from sb3_quad.evaluation.controllers import build, parse_controllers
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.show.episodes import Setting, fixed_setting, fly_all, scenario_setting
+from sb3_quad.show.episodes import Recording, Setting, fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
-from sb3_quad.show.recording import Recording
 from sb3_quad.show.sequence import sequence
 from sb3_quad.simulation.checks import check_size
 from sb3_quad.training.runs import find_run

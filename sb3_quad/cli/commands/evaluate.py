@@ -1,7 +1,5 @@
 """``evaluate``: any number of controllers through a suite of scenarios, side by side on the same episodes."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -1,7 +1,5 @@
 """``export``: a trained policy as a file that flies without this package."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

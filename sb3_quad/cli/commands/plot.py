@@ -1,7 +1,5 @@
 """``plot``: learning curves of one or more runs as a picture."""
 
-from __future__ import annotations
-
 import argparse
 import glob
 from pathlib import Path

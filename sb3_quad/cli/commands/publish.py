@@ -1,7 +1,5 @@
 """``publish``: a trained policy as a small zip for stock PPO, with a card that says what it can and where it comes from."""
 
-from __future__ import annotations
-
 import argparse
 import subprocess
 from pathlib import Path
@@ -14,7 +12,7 @@ import sb3_quad
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, write_bytes, write_text
 from sb3_quad.experts.models import load_model
-from sb3_quad.export.slim import slim_bytes
+from sb3_quad.export.policy import slim_bytes
 from sb3_quad.report.card import measure, write_card
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.runs import RunFolder, open_run

@@ -1,7 +1,5 @@
 """``record-video``: a trained agent's flights as a film, in the folder of its run."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """``report``: a folder of results as one page, and its plots as pictures."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

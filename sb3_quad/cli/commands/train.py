@@ -1,7 +1,5 @@
 """``train``: one training run, and its agent beside the expert at the end; or a pipeline of several."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import time

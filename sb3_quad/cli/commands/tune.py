@@ -1,7 +1,5 @@
 """``tune``: a search for an algorithm's hyperparameters."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import suppress
 from itertools import count

@@ -1,7 +1,5 @@
 """``tune-expert``: gains of the geometric expert for a vehicle, into a copy of its YAML."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

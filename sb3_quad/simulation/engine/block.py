@@ -4,8 +4,6 @@ Lanes behind the last row repeat it, so that every loop runs over all lanes: a r
 others fly, or on where in the batch it stands.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -4,8 +4,6 @@ A block (:mod:`.block`) is reached through one pointer, and every array in it ha
 each distance between two rows, needs no test for overlap, and vectorises the loops over lanes.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable
 from pathlib import Path

@@ -7,8 +7,6 @@ exponential of ω dt with dt |ω| cut at π/4. Against PyBullet the difference i
 The body rates stay in the body frame: a rotation about ω leaves ω as it is, so that PyBullet's world-frame sum is the same.
 """
 
-from __future__ import annotations
-
 import math
 
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled

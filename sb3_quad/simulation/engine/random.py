@@ -11,8 +11,6 @@ calls, so that the loops vectorise; their error (1e-7) is far below what any tes
 number there can be is 6.6.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

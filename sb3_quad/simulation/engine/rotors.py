@@ -1,7 +1,5 @@
 """The rotors of one quadcopter through one control step, for a simulator that moves the body itself."""
 
-from __future__ import annotations
-
 import math
 
 from sb3_quad.simulation.engine.block import P, X

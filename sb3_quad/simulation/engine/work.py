@@ -5,8 +5,6 @@ under way and how many of its blocks are not taken yet. Whoever comes takes the 
 comes, costs time but changes nothing, since each row has a stream of its own and each block its own memory.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -5,8 +5,6 @@ between calls, fights torch for the cores and forbids fork. Here a worker looks 
 last one, then sleeps; nobody waits for it unless it holds a block.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import sys

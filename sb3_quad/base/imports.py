@@ -1,11 +1,11 @@
-"""Names of a package that are imported on first use."""
-
-from __future__ import annotations
+"""Imports that wait until they are needed, and those of packages that only some commands need."""
 
 import importlib
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
+
+from sb3_quad.base.errors import MissingExtra
 
 
 def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -24,3 +24,16 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str]
         return sorted({*vars(sys.modules[package]), *modules})
 
     return get, names
+
+
+def require(module: str, extra: str, what: str) -> Any:
+    """The module, imported.
+
+    :param extra: of this package, which brings it.
+    :param what: needs it, for the message.
+    :raises MissingExtra: it cannot be imported; the message says what to install.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingExtra(f"{what} needs {module} ({error}): pip install 'sb3_quad[{extra}]'") from None
