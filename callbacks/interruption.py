@@ -1,8 +1,8 @@
 """Trainings that end before their time: neither a signal nor a diverging loss costs the model."""
 
 import random
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch as th
@@ -69,8 +69,7 @@ class StopOnSignal(BaseCallback):
             self._signals.__exit__(None, None, None)
 
 
-@dataclass(frozen=True)
-class Snapshot:
+class Snapshot(NamedTuple):
     """A training between two rollouts: everything it needs to continue as if nothing had happened, except a dataset."""
 
     timesteps: int

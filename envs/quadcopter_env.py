@@ -229,8 +229,12 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
 
     def _info(self) -> dict[str, Any]:
         ended = self.batch.outcome[0]
-        info = {"is_success": bool(ended["truncated"]), "distance": float(ended["distance"])}
-        return info | {name: bool(ended[name]) for name in ("collision", "out_of_range")}
+        return {
+            "is_success": bool(ended["truncated"]),
+            "distance": float(ended["distance"]),
+            "collision": bool(ended["collision"]),
+            "out_of_range": bool(ended["out_of_range"]),
+        }
 
     def render(self) -> Image | None:
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""

@@ -18,6 +18,7 @@ from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
+_MODE = (JOB.names or ()).index("mode")
 _MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns")  # all that future flight depends on
 
 
@@ -124,12 +125,13 @@ class QuadcopterBatch:
         arrays = self._run(SCORE)
         return arrays.observations, arrays.rewards, arrays.dones
 
-    def _run(self, mode: int, resetting: Any = ()) -> StepArrays:
+    def _run(self, mode: int, resetting: IntArray | None = None) -> StepArrays:
         arrays = step_arrays(self.n)
-        arrays.dones[np.array(resetting, dtype=np.int64)] = True
-        self.job["mode"] = mode
+        if resetting is not None:
+            arrays.dones[resetting] = True
+        self._job_numbers[_MODE] = mode
         run(self._job_numbers, self.threads, arrays)
-        self.job["mode"] = FLY
+        self._job_numbers[_MODE] = FLY
         return arrays
 
     def rows(self, rows: Rows) -> IntArray:

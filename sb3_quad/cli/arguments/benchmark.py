@@ -10,12 +10,10 @@ import argparse
 
 from sb3_quad.cli.parser import Parser, positive
 
-SIZES = (64, 240, 1024, 4096, 16384)
-
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("--sizes", nargs="+", type=positive, default=list(SIZES), metavar="N", help="rows of the batch")
+    add("--sizes", nargs="+", type=positive, default=[64, 240, 1024, 4096, 16384], metavar="N", help="rows of the batch")
     add("--n-envs", type=positive, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
     add("--seconds", type=float, default=3.0, metavar="S", help="duration of each measurement (3)")
     add("--algo", default="ppo_bc", help="algorithm of the training loop (ppo_bc)")

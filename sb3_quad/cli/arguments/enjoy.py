@@ -46,7 +46,7 @@ def add_flight_arguments(parser: Parser) -> None:
     add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest (0)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
-        "--load-best", dest="which", action="store_const", const="best", help="the agent of the best evaluation"
+        "--load-best", dest="which", action="store_const", const="best", help="the best agent of the evaluations"
     )
     which.add_argument("--load-checkpoint", dest="which", type=whole, metavar="N", help="the checkpoint after N timesteps")
     last = "last checkpoint"

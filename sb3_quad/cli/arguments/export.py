@@ -19,12 +19,8 @@ from sb3_quad.pretrained_policies import agent_path
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add(
-        "model",
-        type=agent_path,
-        metavar="MODEL.zip",
-        help="an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy, or a name such as itm-recovery",
-    )
+    agent = "an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy, or a name such as itm-recovery"
+    add("model", type=agent_path, metavar="MODEL.zip", help=agent)
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
     add("-o", metavar="FILE", dest="file", help="file to write (beside the zip, ending in .onnx, .pt or .h)")
     add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
