@@ -67,11 +67,9 @@ def _pid(position, quaternion, velocity, rates, target, gains, attitude, mixer_i
     low, high = limits
     middle, half = (high + low) / 2, (high - low) / 2
     for i in range(actions.shape[0]):
-        ex, ey, ez = (
-            target[0, i] - position[0, i],
-            target[1, i] - position[1, i],
-            target[2, i] - position[2, i],
-        )
+        ex = target[0, i] - position[0, i]
+        ey = target[1, i] - position[1, i]
+        ez = target[2, i] - position[2, i]
         vx, vy, vz = velocity[0, i], velocity[1, i], velocity[2, i]
         (r11, r12, r13), (r21, r22, r23), (r31, r32, r33) = rotation_rows(
             quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]

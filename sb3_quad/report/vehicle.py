@@ -33,10 +33,7 @@ def parameter_table(vehicle: Vehicle, able: Authority) -> Table:
         ("inertia", f"{ixx:.4g}, {iyy:.4g}, {izz:.4g} kg m²"),
         ("", f"physical: the largest moment is {share:.2f} of the other two together, at most 1 (triangle inequality)"),
         ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
-        (
-            "motors",
-            f"time constant {1000 * able.motor_lag:.1f} ms; from command to thrust {1000 * able.command_lag:.1f} ms",
-        ),
+        ("motors", f"time constant {1000 * able.motor_lag:.1f} ms; from command to thrust {1000 * able.command_lag:.1f} ms"),
         ("half a turn", f"{able.half_turn:.2f} s from rest to rest, roll or pitch, the weaker; lags left out"),
     )
     return text_table(vehicle.name, ("", ""), rows, align="left")
