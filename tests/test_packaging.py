@@ -90,7 +90,19 @@ def installed(wheel, tmp_path_factory):
     (paths["purelib"] / "lent.pth").write_text("\n".join(lent))
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", paths["scripts"] / "python")
     run(*pip, "install", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
+    _lend_compiled_code(paths["purelib"])
     return paths["scripts"]
+
+
+def _lend_compiled_code(purelib):
+    """Numba takes what it has compiled for the checkout, if there is any, where the files' times are the same."""
+    for name, source in package_folders().items():
+        target = purelib.joinpath(*name.split("."))
+        for path in source.glob("*.py"):
+            shutil.copystat(path, target / path.name)
+        for path in source.glob("__pycache__/*.nb[ic]"):
+            (target / "__pycache__").mkdir(exist_ok=True)
+            shutil.copy(path, target / "__pycache__")
 
 
 def test_every_package_is_listed(options):

@@ -1,15 +1,18 @@
-"""The saved zips fly in stock Stable-Baselines3, where sb3_quad is not installed."""
+"""Saved and shipped zips fly in stock Stable-Baselines3, where sb3_quad is not installed."""
 
 import json
 import subprocess
 import sys
 
 import numpy as np
+from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
+import sb3_quad
 from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.pretrained_policies import pretrained_names
 
 FLY = """
 import json, sys
@@ -40,10 +43,11 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     observations = env.reset()
     np.save(tmp_path / "observations.npy", observations)
     files = ["observations.npy", *(f"{number}.zip" for number in range(len(models)))]
-    command = [sys.executable, "-W", "error", "-c", FLY, *files]
+    shipped = [sb3_quad.pretrained(name) for name in pretrained_names()]
+    command = [sys.executable, "-W", "error", "-c", FLY, *files, *map(str, shipped)]
     result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
     assert result.returncode == 0, result.stderr
     actions, timesteps = json.loads(result.stdout)
-    assert timesteps == [256] * len(models)
-    for model, flown in zip(models, actions, strict=True):
+    assert timesteps[: len(models)] == [256] * len(models)
+    for model, flown in zip([*models, *map(PPO.load, shipped)], actions, strict=True):
         np.testing.assert_array_equal(np.float32(flown), model.predict(observations, deterministic=True)[0])
