@@ -5,16 +5,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.envs.in_flight import InFlight
+from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.tasks import TaskSpec
 
 
@@ -44,8 +42,7 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
             raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
         self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords)
         self.num_envs = self.batch.n
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
-        self.single_action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+        self.single_observation_space, self.single_action_space = quadcopter_spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 

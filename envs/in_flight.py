@@ -1,13 +1,15 @@
-"""What all environments can be asked and told in flight."""
+"""What all environments have in common: their spaces, and what they can be asked and told in flight."""
 
 import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
+from gymnasium import spaces
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import TARGET
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -23,6 +25,12 @@ def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[
         return method(self.batch, *args, **kwargs)
 
     return call
+
+
+def quadcopter_spaces() -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
+    """Observation and action space of one quadcopter; made anew, since each space has random numbers of its own."""
+    observations = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+    return observations, spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
 class InFlight:

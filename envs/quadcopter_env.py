@@ -6,17 +6,15 @@ from typing import Any
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from gymnasium import spaces
 from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
-from sb3_quad.envs.in_flight import InFlight
+from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.checks import check_size, parse_options
 from sb3_quad.simulation.engine.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD
 from sb3_quad.simulation.tasks import TaskSpec
 
@@ -162,8 +160,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         self.batch = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._ready = False
-        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
-        self.observation_space = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+        self.observation_space, self.action_space = quadcopter_spaces()
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height

@@ -6,15 +6,14 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from gymnasium import Wrapper, spaces
+from gymnasium import Wrapper
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.envs.in_flight import InFlight
+from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
 
@@ -47,8 +46,7 @@ class QuadcopterVecEnv(InFlight, VecEnv):
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
-        observations = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
-        super().__init__(self.batch.n, observations, spaces.Box(-1.0, 1.0, (4,), np.float32))
+        super().__init__(self.batch.n, *quadcopter_spaces())
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, 18)."""

@@ -11,22 +11,20 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
+from sb3_quad.envs.in_flight import quadcopter_spaces
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.experts.controller import Controller
 from sb3_quad.scenarios.sample import Plan
 from sb3_quad.settings.flight import FlightSettings
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-ACTIONS = spaces.Box(-1.0, 1.0, (4,), np.float32)
-OBSERVATIONS = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+OBSERVATIONS, ACTIONS = quadcopter_spaces()
 
 
 @dataclass(frozen=True, eq=False)
