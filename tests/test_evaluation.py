@@ -47,7 +47,7 @@ def test_pybullet_gives_the_same_flights(task, vehicle):
     same(*flights)
 
 
-@settings(max_examples=5)
+@settings(max_examples=settings().max_examples // 20)
 @given(seed=st.integers(0, 2**20), n=st.integers(1, 5))
 def test_rows_do_not_depend_on_their_number(seed, n):
     alone = fly(PIDExpert(), "state_recovery", 1, seed + n - 1, max_steps=150)
