@@ -152,7 +152,7 @@ def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     np.testing.assert_allclose(np.linalg.norm(sampled["body_rates"], axis=1), rate, atol=1e-9)
     for name, values in sampled.items():
         np.testing.assert_array_equal(values, again[name])
-        if name == "velocity" and speed > 0:
+        if name == "velocity" and speed > 1e-300:  # smaller ones have too few digits to tell directions apart
             assert len(np.unique(values[:, 0])) == 3
 
 
