@@ -23,7 +23,7 @@ class BestModel(EveryTimesteps):
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's EvalCallback keeps the
     model of the highest mean reward; here a model that succeeds more often is better, and reward decides between equals.
     ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training besides. It logs ``eval/success_rate``,
-    ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``.
+    ``eval/survival_rate``, ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad import PIDExpert
@@ -115,11 +115,14 @@ class BestModel(EveryTimesteps):
         self.stopped = not self._should_continue(*score)
 
     def _fly(self, group: str, seconds: float) -> Score:
-        env, rows, successes = self._envs[group], self._rows[group], []
+        env, rows, successes, survived = self._envs[group], self._rows[group], [], []
 
         def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
             if local_variables["done"]:  # an environment that knows no success counts as failing: reward decides
-                successes.append(float(local_variables["info"].get("is_success", 0.0)))
+                info = local_variables["info"]
+                successes.append(float(info.get("is_success", 0.0)))
+                if "survival" in info:
+                    survived.append(float(info["survival"]))
 
         rewards, lengths = self._evaluate(self.model, env, note)
         for key, value in zip(KEYS, (self.num_timesteps, rewards, lengths, successes, seconds), strict=True):
@@ -128,6 +131,8 @@ class BestModel(EveryTimesteps):
         success, reward = score = _score(successes, rewards)
         self.logger.record(f"{group}/success_rate", success)
         self.logger.record(f"{group}/mean_reward", reward)
+        if survived:
+            self.logger.record(f"{group}/survival_rate", float(np.mean(survived)))
         self.logger.record(f"{group}/mean_ep_length", float(np.mean(lengths)))
         if self._expert is not None:
             if group not in self._expert_rewards:

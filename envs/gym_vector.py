@@ -26,8 +26,8 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
     :func:`~sb3_quad.base.seeds.row_seeds`.
 
     Autoreset is ``SAME_STEP``: a row that ends returns the first observation of its next episode, and the infos hold the last
-    one in ``final_obs[i]`` and ``is_success``, ``distance``, ``collision`` and ``out_of_range`` in ``final_info``, each with
-    the mask ``_final_obs``, ``_final_info`` and so on. Where no episode ends, infos are empty.
+    one in ``final_obs[i]`` and ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range`` in
+    ``final_info``, each with the mask ``_final_obs``, ``_final_info`` and so on. Where no episode ends, infos are empty.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
@@ -81,7 +81,8 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
             for row in np.flatnonzero(done):
                 final[row] = outcome["observation"][row].copy()
             info: dict[str, Any] = {
-                "is_success": truncated.copy(),
+                "is_success": done & outcome["success"],
+                "survival": truncated.copy(),
                 "distance": np.where(done, outcome["distance"], 0.0),
                 "collision": done & outcome["collision"],
                 "out_of_range": done & outcome["out_of_range"],

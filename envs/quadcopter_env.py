@@ -94,11 +94,15 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     - *Terminated*: the collision sphere (radius 0.135 m) touches the ground, or |r - r_T| > 30 m.
     - *Truncated*: after 1500 control steps (15 s), by `max_episode_steps` of `gymnasium.make`.
 
+    An episode succeeds that is truncated within 0.1 m of the target; state recovery within 0.25 m, tilted by at most 10°
+    (`success_distance` and `success_tilt` of the task).
+
     ## Info
 
     | Key | Meaning |
     |-----|---------|
-    | `is_success` | not terminated so far; at the end of the episode, the thesis's success |
+    | `is_success` | close enough to the target now: at the end of the episode, whether it succeeded |
+    | `survival` | not terminated so far: at the end of the episode, the thesis's success |
     | `distance` | from the target, m |
     | `collision` | the ground was touched |
     | `out_of_range` | too far from the target |
@@ -222,12 +226,13 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         if self.render_mode == "human":
             self._draw()
         info = self._info()
-        return observations[0], float(batch.outcome["reward"][0]), not info["is_success"], False, info
+        return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
     def _info(self) -> dict[str, Any]:
         ended = self.batch.outcome[0]
         return {
-            "is_success": bool(ended["truncated"]),
+            "is_success": bool(ended["success"]),
+            "survival": bool(ended["truncated"]),
             "distance": float(ended["distance"]),
             "collision": bool(ended["collision"]),
             "out_of_range": bool(ended["out_of_range"]),

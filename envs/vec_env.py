@@ -29,7 +29,7 @@ class RowSeeds(VecEnv):
     SB3 gives row i ``seed + i``: of 480 rows, those of seeds 0 and 1 share 479 streams of random numbers.
     """
 
-    def seed(self, seed: int | None = None) -> list[int]:  # type: ignore[override]
+    def seed(self, seed: int | None = None) -> list[int | None]:
         """Seed all rows from their next reset on; returns :func:`~sb3_quad.base.seeds.row_seeds`. None: by a random number."""
         first = secrets.randbits(32) if seed is None else seed
         self._seeds = [*row_seeds(first, self.num_envs)]
@@ -43,8 +43,9 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
     row i flies exactly as that environment does after ``reset(seed=row_seeds(seed, n)[i])``
     (:func:`~sb3_quad.base.seeds.row_seeds`; ``seed()`` returns them). A row that ends begins its next episode
     within the same step, and its info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``,
-    ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``distance``, ``collision`` and ``out_of_range``. The infos of other
-    rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are fresh.
+    ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
+    infos of other rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are
+    fresh.
 
     See :class:`~sb3_quad.simulation.batch.QuadcopterBatch` for the arguments.
     """
@@ -89,12 +90,13 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
             elapsed = round(time.time() - self._start, 6)
             outcomes = self.batch.outcome[rows].tolist()  # of a copy, so that the last observations are fresh
             for row, outcome in zip(self._ended, outcomes, strict=True):
-                total, _, length, distance, collision, out_of_range, truncated, observation = outcome
+                total, _, length, distance, collision, out_of_range, truncated, success, observation = outcome
                 self._infos[row] = {
                     "terminal_observation": observation,
                     "TimeLimit.truncated": truncated,
                     "episode": {"r": round(total, 6), "l": length, "t": elapsed},
-                    "is_success": truncated,
+                    "is_success": success,
+                    "survival": truncated,
                     "distance": distance,
                     "collision": collision,
                     "out_of_range": out_of_range,

@@ -28,7 +28,6 @@ for episode in range(arguments.episodes):
     while not (terminated or truncated):
         action, _ = model.predict(observation, deterministic=True)
         observation, reward, terminated, truncated, info = env.step(action)
-    print(
-        f"episode {episode}: {'safe' if info['is_success'] else 'lost'}, {info['distance']:.3f} m from the target at the end"
-    )
+    arrived = "arrived" if info["is_success"] else "missed"
+    print(f"episode {episode}: {arrived}, {info['distance']:.3f} m from the target at the end")
 env.close()

@@ -33,5 +33,5 @@ model.save(arguments.output)
 
 for name, controller in (("expert", PIDExpert()), ("agent", model)):
     flights = fly(controller, "target_tracking", n_episodes=48, seed=1_000_000)
-    print(f"{name}: {flights.success.mean():.1%} safe, mean distance after 15 s {flights.final_error.mean():.3f} m")
+    print(f"{name}: {flights.success.mean():.1%} arrive, mean distance after 15 s {flights.final_error.mean():.3f} m")
 print(f"saved to {arguments.output}")

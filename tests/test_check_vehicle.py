@@ -104,7 +104,7 @@ def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, cap
 def test_nothing_is_flown_where_nothing_is_asked_for(capsys):
     assert main(["check-vehicle", "crazyflie", "-n", "0"]) == 0
     printed = capsys.readouterr().out
-    assert "0.02 to 0.1125 N" in printed and "success" not in printed
+    assert "0.02 to 0.1125 N" in printed and "survival" not in printed
 
 
 def test_what_cannot_hover_leaves_with_1(tmp_path, capsys):

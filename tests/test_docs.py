@@ -87,7 +87,7 @@ def check_environments(scope):
 
 
 def check_vehicles(scope):
-    assert abs(scope["flights"].success.mean() - 0.953) < 0.01
+    assert abs(scope["flights"].survival.mean() - 0.953) < 0.01
 
 
 LONG = ("README.md", "docs/callbacks.md")

@@ -53,28 +53,30 @@ def test_its_agent_is_shown_with_the_settings_of_its_run(tmp_path, capsys, monke
 def test_results_are_read_and_written_alike(tmp_path):
     results = load_results(OLD / "results")
     entry = results.entry("agent", "hit")
-    assert entry.metrics.success.n == 1 and entry.metrics.arrivals[0].tolerance == 0.5
+    assert entry.metrics.survival.n == 1 and entry.metrics.success is None  # which it called success
+    assert entry.metrics.arrivals[0].tolerance == 0.5
     assert entry.figures is entry.metrics  # as documented in version 0.1
     assert len(entry.hit_limit.trials) == 17 and results.failures[0].controller == "missing"
+    assert results.scenarios[0].reference["expert"].survival is not None
     assert results.scenarios[0].reference["expert"].time_to == {"0.5": 1.25}
     assert read_flights(OLD / "results" / entry.flights)["position"].shape == (1, 11, 3)
     shutil.copytree(OLD / "results" / "flights", tmp_path / "flights")
     write_results(tmp_path, results)
-    for name in ("results.json", "episodes.csv"):
-        assert (tmp_path / name).read_bytes() == (OLD / "results" / name).read_bytes()
+    assert load_results(tmp_path) == results
+    assert (tmp_path / "episodes.csv").read_bytes() == (OLD / "results" / "episodes.csv").read_bytes()
 
 
-def test_what_is_there_is_not_flown_again(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sb3_quad.evaluation.evaluate.__version__", "0.1.0")  # another version flies anew
+def test_flights_of_its_random_streams_are_not_mixed_with_ours_and_are_shown(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     shutil.copytree(OLD / "results", tmp_path / "results")
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.npz")}
+    before = {path: path.read_bytes() for path in (tmp_path / "results").rglob("*.*")}
     command = ["evaluate", str(OLD / "agent.zip"), "--suite", str(OLD / "small.yaml"), "-o", "results", "--no-report"]
-    assert main(command) == 0
-    assert before == {path: path.stat().st_mtime_ns for path in (tmp_path / "results").rglob("*.npz")} and len(before) == 3
-    table = capsys.readouterr().out
-    for part in ("paper", "expert 50", "tilt 60", "half survive up to", "waypoints reached"):
-        assert part in table
+    assert main(command) == 2 and "give another folder with -o" in capsys.readouterr().err
+    assert before == {path: path.read_bytes() for path in (tmp_path / "results").rglob("*.*")}
+    assert main(["report", "results"]) == 0
+    page = (tmp_path / "results" / "report.html").read_text()
+    for part in ("paper", "Survival", "tilt", "half survive up to", "waypoints reached"):
+        assert part.lower() in page.lower(), part
 
 
 def test_names_that_were_documented_can_still_be_imported():

@@ -33,7 +33,7 @@ def hover(observation):
 
 
 def same(a: Flights, b: Flights) -> None:
-    assert (a.success == b.success).all()
+    assert (a.success == b.success).all() and (a.survival == b.survival).all()
     assert (a.length == b.length).all()
     for name in ("reward", "path_length", "final_error"):
         np.testing.assert_allclose(getattr(a, name), getattr(b, name), rtol=1e-6, atol=1e-6)
@@ -69,7 +69,7 @@ def test_figures_are_those_of_the_environment():
             ended.setdefault(int(row), infos[row])
     flights = fly(expert, "state_recovery", 6, seed=3, max_steps=300)
     for row, info in ended.items():
-        assert flights.success[row] == info["is_success"]
+        assert (flights.success[row], flights.survival[row]) == (info["is_success"], info["survival"])
         assert flights.length[row] == info["episode"]["l"]
         assert flights.reward[row] == pytest.approx(info["episode"]["r"], abs=1e-4)
         assert flights.final_error[row] == pytest.approx(info["distance"], abs=1e-9)
@@ -77,7 +77,7 @@ def test_figures_are_those_of_the_environment():
 
 def test_a_fall_is_as_long_as_it_is_high():
     flights = fly(fall, "target_tracking", 4, seed=0)
-    assert not flights.success.any()
+    assert not flights.survival.any() and not flights.success.any()
     assert flights.path_length == pytest.approx(np.full(4, 15 - 0.135), abs=0.15)  # at most one step's way past contact
     assert (flights.length == flights.length[0]).all()
     assert np.isnan(flights.time_to[0.1]).all()
@@ -85,7 +85,7 @@ def test_a_fall_is_as_long_as_it_is_high():
 
 def test_hovering_covers_no_distance():
     flights = fly(hover, "target_tracking", 4, seed=0, max_steps=200)
-    assert flights.success.all()
+    assert flights.survival.all() and not flights.success.any()
     assert (flights.length == 200).all()
     assert flights.path_length == pytest.approx(np.zeros(4), abs=1e-9)
     assert flights.final_error == pytest.approx(np.full(4, 10.0))
@@ -145,7 +145,8 @@ def table_of(metrics, name, beside):
 def test_tables_say_how_many_arrived():
     n = 4
     flights = Flights(
-        success=np.array([True, True, False, True]),
+        success=np.array([True, False, False, False]),
+        survival=np.array([True, True, False, True]),
         collision=np.array([False, False, True, False]),
         reward=np.full(n, -8.0),
         length=np.full(n, 1500),
@@ -159,11 +160,23 @@ def test_tables_say_how_many_arrived():
         target=np.zeros((n, 3)),
     )
     figures = summarise(flights)
-    assert figures.success.value == 0.75 and (figures.collisions, figures.out_of_range) == (1, 0)
+    assert (figures.success.value, figures.survival.value) == (0.25, 0.75)
+    assert (figures.collisions, figures.out_of_range) == (1, 0)
     assert figures.arrivals[-1].time.value == 5.0 and figures.arrivals[-1].share.value == 0.75
     assert figures.final_error_max == 0.3 and figures.final_offset == pytest.approx((0.2, 0.0, 0.0))
     text = text_of(table_of(figures, "tracking", ["expert"]))
-    for part in ("success, %", "75.0 (", "5.00 (", ", 75 % arrive", "never", "0.300", "thesis: expert", "7.75"):
+    for part in (
+        "success, %",
+        "25.0 (",
+        "survival, %",
+        "75.0 (",
+        "5.00 (",
+        ", 75 % arrive",
+        "never",
+        "0.300",
+        "thesis: expert",
+        "7.75",
+    ):
         assert part in text
     one_lost = figures.model_copy(update={"success": share([False] + [True] * 3839)})
     assert metric_cells(one_lost)[SUCCESS].number == "99.97"  # not 100

@@ -39,7 +39,7 @@ def fly_one(expert, target, *, start=(), wrench=None, steps=1500):
         _, _, dones, infos = env.step(expert.actions(env.true_state()))
         if dones[0]:
             distances.append(infos[0]["distance"])
-            return np.array(distances), path, (None if infos[0]["is_success"] else step + 1)
+            return np.array(distances), path, (None if infos[0]["survival"] else step + 1)
         path += float(np.linalg.norm(state.position[0] - last))
         last = state.position[0].copy()
         distances.append(float(state.distance[0]))
@@ -61,7 +61,7 @@ def test_pid_tracking_figures():
 
 def test_pid_recovery_figure():
     flights = fly(PIDExpert(), task="state_recovery", n_episodes=4800, seed=12)
-    assert 100 * flights.success.mean() == pytest.approx(31.9, abs=2.0)
+    assert 100 * flights.survival.mean() == pytest.approx(31.9, abs=2.0)
 
 
 @pytest.mark.parametrize(("sign", "times", "length"), [(1, (7.23, 6.45, 4.54), 10.19), (-1, (8.18, 7.26, 5.31), 11.05)])

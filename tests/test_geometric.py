@@ -107,7 +107,7 @@ def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target() -> None:
 def test_it_flies_as_well_on_noisy_observations() -> None:
     """What a policy can learn from it: a function of the 18 features that their noise does not upset."""
     recovery = fly(lambda observation: EXPERT.predict(observation)[0], "state_recovery", 120, 14, max_steps=350, noise=0.05)
-    assert recovery.success.mean() >= 0.99
+    assert recovery.survival.mean() >= 0.99
 
 
 def changed(**changes: object) -> GeometricExpert:
@@ -137,4 +137,4 @@ def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(expert: G
     tracking = fly(expert, "target_tracking", 32, 3, vehicle=vehicle, max_steps=900, noise=0.0)
     recovery = fly(expert, "state_recovery", 150, 3, vehicle=vehicle, max_steps=400, noise=0.0)
     assert tracking.success.all() and tracking.final_error.max() < 0.02
-    assert recovery.success.mean() > 0.9
+    assert recovery.survival.mean() > 0.9

@@ -47,7 +47,7 @@ def test_flights_are_those_of_the_other_environments():
         np.testing.assert_array_equal(terminated | truncated, dones)
         for row in np.flatnonzero(dones):
             np.testing.assert_array_equal(infos["final_obs"][row], batch_infos[row]["terminal_observation"])
-            for key in ("is_success", "distance", "collision", "out_of_range"):
+            for key in ("is_success", "survival", "distance", "collision", "out_of_range"):
                 assert infos["final_info"][key][row] == batch_infos[row][key]
                 assert infos["final_info"]["_" + key].tolist() == dones.tolist()
     single.close()
@@ -64,7 +64,7 @@ def test_truncation():
     env.step(np.zeros((5, 4)))
     _, _, terminated, truncated, infos = env.step(np.zeros((5, 4)))
     assert truncated.tolist() == [True, True, False, True, True] and not terminated.any()
-    assert infos["final_info"]["is_success"].tolist() == truncated.tolist()
+    assert infos["final_info"]["survival"].tolist() == truncated.tolist()
 
 
 def test_seeds_and_masks():

@@ -123,8 +123,8 @@ def test_row_of_the_batched_environment_flies_the_same(task: str) -> None:
             np.testing.assert_allclose(reward, rewards[row], atol=1e-6)
             if terminated:
                 np.testing.assert_allclose(observation, infos[row]["terminal_observation"], atol=1e-6)
-                assert {key: infos[row][key] for key in ("collision", "out_of_range", "is_success")} == {
-                    key: info[key] for key in ("collision", "out_of_range", "is_success")
+                assert {key: infos[row][key] for key in ("collision", "out_of_range", "is_success", "survival")} == {
+                    key: info[key] for key in ("collision", "out_of_range", "is_success", "survival")
                 }
                 observation, _ = env.reset()
             np.testing.assert_allclose(observation, rows[row], atol=1e-6)
@@ -185,7 +185,7 @@ def test_hovers_on_zero_action(env: QuadcopterEnv) -> None:
     np.testing.assert_allclose(env.true_state().position[0], [0, 0, 15], atol=1e-9)
     np.testing.assert_allclose(info["distance"], np.sqrt(5.0))
     np.testing.assert_allclose(reward, -0.003 * np.sqrt(5.0))
-    assert info["is_success"] and not terminated and not truncated
+    assert info["survival"] and not info["is_success"] and not terminated and not truncated
 
 
 def test_ends_on_touching_the_ground(env: QuadcopterEnv) -> None:
@@ -193,7 +193,7 @@ def test_ends_on_touching_the_ground(env: QuadcopterEnv) -> None:
     for _ in range(100):
         _, reward, terminated, _, info = env.step(-np.ones(4, dtype=np.float32))
         height = env.true_state().position[0, 2]
-        assert terminated == (height <= env.vehicle.collision_radius) == info["collision"] == (not info["is_success"])
+        assert terminated == (height <= env.vehicle.collision_radius) == info["collision"] == (not info["survival"])
         if terminated:
             break
     assert terminated and reward < -15 and not info["out_of_range"]
@@ -204,7 +204,7 @@ def test_ends_out_of_range(env: QuadcopterEnv) -> None:
     env.reset(seed=0)
     env.set_target((0, 0, 45.5))
     _, reward, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
-    assert terminated and not truncated and info["out_of_range"] and not info["is_success"] and reward < -15
+    assert terminated and not truncated and info["out_of_range"] and not info["survival"] and reward < -15
 
 
 def test_truncated_after_1500_steps() -> None:
@@ -212,7 +212,7 @@ def test_truncated_after_1500_steps() -> None:
     env.reset(seed=0)
     for step in range(1, 1501):
         _, _, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
-        assert not terminated and truncated == (step == 1500) and info["is_success"]
+        assert not terminated and truncated == (step == 1500) and info["survival"]
     env.close()
 
 

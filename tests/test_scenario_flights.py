@@ -91,7 +91,7 @@ def test_an_impulse_is_force_times_time():
     np.testing.assert_allclose(np.diff(log["time"]), 0.02)
     impulse = 0.02 * log["wrench"][:, 1:, 0].sum(axis=1)  # means over the steps between samples
     np.testing.assert_allclose(impulse, factors * 6 * 0.05, rtol=1e-5)
-    assert flights.success.all()
+    assert flights.survival.all()
 
 
 def test_waypoints_are_flown_one_after_the_other():
@@ -111,7 +111,7 @@ def test_waypoints_are_flown_one_after_the_other():
 
 def test_a_lost_flight_is_recorded_to_its_end():
     flights, log = fly_scenario(lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), recorded=2)
-    assert flights.collision.all() and not flights.success.any() and np.isnan(flights.final_offset).all()
+    assert flights.collision.all() and not flights.survival.any() and np.isnan(flights.final_offset).all()
     assert (log["samples"] <= flights.flown / 0.02 + 1).all() and (log["samples"] > flights.flown / 0.02 - 1).all()
     assert log["position"][0, log["samples"][0] - 1, 2] < 0.8
 
@@ -121,7 +121,7 @@ def test_flight_files_hold_what_was_flown(tmp_path):
     write_arrays(tmp_path / "f.npz", **episode_arrays(flights, range(3)), **log)
     arrays = read_flights(tmp_path / "f.npz")
     np.testing.assert_array_equal(arrays["position"], log["position"])
-    assert arrays["episode_outcome"].tolist() == ["success"] * 3
+    assert arrays["episode_outcome"].tolist() == ["missed"] * 3
     assert all(name.startswith("episode_") for name in read_flights(tmp_path / "f.npz", "episode_"))
     (tmp_path / "f.npz").write_bytes(b"PK")
     with pytest.raises(ConfigError, match="cannot be read"):
@@ -152,12 +152,12 @@ def test_the_expert_reaches_the_specified_figures(name, times, path):
 def test_the_expert_is_lost_where_the_specification_says():
     assert specified("recovery_s1", 1)[0].flown.value == pytest.approx(1.78, rel=0.01)
     assert specified("recovery_s2", 1)[0].flown.value == pytest.approx(1.46, rel=0.01)
-    assert specified("side_hit", 1)[0].success.value == 0.0
+    assert specified("side_hit", 1)[0].survival.value == 0.0
     assert specified("constant_force", 1)[0].final_error.value == pytest.approx(5.6, rel=0.01)
 
 
 def test_the_expert_recovers_as_often_as_specified():
-    success = specified("recovery", 480)[0].success
+    success = specified("recovery", 480)[0].survival
     assert success.low - 0.02 < 0.319 < success.high + 0.02
 
 
@@ -170,7 +170,7 @@ def test_a_hit_is_bracketed():
     assert limit.high - limit.low <= 0.02 * limit.high
     for factor, survives in ((limit.low, True), (limit.high, False)):
         flights, _ = fly_scenario(PIDExpert(), short, seeds=range(4), factors=np.full(4, factor))
-        assert (flights.success == survives).all()
+        assert (flights.survival == survives).all()
     none = short.model_copy(update={"wrenches": (short.wrenches[0].model_copy(update={"duration": None, "start": 7.9}),)})
     assert find_limit(PIDExpert(), none).factor is None
 

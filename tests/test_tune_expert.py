@@ -50,9 +50,9 @@ def slow_itm(tmp_path):
 
 figures = st.builds(
     GeometricMetrics,
-    recovery_success=st.floats(0, 1),
+    recovery_survival=st.floats(0, 1),
     recovery_episodes=st.integers(1, 10**6),
-    tracking_success=st.floats(0, 1),
+    tracking_survival=st.floats(0, 1),
     tracking_episodes=st.integers(1, 10**6),
     time_to_0_1_m=positive,
     tracking_reward=st.floats(-50, 0),
@@ -94,7 +94,7 @@ def test_the_cost_tells_better_gains_from_worse_and_repeats_itself():
 def test_recoveries_by_start_count_each_flight_once_per_quantity():
     flights = fly(GeometricExpert(), "state_recovery", 200, 5, noise=0.0, max_steps=1)
     recovered = np.random.default_rng(0).random(200) < 0.7
-    counts = by_start(dataclasses.replace(flights, success=recovered))
+    counts = by_start(dataclasses.replace(flights, survival=recovered))
     for quantity in ("tilt", "falling", "body rate"):
         flown, lost = zip(*(counts[start] for start in counts if start.startswith(quantity)), strict=True)
         assert len(flown) == 3 and sum(flown) == 200 and sum(lost) == (~recovered).sum()

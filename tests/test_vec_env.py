@@ -80,7 +80,8 @@ def test_whole_episodes_are_pybullets(task, controller):
         assert len(expected) == len(rewards[row])
         np.testing.assert_allclose(rewards[row], expected, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(infos[row]["terminal_observation"], observation, atol=2e-6)
-        assert infos[row]["is_success"] == (not terminated)
+        assert infos[row]["is_success"] == info["is_success"]
+        assert infos[row]["survival"] == info["survival"] == (not terminated)
         assert infos[row]["TimeLimit.truncated"] == (not terminated)
         assert infos[row]["episode"]["l"] == len(expected)
         assert infos[row]["episode"]["r"] == pytest.approx(expected.sum(), abs=1e-5)
@@ -205,12 +206,42 @@ def test_the_end_of_an_episode():
                 relative = start.position[row] - start.target[row]
                 np.testing.assert_allclose(observations[row, :3] * env.observation_std[row, :3], relative, atol=1e-5)
     for row in range(3):
-        assert ends[row]["collision"] and not ends[row]["is_success"] and not ends[row]["TimeLimit.truncated"]
+        assert ends[row]["collision"] and not ends[row]["survival"] and not ends[row]["TimeLimit.truncated"]
         assert total[row] < -15.0
     for row in range(3, 6):
-        assert ends[row]["is_success"] and ends[row]["TimeLimit.truncated"] and not ends[row]["collision"]
+        assert (
+            ends[row]["survival"]
+            and not ends[row]["is_success"]
+            and ends[row]["TimeLimit.truncated"]
+            and not ends[row]["collision"]
+        )
         assert ends[row]["distance"] == pytest.approx(10.0)
         assert ends[row]["episode"]["l"] == 400
+
+
+@pytest.mark.parametrize(
+    ("task", "distance", "tilt", "succeeds"),
+    [
+        ("target_tracking", 0.09, 40.0, True),
+        ("target_tracking", 0.11, 0.0, False),
+        ("state_recovery", 0.24, 9.0, True),
+        ("state_recovery", 0.26, 9.0, False),
+        ("state_recovery", 0.24, 11.0, False),
+    ],
+)
+def test_success_is_to_be_at_the_target_in_the_end(task, distance, tilt, succeeds):
+    batch, single = QuadcopterVecEnv(2, task, max_episode_steps=1), QuadcopterEnv(task)
+    quaternion = [np.cos(np.radians(tilt / 2)), np.sin(np.radians(tilt / 2)), 0.0, 0.0]
+    start = {"position": [0, 0, 15], "quaternion": quaternion, "velocity": [0, 0, 0], "body_rates": [0, 0, 0]}
+    single.reset(options={"state": start, "target": [0, 0, 15 + distance]})
+    batch.reset()
+    for name, value in start.items():
+        getattr(batch.true_state(), name)[:] = value
+    batch.set_target([0, 0, 15 + distance])
+    info = single.step(np.zeros(4))[4]
+    for each in (info, *batch.step(np.zeros((2, 4)))[3]):
+        assert each["survival"] and each["is_success"] == succeeds
+    single.close()
 
 
 def test_terminal_observations_are_rows_own_and_stay():

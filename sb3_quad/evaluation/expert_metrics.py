@@ -26,9 +26,9 @@ def measure_expert(
     tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
     times = np.nan_to_num(tracking.time_to[NEAR], nan=time_limit * vehicle.control_step)
     metrics = GeometricMetrics(
-        recovery_success=round(float(recovery.success.mean()), 5),
+        recovery_survival=round(float(recovery.survival.mean()), 5),
         recovery_episodes=recovery.n,
-        tracking_success=round(float(tracking.success.mean()), 5),
+        tracking_survival=round(float(tracking.survival.mean()), 5),
         tracking_episodes=tracking.n,
         time_to_0_1_m=round(float(times.mean()), 3),
         tracking_reward=round(float(tracking.reward.mean()), 3),
@@ -48,5 +48,5 @@ def by_start(flights: Flights) -> ByStart:
     for name, values, low, high, unit in quantities:
         for group, label in enumerate((f"below {low}{unit}", f"{low} to {high}{unit}", f"above {high}{unit}")):
             rows = np.digitize(values, (low, high)) == group
-            counts[f"{name} {label}"] = int(rows.sum()), int((rows & ~flights.success).sum())
+            counts[f"{name} {label}"] = int(rows.sum()), int((rows & ~flights.survival).sum())
     return counts

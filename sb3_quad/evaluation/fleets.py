@@ -25,6 +25,7 @@ class FleetStep(NamedTuple):
     lost: BoolArray  # (n,), on the ground or out of range
     collided: BoolArray  # (n,), on the ground
     distance: FloatArray  # |r - r_T|, (n,), m
+    arrived: BoolArray  # (n,), a flight that ended now would be a success
 
 
 class BatchFleet:
@@ -54,7 +55,8 @@ class BatchFleet:
         """One control step of the rows that are ``flying``; what comes back of the others has no meaning."""
         observation, reward, _ = self._batch.step(actions)
         end = self._batch.outcome
-        return FleetStep(observation, reward.astype(np.float64), ~end["truncated"], end["collision"], end["distance"])
+        ends = ~end["truncated"], end["collision"], end["distance"], end["success"]
+        return FleetStep(observation, reward.astype(np.float64), *ends)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         """Move the targets of some rows, (len(rows), 3); all observations with the new targets, (n, 18)."""
@@ -95,11 +97,12 @@ class PyBulletFleet:
 
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
         n = len(actions)
-        reward, distance, lost, collided = np.zeros(n), np.zeros(n), np.zeros(n, np.bool_), np.zeros(n, np.bool_)
+        reward, distance = np.zeros(n), np.zeros(n)
+        lost, collided, arrived = np.zeros((3, n), np.bool_)
         for row in np.flatnonzero(flying):
             self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(actions[row])
-            collided[row], distance[row] = info["collision"], info["distance"]
-        return FleetStep(self._observation.copy(), reward, lost, collided, distance)
+            collided[row], distance[row], arrived[row] = info["collision"], info["distance"], info["is_success"]
+        return FleetStep(self._observation.copy(), reward, lost, collided, distance, arrived)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         for row, target in zip(rows, targets, strict=True):

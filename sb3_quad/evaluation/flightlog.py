@@ -13,7 +13,7 @@ target                (m, k, 3)          r_T, world frame, m
 wrench                (m, k, 6)          mean since the sample before: force, world frame, N; torque, body frame, N m
 samples               (m,)               how many samples each flight has
 episode_seed          (n,)
-episode_outcome       (n,) text          success, collision or out_of_range
+episode_outcome       (n,) text          success, missed, collision or out_of_range
 episode_start         (n, 13)            position, quaternion, velocity, body rates, in the units above
 episode_target        (n, 3)             first target, m
 episode_flown         (n,)               s until lost or the end
@@ -42,7 +42,7 @@ from sb3_quad.simulation.state import FORCE_BODY, FORCE_WORLD, TORQUE_BODY, TORQ
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SAMPLE_RATE = 50.0  # Hz
-OUTCOMES = {"success": "", "collision": "touches the ground", "out_of_range": "leaves the range"}  # in words
+OUTCOMES = {"success": "", "missed": "", "collision": "touches the ground", "out_of_range": "leaves the range"}  # in words
 STATES = ("position", "quaternion", "velocity", "body_rates", "target")
 
 
@@ -93,7 +93,7 @@ def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset")
     return {
         "episode_seed": np.asarray(seeds, dtype=np.int64),
-        "episode_outcome": np.where(flights.success, "success", np.where(flights.collision, "collision", "out_of_range")),
+        "episode_outcome": np.select([flights.success, flights.survival, flights.collision], [*OUTCOMES][:3], [*OUTCOMES][3]),
         **{f"episode_{name}": getattr(flights, name) for name in as_they_are},
         "episode_path": flights.path_length,
         "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),

@@ -32,7 +32,8 @@ OBSERVATIONS, ACTIONS = quadcopter_spaces()
 class Flights:
     """The metrics of n episodes, one per row."""
 
-    success: BoolArray  # (n,), neither collision nor out of range
+    success: BoolArray  # (n,), survived, and ended at the (last) target: success_distance and success_tilt of the task
+    survival: BoolArray  # (n,), neither collision nor out of range: the thesis's success
     collision: BoolArray  # (n,), the ground was touched
     reward: FloatArray  # (n,), sum of the rewards
     length: IntArray  # (n,), control steps
@@ -138,7 +139,8 @@ def _fly_fleet(
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     flights = Flights(
-        success=np.ones(n, dtype=np.bool_),
+        success=np.zeros(n, dtype=np.bool_),
+        survival=np.ones(n, dtype=np.bool_),
         collision=np.zeros(n, dtype=np.bool_),
         reward=np.zeros(n),
         length=np.zeros(n, dtype=np.int64),
@@ -151,7 +153,7 @@ def _fly_fleet(
         start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
         target=state.target.copy(),
     )
-    flying = flights.success  # until it is lost
+    flying = flights.survival  # until it is lost
     for hook in hooks:
         hook.on_start(state, fleet.vehicle)
 
@@ -162,12 +164,12 @@ def _fly_fleet(
         actions = _ask(asked, observation, flying, (step - 1) * control_step)
         for hook in hooks:
             hook.before_step(state, observation, wrench, flying)
-        observation, step_reward, lost, collided, error = fleet.step(actions, flying)
+        observation, step_reward, lost, collided, error, arrived = fleet.step(actions, flying)
         state = fleet.true_state()
         flights.reward[flying] += step_reward[flying]
         flights.path_length[flying] += np.linalg.norm(state.position - position, axis=1)[flying]
         position = state.position.copy()
-        flights.final_error[flying] = error[flying]
+        flights.final_error[flying], flights.success[flying] = error[flying], arrived[flying]
         flights.length[flying], flights.flown[flying] = step, step * control_step
         times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
         flights.collision[flying & lost & collided] = True
@@ -184,6 +186,7 @@ def _fly_fleet(
             onward = reached[waypoint[reached] < count]
             if onward.size:
                 observation = fleet.set_targets(onward, plan.waypoints[waypoint[onward]])
+    flights.success[~(flying & on_last)] = False
     flights.final_offset[flying] = (state.position - state.target)[flying]
     return flights
 

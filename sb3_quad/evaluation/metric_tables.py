@@ -10,12 +10,13 @@ from sb3_quad.scenarios.load import axis_name
 from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 
 # The rows, without their cells:
-SUCCESS, REWARD, FLOWN = Row("success", "%"), Row("mean reward"), Row("time flown", "s")
+SUCCESS, SURVIVAL = Row("success", "%"), Row("survival", "%")
+REWARD, FLOWN = Row("mean reward"), Row("time flown", "s")
 PATH, MEDIAN, LARGEST = Row("mean path", "m"), Row("final error, median", "m"), Row("final error, largest", "m")
 REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
 HIT, HIT_SIZE = Row("half survive up to", "×"), Row("which is")
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
-ALWAYS_COMPARABLE = {SUCCESS, REACHED, COMPLETED, HIT}  # also where flights are lost, which end early
+ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED, HIT}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
 MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
@@ -30,7 +31,9 @@ def time_row(tolerance: float | str) -> Row:
 
 def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
     """Everything that was measured of a controller in a scenario."""
-    cells = {SUCCESS: _share(metrics.success), REWARD: _mean(metrics.reward), FLOWN: _mean(metrics.flown)}
+    cells = {SURVIVAL: _share(metrics.survival), REWARD: _mean(metrics.reward), FLOWN: _mean(metrics.flown)}
+    if metrics.success is not None:
+        cells[SUCCESS] = _share(metrics.success)
     for arrival in metrics.arrivals:
         some = arrival.time is not None and arrival.share.value < 1.0
         note = f"{100 * arrival.share.value:.3g} % arrive" if some else ""
@@ -56,8 +59,8 @@ def reference_cells(reference: Reference) -> Cells:
     """Others' metrics."""
     given = {REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error, FLOWN: reference.flown}
     cells = {row: _given(value) for row, value in given.items() if value is not None}
-    if reference.success is not None:
-        cells[SUCCESS] = replace(_given(reference.success, 100.0), note=reference.note)
+    shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
+    cells |= {row: replace(_given(share, 100.0), note=reference.note) for row, share in shares.items() if share is not None}
     return cells | {time_row(tolerance): _given(time) for tolerance, time in reference.time_to.items()}
 
 
@@ -70,7 +73,7 @@ def metric_rows(
     :param brief: only the main ones of many tolerances; a plot shows the others.
     """
     others = [reference_cells(reference) for reference in references]
-    none_lost = all(cells is None or cells[SUCCESS].value == 100.0 for cells in measured)
+    none_lost = all(cells is None or cells[SURVIVAL].value == 100.0 for cells in measured)
     rows = []
     for row in _rows_of(scenario, brief):
         failed = Cell(words="failed") if row == SUCCESS else Cell()
@@ -134,18 +137,18 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
 def _rows_of(scenario: Scenario, brief: bool) -> list[Row]:
     """The rows that mean something in a scenario."""
     if scenario.target.waypoints is not None:
-        return [SUCCESS, REACHED, COMPLETED, COURSE_TIME]
+        return [SUCCESS, SURVIVAL, REACHED, COMPLETED, COURSE_TIME]
     if scenario.group is not None:
-        return [SUCCESS, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
+        return [SUCCESS, SURVIVAL, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
     tolerances = scenario.tolerances
     if brief and len(tolerances) > MOST_TOLERANCES:
         referenced = {float(key) for reference in scenario.reference.values() for key in reference.time_to}
         kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        rows = [SUCCESS, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
+        rows = [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
     else:
-        rows = [SUCCESS, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
+        rows = [SUCCESS, SURVIVAL, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
     return rows + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
 
 

@@ -10,15 +10,15 @@ A folder of results holds
 A number that does not exist is None, never NaN.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from sb3_quad.base.validate import Frozen
 from sb3_quad.scenarios.parts import Vector
 from sb3_quad.scenarios.scenario import Scenario
 
-SCHEMA_VERSION: Literal[1] = 1
+SCHEMA_VERSION: Literal[2] = 2
 Scaling = Literal["none", "adaptive"]
 
 
@@ -51,7 +51,11 @@ class Metrics(Frozen):
     """What one controller reached in one scenario; path and errors are of the flights that were not lost."""
 
     n: int = Field(description="flights")
-    success: Estimate = Field(description="share that neither touched the ground nor left the range")
+    success: Estimate | None = Field(
+        default=None,
+        description="share that survived and ended at the target; None: flown by version 0.1, which noted survival",
+    )
+    survival: Estimate = Field(description="share that neither touched the ground nor left the range")
     collisions: int = Field(description="flights that touched the ground")
     out_of_range: int = Field(description="flights that left the range")
     reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
@@ -63,6 +67,11 @@ class Metrics(Frozen):
     final_error_max: float | None = Field(description="m")
     final_offset: Vector | None = Field(description="mean r - r_T at the end, world frame, m")
     course: Course | None = Field(default=None, description="of scenarios with waypoints")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_version_0_1(cls, data: Any) -> Any:
+        return data if "survival" in data else {**data, "survival": data["success"], "success": None}
 
 
 class HitTrial(Frozen):
@@ -128,7 +137,7 @@ class Failure(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[1] = SCHEMA_VERSION
+    schema_version: Literal[2] = SCHEMA_VERSION
     suite: str
     description: str
     source: str = Field(default="reference", description="where the scenarios' reference comes from")
@@ -137,6 +146,16 @@ class Results(Frozen):
     scenarios: list[Scenario]
     entries: list[Entry]
     failures: list[Failure] = Field(default_factory=list)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_version_0_1(cls, data: Any) -> Any:
+        if data.get("schema_version") != 1:
+            return data
+        for scenario in data["scenarios"]:  # whose reference calls survival success
+            references = scenario["reference"].items()
+            scenario["reference"] = {name: {**each, "success": None, "survival": each["success"]} for name, each in references}
+        return {**data, "schema_version": 2}
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """The entry of a controller's label and a scenario's name, None if there is none."""

@@ -62,12 +62,12 @@ def hover_offset(
     """
     own = {} if settings is None else settings.in_any_task()
     flights = fly(controller, "target_tracking", n_flights, seed, **own)
-    lost = 1.0 - float(flights.success.mean())
+    lost = 1.0 - float(flights.survival.mean())
     if lost > 0.5:
         raise ConfigError(
             f"the steady offset from the target cannot be measured: {100 * lost:.0f} % of the flights to targets end early"
         )
-    return np.asarray(flights.final_offset[flights.success].mean(axis=0))
+    return np.asarray(flights.final_offset[flights.survival].mean(axis=0))
 
 
 def measure_mean(policy: Any, n_flights: int = N_FLIGHTS, settings: FlightSettings | None = None) -> FloatArray:

@@ -77,7 +77,7 @@ def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> H
     for _ in range(MAX_ROUNDS):
         factors = np.repeat(grid, search.episodes)
         flights, _ = fly_scenario(controller, scenario, backend, seeds * grid.size, factors)
-        survived = flights.success.reshape(grid.size, search.episodes)
+        survived = flights.survival.reshape(grid.size, search.episodes)
         tried |= {factor: share(row) for factor, row in zip(grid.tolist(), survived, strict=True)}
         lost = next((factor for factor in sorted(tried) if tried[factor].value <= 0.5), None)
         if lost is None:

@@ -15,7 +15,7 @@ RESAMPLES = 1000
 
 def summarise(flights: Flights) -> Metrics:
     """The metrics of some flights, at least one."""
-    done = flights.success
+    done = flights.survival
     error, offset = flights.final_error[done], flights.final_offset[done]
     some, reached = bool(done.any()), np.isfinite(flights.waypoint_times)
     course = None
@@ -24,7 +24,8 @@ def summarise(flights: Flights) -> Metrics:
         course = Course(reached=count, completed=share(reached.all(axis=1)), time=time)
     return Metrics(
         n=flights.n,
-        success=share(done),
+        success=share(flights.success),
+        survival=share(done),
         collisions=int(flights.collision.sum()),
         out_of_range=int((~done & ~flights.collision).sum()),
         reward=_bootstrap(flights.reward),

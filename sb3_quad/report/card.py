@@ -5,7 +5,7 @@ from typing import Any
 
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, metric_cells, time_row
+from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
 from sb3_quad.evaluation.records import Metrics
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
@@ -13,7 +13,7 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 DISTANCES = (10.0, 15.0, 20.0)  # m
 RECOVERY, NEAR = "state recovery", time_row(0.1)
-SHOWN = (SUCCESS, REWARD, NEAR, MEDIAN, LARGEST)
+SHOWN = (SUCCESS, SURVIVAL, REWARD, NEAR, MEDIAN, LARGEST)
 CARD = """# {name}
 
 A policy for the vehicle `{vehicle}`: it recovers from random attitudes, velocities and body rates, and flies

@@ -242,7 +242,14 @@ def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, st
     error, distances = _axes(HALF, axis_label(key), "final distance (m)")
     for label, cells in flown.items():
         x = np.array([scenario.cell[key] for scenario, _ in cells])
-        band(shares, colours[label], label, x, _ends([metrics.success for _, metrics in cells], 100.0), **POINTS)
+        band(
+            shares,
+            colours[label],
+            label,
+            x,
+            _ends([metrics.success or metrics.survival for _, metrics in cells], 100.0),
+            **POINTS,
+        )
         medians = np.array([metrics.final_error_median for _, metrics in cells], dtype=np.float64)
         distances.plot(x, medians, color=colours[label], label=label, **POINTS)
     shares.set_ylim(-3.0, 103.0)
@@ -266,7 +273,7 @@ def _heat_map(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours
             for scenario, metrics in cells:
                 if _rest(scenario) == column:
                     x, y = x_values.index(scenario.cell[keys[0]]), y_values.index(scenario.cell[keys[1]])
-                    grid[y, x] = success = 100.0 * metrics.success.value
+                    grid[y, x] = success = 100.0 * (metrics.success or metrics.survival).value
                     style = {"ha": "center", "va": "center", "fontsize": 7, "color": "#101010" if success > 60 else "#fefefe"}
                     axes.text(x + 0.5, y + 0.5, f"{success:.0f}", **style)
             image = axes.pcolormesh(grid, vmin=0, vmax=100, cmap="viridis", edgecolors=PAPER, linewidth=0.8)

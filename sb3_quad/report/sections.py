@@ -6,7 +6,15 @@ from pathlib import Path
 
 from sb3_quad.drawing.labels import colours_of
 from sb3_quad.evaluation.flightlog import read_tracks
-from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, measured_cells, metric_rows, reference_cells, scenario_groups
+from sb3_quad.evaluation.metric_tables import (
+    SUCCESS,
+    SURVIVAL,
+    mark_best,
+    measured_cells,
+    metric_rows,
+    reference_cells,
+    scenario_groups,
+)
 from sb3_quad.evaluation.records import Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
@@ -14,7 +22,10 @@ from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, group
 from sb3_quad.scenarios.load import axis_label
 from sb3_quad.scenarios.scenario import Scenario
 
-OVERVIEW = "Share of flights that neither touch the ground nor leave the range. Where a scenario is varied: least to greatest."
+OVERVIEW = (
+    "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within 0.25 m and tilted by at"
+    " most 10°. Survival: it neither touches the ground nor leaves the range. Where a scenario is varied: least to greatest."
+)
 
 
 @dataclass(frozen=True)
@@ -36,7 +47,8 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     """
     colours = colours_of([record.label for record in results.controllers])
     groups = scenario_groups(results)
-    parts = [Section("overview", "Success", OVERVIEW, [_success_table(results, groups, colours, "success (%)")])]
+    shares = [_share_table(row, results, groups, colours, f"{row.heading}") for row in (SUCCESS, SURVIVAL)]
+    parts = [Section("overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows])]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:
@@ -50,7 +62,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             if len(first.cell) == 1:
                 cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
                 corner = f"{axis_label(next(iter(first.cell)))}: success (%)"
-                tables.append(_success_table(results, cells, colours, corner))
+                tables.append(_share_table(SUCCESS, results, cells, colours, corner))
         facts = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
             f"observation noise {100 * first.noise:g} %; seed {first.seed}"
@@ -77,29 +89,30 @@ def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, 
     return plots
 
 
-def _success_table(
-    results: Results, groups: Sequence[tuple[str, Sequence[Scenario]]], colours: Mapping[str, str], corner: str
+def _share_table(
+    row: Row, results: Results, groups: Sequence[tuple[str, Sequence[Scenario]]], colours: Mapping[str, str], corner: str
 ) -> Table:
-    """Success in each group of scenarios; where there are several in one, from the worst to the best."""
+    """Success or survival in each group of scenarios; where there are several in one, from the worst to the best."""
     references = [scenarios[0].reference for _, scenarios in groups]
-    others = dict.fromkeys(name for given in references for name in given if given[name].success is not None)
+    others = dict.fromkeys(name for given in references for name in given if row in reference_cells(given[name]))
     rows = []
     for (heading, scenarios), given in zip(groups, references, strict=True):
-        own = mark_best(SUCCESS, [_success(results, label, scenarios) for label in colours])
-        beside = [reference_cells(given[name]).get(SUCCESS, Cell()) if name in given else Cell() for name in others]
-        rows.append(Row(heading, "", [*own, *beside]))
+        own = mark_best(row, [_share(row, results, label, scenarios) for label in colours])
+        beside = [reference_cells(given[name]).get(row, Cell()) if name in given else Cell() for name in others]
+        if any(cell != Cell() for cell in own):
+            rows.append(Row(heading, "", [*own, *beside]))
     return Table(_columns(colours, others, results.source), rows, corner)
 
 
-def _success(results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
+def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
     found = [measured_cells(results, label, scenario) for scenario in scenarios]
-    shares = [cells[SUCCESS] for cells in found if cells is not None]
+    shares = [cells.get(row, Cell()) for cells in found if cells is not None]
     if not shares:
         return Cell(words="failed")
     if len(scenarios) == 1:
         return shares[0]
     values = [share.value for share in shares if share.value is not None]
-    return Cell(words=f"{min(values):.0f} to {max(values):.0f}")
+    return Cell(words=f"{min(values):.0f} to {max(values):.0f}") if values else Cell()
 
 
 def _columns(colours: Mapping[str, str], others: Iterable[str], source: str) -> list[Column]:

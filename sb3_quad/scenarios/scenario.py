@@ -13,7 +13,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
-from sb3_quad.simulation.tasks import Task
+from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
@@ -24,7 +24,10 @@ NumberOrRange = float | tuple[float, float]
 class Reference(Frozen):
     """What others measured, printed beside our own metrics; a pair is a range."""
 
-    success: NumberOrRange | None = Field(default=None, description="share of flights, 0 to 1")
+    success: NumberOrRange | None = Field(default=None, description="share of flights that end at their target, 0 to 1")
+    survival: NumberOrRange | None = Field(
+        default=None, description="share that neither crash nor get lost: the thesis's success"
+    )
     reward: NumberOrRange | None = Field(default=None, description="mean per episode")
     time_to: dict[str, NumberOrRange | None] = Field(
         default_factory=dict, description="from tolerances in m to mean times in s; null: never within it"
@@ -138,7 +141,12 @@ class Scenario(Frozen):
             velocity_std=self.start.velocity.std or 0.0,
             body_rates_std=self.start.body_rates.std or 0.0,
             max_distance=self.max_distance,
+            **({} if self._is_flown_to() else RECOVERED),
         )
+
+    def _is_flown_to(self) -> bool:
+        """Whether the target lies elsewhere than the start."""
+        return bool(self.target.distance) or any(point != self.start.position for point in self.target.points)
 
     @property
     def is_fixed(self) -> bool:

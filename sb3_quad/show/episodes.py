@@ -173,7 +173,7 @@ def _record(name: str, colour: str, controller: Any, settings: FlightSettings, p
         state=QuadcopterState.concatenate(every.states),
         wrench=wrench,
         reward=float(flights.reward[0]),
-        lost="" if flights.success[0] else "collision" if flights.collision[0] else "out of range",
+        lost="" if flights.survival[0] else "collision" if flights.collision[0] else "out of range",
     )
 
 

@@ -109,8 +109,8 @@ class QuadcopterBatch:
 
         :param actions: (n, 4), clipped to [-1, 1].
         :return: observations float32 (n, 18), rewards float32 (n,), done bool (n,): fresh arrays. Of rows that are done,
-            ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, observation) tells how the
-            episode ended, until the row's next one ends; without autoreset it is of every row's last step.
+            ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, success, observation)
+            tells how the episode ended, until the row's next one ends; without autoreset it is of every row's last step.
         """
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):

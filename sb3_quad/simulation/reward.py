@@ -26,6 +26,14 @@ def _tilt(sine2, cosine2):
     return angle if sine2 <= cosine2 else math.pi - angle
 
 
+@compiled(forceinline=True)
+def succeeds(b, lane):
+    """Whether a flight that ends now ends close enough to its target, and level enough."""
+    q, scored = b.quaternion, b.scored
+    r33 = 1.0 - 2.0 * (q[1, lane] * q[1, lane] + q[2, lane] * q[2, lane])
+    return b.distance[lane] <= scored[S.success_distance, lane] and r33 >= math.cos(scored[S.success_tilt, lane])
+
+
 @compiled(fastmath=True)
 def score(b):
     """``b.reward`` and ``b.distance`` |r - r_T| (m) of a loaded block, on the true state at the end of a control step.

@@ -34,6 +34,8 @@ class Task(Frozen):
     velocity_std: NonNegativeFloat = Field(default=0.0, description="standard deviation of v at the start, per axis, m/s")
     body_rates_std: NonNegativeFloat = Field(default=0.0, description="of the body rates at the start, per axis, rad/s")
     max_distance: PositiveFloat = Field(default=30.0, description="farther from the target ends, m")
+    success_distance: PositiveFloat = Field(default=0.1, description="a flight succeeds that ends this close to its target, m")
+    success_tilt: PositiveFloat = Field(default=np.pi, description="and is tilted by no more than this, rad")
     position_cost: NonNegativeFloat = Field(default=0.003, description="per m and control step (Eq. 4.5)")
     tilt_cost: NonNegativeFloat = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
     body_rates_cost: NonNegativeFloat = Field(default=0.0005, description="per rad/s and control step (Eq. 4.7)")
@@ -62,12 +64,15 @@ class Task(Frozen):
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
-SCORED = [name for name in TASK if name == "max_distance" or name.endswith("_cost")]  # what a control step needs
+SCORED = [
+    name for name in TASK if name.startswith(("max_", "success_")) or name.endswith("_cost")
+]  # what a control step needs
 S = first_rows(dict.fromkeys(SCORED, 1))
 
+RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}  # of tasks whose target is their start
 TASKS: Mapping[str, Task] = {
     "target_tracking": Task(name="target_tracking", target_distance=10.0),
-    "state_recovery": Task(name="state_recovery", random_attitude=True, velocity_std=2.0, body_rates_std=4.0),
+    "state_recovery": Task(name="state_recovery", random_attitude=True, velocity_std=2.0, body_rates_std=4.0, **RECOVERED),
     "recovery_and_tracking": Task(
         name="recovery_and_tracking",
         target_distance=25.0,

@@ -95,6 +95,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = _load_snapshot(run, config.algo, env, job.device, **attributes)
+        env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         return _learn(job, run, model, eval_envs, signals, report)
 

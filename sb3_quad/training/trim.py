@@ -37,7 +37,7 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 _POSITION = GROUPS["position"]
 SCALES = (1.0, 0.85, 0.75, 0.65, 0.55, 0.5)  # α
 N_TARGETS, N_RECOVERIES = 120, 480  # flights that judge a scale
-TOLERATED = 0.02  # loss of recovery success for which a smaller α is still taken, if it does not double the failures
+TOLERATED = 0.02  # loss of recoveries for which a smaller α is still taken, if it does not double the failures
 
 STIFFNESS = 0.1  # λ
 N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
@@ -62,8 +62,8 @@ class Trim(NamedTuple):
 def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
     """Find μ and α for an agent and fold them into its first layer.
 
-    Of the scales, the one with the highest mean reward of target tracking is taken, if all its flights succeed and recoveries
-    succeed as often as with α = 1, within two hundredths and with at most twice the failures.
+    Of the scales, the one with the highest mean reward of target tracking is taken, if all its flights survive and recoveries
+    survive as often as with α = 1, within two hundredths and with at most twice the failures.
 
     :param seed: of the flights that judge; report metrics of others.
     :param settings: vehicle, noise and scaling that the agent flies with.
@@ -87,11 +87,11 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
                 raise
             break  # already too lively to hover
         tracking = fly(model, "target_tracking", N_TARGETS, seed, **own.in_any_task())
-        recovery = float(fly(model, "state_recovery", N_RECOVERIES, seed, **own.in_any_task()).success.mean())
+        recovery = float(fly(model, "state_recovery", N_RECOVERIES, seed, **own.in_any_task()).survival.mean())
         reward = float(tracking.reward.mean())
         if scale == 1.0:
             needed = recovery - min(TOLERATED, 1.0 - recovery)
-        if tracking.success.all() and recovery >= needed and reward > best_reward:
+        if tracking.survival.all() and recovery >= needed and reward > best_reward:
             best, best_scale, best_reward = deepcopy(layer.state_dict()), scale, reward
     layer.load_state_dict(best)
     after = hover_offset(model, seed=seed, settings=own)

@@ -84,9 +84,9 @@ class ExpertObjective:
         tracking, ways = self._fly(expert, "target_tracking", self.tracking, WAY)
         recovery, _ = self._fly(expert, "state_recovery", self.recovery, RECOVERY)
         # Recoveries that are not chosen for being hard find gains that lose other starts than the hardest.
-        lost = (~hard.success).sum() / self.starts + (~recovery.success).mean()
+        lost = (~hard.survival).sum() / self.starts + (~recovery.survival).mean()
         low = float(np.exp(-np.maximum(descents.lowest, 0.0) / CLOSE).sum() / self.starts)
-        settling = float(np.where(tracking.success, ways.settled, 2 * WAY * self.vehicle.control_step).mean())
+        settling = float(np.where(tracking.survival, ways.settled, 2 * WAY * self.vehicle.control_step).mean())
         rewards = float(tracking.reward.mean()), float(recovery.reward.mean())
         value = LOST * lost + TOO_LOW * low + settling - TRACKING_REWARD * rewards[0] - RECOVERY_REWARD * rewards[1]
         return Cost(float(value), float(lost), low, settling, *rewards)

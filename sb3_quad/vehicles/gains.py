@@ -1,9 +1,9 @@
 """The gains of the geometric expert as a vehicle's YAML holds them, and how well the expert flies with them."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
@@ -14,14 +14,19 @@ Share = Annotated[float, Field(ge=0, le=1)]
 class GeometricMetrics(Frozen):
     """What :class:`GeometricGains` reached on episodes that no search over them had seen; true state, no other noise."""
 
-    recovery_success: Share = Field(description="share of recovery episodes with neither collision nor out of range")
+    recovery_survival: Share = Field(description="share of recovery episodes with neither collision nor out of range")
     recovery_episodes: PositiveInt = Field(description="recovery episodes flown")
-    tracking_success: Share = Field(description="share of tracking episodes with neither collision nor out of range")
+    tracking_survival: Share = Field(description="share of tracking episodes with neither collision nor out of range")
     tracking_episodes: PositiveInt = Field(description="tracking episodes flown, targets 10 m away")
     time_to_0_1_m: PositiveFloat = Field(description="mean time until 0.1 m from the target, of the tracking episodes, s")
     tracking_reward: float = Field(description="mean reward of the tracking episodes (Eqs. 4.5-4.9)")
     observation_noise: NonNegativeFloat = Field(description="relative, on what the expert sees")
     seeds: tuple[int, ...] = Field(min_length=1, description="seed of each set of episodes")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _former_names(cls, data: Any) -> Any:
+        return {str(key).replace("_success", "_survival"): value for key, value in dict(data).items()}
 
 
 class GeometricGains(Frozen):

@@ -44,17 +44,17 @@ def run(options: argparse.Namespace) -> int:
     search.note_output(content.encode("utf-8"))
     write_text(output, content)
 
-    heads = ("", "episodes", "success", "mean time to 0.1 m", "mean reward")
-    recovery = (str(measured.recovery_episodes), f"{100 * measured.recovery_success:.2f} %", "", "")
-    tracking = (str(measured.tracking_episodes), f"{100 * measured.tracking_success:.2f} %")
+    heads = ("", "episodes", "survival", "mean time to 0.1 m", "mean reward")
+    recovery = (str(measured.recovery_episodes), f"{100 * measured.recovery_survival:.2f} %", "", "")
+    tracking = (str(measured.tracking_episodes), f"{100 * measured.tracking_survival:.2f} %")
     times = (f"{measured.time_to_0_1_m:.2f} s", f"{measured.tracking_reward:.2f}")
     rows = [("state recovery", *recovery), ("target tracking", *tracking, *times)]
     console().print(text_table("on fresh episodes, true state", heads, rows))
     starts = []
     for start, (flown, lost) in recoveries.items():
-        success = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
-        starts.append((start, str(flown), str(lost), success))
-    console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "success"), starts))
+        survival = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
+        starts.append((start, str(flown), str(lost), survival))
+    console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "survival"), starts))
     print(f"{search.trials_done} gains tried, least cost {search.study.best_value:.3f}; journal: {journal}")
     print(f"saved {output}")
     return signals.exit_code

@@ -28,7 +28,7 @@ from sb3_quad.simulation.engine.random import STEP
 from sb3_quad.simulation.episodes import start_episode
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
-from sb3_quad.simulation.reward import score
+from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import TASK, S
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
@@ -55,7 +55,8 @@ OUTCOME = np.dtype(
         ("distance", "f8"),  # |r - r_T|, m
         ("collision", "?"),
         ("out_of_range", "?"),
-        ("truncated", "?"),  # neither of these
+        ("truncated", "?"),  # neither of these: the flight survived
+        ("success", "?"),  # survived, and ended at its target
         ("observation", "f4", (OBSERVATION_SIZE,)),
     ],
     align=True,
@@ -145,6 +146,7 @@ def run_block(job, number, b, fresh):
                 outcome[i].collision = height[lane] <= radius[lane]
                 outcome[i].out_of_range = distance[lane] > scored[S.max_distance, lane]
                 outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
+                outcome[i].success = outcome[i].truncated and succeeds(b, lane)
                 outcome[i].distance = distance[lane]
                 outcome[i].total, outcome[i].reward = returns[i], b.reward[lane]
                 outcome[i].length = streams[STEP, i]
