@@ -143,10 +143,9 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
-    updates = -(-config.n_timesteps // (model.n_steps * env.num_envs))
-    for schedule in keywords.values():
-        if isinstance(schedule, LinearSchedule):  # SB3 asks it for the last update's value when nothing remains: not 0
-            schedule.end = schedule.start / updates
+    rate = keywords.get("learning_rate")
+    if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
+        rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
     env.seed(seed_for("training", job.seed))  # SB3 has just seeded it with the seed of the policy
     return model
 

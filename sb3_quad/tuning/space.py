@@ -49,7 +49,7 @@ class Interval(Frozen):
 
     :param log: on a logarithmic scale.
     :param whole: whole numbers only; others have four significant digits.
-    :param schedule: written ``lin_x``: falls linearly from x over the training.
+    :param schedule: written ``lin_x``: falls linearly from x to 0 over the training.
     """
 
     low: float
