@@ -67,7 +67,7 @@ class QuadcopterVecEnv(InFlight, VecEnv):
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces())
-        self.metadata["render_fps"] = round(1.0 / self.vehicle.control_step)
+        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
 
     def _make_renderers(self, rows: Sequence[int], width: int, height: int) -> "dict[int, Renderer]":
         if self.render_mode is None:
