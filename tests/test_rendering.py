@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.drawing import models
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
@@ -136,7 +137,7 @@ def test_sb3_films_the_batched_environment(tmp_path: Path, monkeypatch: pytest.M
     assert all(_orange(half).sum() > 20 for half in np.split(frames[3], 2))
     assert np.abs(frames[4].astype(float) - frames[3]).mean() > 3 * np.abs(frames[3].astype(float) - frames[2]).mean()
     single = QuadcopterEnv(noise=0.0, render_mode="rgb_array", **size)
-    single.reset(seed=3)
+    single.reset(seed=row_seeds(0, 5)[3])
     np.testing.assert_array_equal(frames[0][120:], single.render())
     for each in (env, env, single):
         each.close()
