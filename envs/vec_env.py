@@ -83,7 +83,8 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces())
-        self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
+        fps: Any = round(1.0 / self.vehicle.control_step)  # SB3's type of it knows lists alone
+        self.metadata["render_fps"] = fps
 
     def _make_renderers(self, rows: Sequence[int], width: int, height: int) -> "dict[int, Renderer]":
         if self.render_mode is None:
