@@ -23,7 +23,8 @@ class BestModel(EveryTimesteps):
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's EvalCallback keeps the
     model of the highest mean reward; here a model that succeeds more often is better, and reward decides between equals.
     ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training besides. It logs ``eval/success_rate``,
-    ``eval/survival_rate``, ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``.
+    ``eval/survival_rate``, ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``, where the
+    evaluation happens.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad import PIDExpert
@@ -112,6 +113,7 @@ class BestModel(EveryTimesteps):
             save_model(self.model, self._best_model)
             line += " (best so far)"
         self._report(line)
+        self.logger.dump(self.num_timesteps)  # as EvalCallback does: a later evaluation of the rollout would replace it
         self.stopped = not self._should_continue(*score)
 
     def _fly(self, group: str, seconds: float) -> Score:

@@ -93,20 +93,19 @@ class BulletBody:
 class Renderer:
     """Draws one vehicle, its target and the wrench that acts on it; the flight is the same with and without it.
 
-    :param body: the simulation. If it has a window, that is drawn into, in real time.
     :param width: of the pictures, pixels; ``height`` likewise.
+    :param body: the simulation, if PyBullet flies. If it has a window, that is drawn into, in real time.
     """
 
-    def __init__(self, vehicle: Vehicle, body: BulletBody, width: int, height: int) -> None:
-        self.vehicle, self.client = vehicle, body.client
-        self.size, self.human = (width, height), body.has_window
+    def __init__(self, vehicle: Vehicle, width: int, height: int, body: BulletBody | None = None) -> None:
+        self.vehicle, self.scene = vehicle, Scene(vehicle, None if body is None else body.client)
+        self.size, self.human = (width, height), body is not None and body.has_window
         self.shown_at, self.frames_due = time.perf_counter(), 1.0
-        # PyBullet would draw the collision sphere.
-        p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=self.client)
-        self.scene = Scene(vehicle, self.client)
+        if body is not None:  # PyBullet would draw the collision sphere
+            p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client)
         self.reset(np.zeros(STATE_SIZE))
         if self.human:
-            start_drawing(self.client)
+            start_drawing(self.scene.client)
 
     def reset(self, state: FloatArray) -> None:
         """A new episode: the camera jumps to where ``state``, (STATE_SIZE,), says."""
@@ -129,7 +128,7 @@ class Renderer:
         if self.frames_due >= 1.0:
             self.frames_due %= 1.0
             self._place(state, wrench)
-            point_window(self.client, camera, state[POSITION])
+            point_window(self.scene.client, camera, state[POSITION])
         self.shown_at += self.vehicle.control_step
         ahead = self.shown_at - time.perf_counter()
         if ahead > 0:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -10,11 +11,13 @@ from gymnasium.vector.utils import batch_space
 from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.tasks import TaskSpec
+
+_INFOS = {"is_success": "success", "survival": "truncated"} | {key: key for key in ("distance", "collision", "out_of_range")}
 
 
 class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
@@ -25,9 +28,14 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
     ``reset(seed=s)`` flies as that environment does after ``reset(seed=row_seeds(s, n)[i])``, see
     :func:`~sb3_quad.base.seeds.row_seeds`.
 
-    Autoreset is ``SAME_STEP``: a row that ends returns the first observation of its next episode, and the infos hold the last
-    one in ``final_obs[i]`` and ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range`` in
-    ``final_info``, each with the mask ``_final_obs``, ``_final_info`` and so on. Where no episode ends, infos are empty.
+    The infos of every step hold ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``, (n,) each,
+    and as ``_is_success`` and so on the mask of the rows that they are of.
+
+    :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. ``"SameStep"``: a row that ends returns the
+        first observation and infos of its next episode, and the last ones are in ``final_obs[i]`` and ``final_info``.
+        ``"NextStep"``: it returns its last ones, and the next step begins its next episode, whatever its action is.
+        ``"Disabled"``: it is to be reset by ``options["reset_mask"]`` before the next step.
+    :raises ConfigError: an argument that does not fit.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
@@ -38,12 +46,20 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         **keywords: Unpack[BatchKeywords],
     ) -> None:
         if render_mode is not None:
             raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
-        self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords)
+        modes = {mode.value: mode for mode in AutoresetMode}
+        name = getattr(autoreset_mode, "value", autoreset_mode)
+        if name not in modes:
+            raise ConfigError(unknown("autoreset_mode", name, modes))
+        self._mode = modes[name]
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode}  # type: ignore[misc]
+        self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords, autoreset=False)
         self.num_envs = self.batch.n
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step, or by the user
         self.single_observation_space, self.single_action_space = quadcopter_spaces()
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -68,25 +84,40 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
         seeded = [row for row in np.flatnonzero(mask).tolist() if seeds[row] is not None]
         if seeded:
             self.batch.seed([seeds[row] for row in seeded], seeded)
-        return self.batch.reset(mask), {}
+        self._ended[mask] = False
+        return self._begin(mask), self._infos(mask)
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
         """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos."""
-        outcome = self.batch.outcome
+        before, final = self._ended, {}
+        if self._mode is AutoresetMode.DISABLED and before.any():
+            rows = np.flatnonzero(before).tolist()
+            raise gymnasium.error.ResetNeeded(
+                f"rows {rows} have ended; call reset(options={{'reset_mask': ...}}) before step()"
+            )
         observations, rewards, done = self.batch.step(actions)
-        truncated = done & outcome["truncated"]
-        infos: dict[str, Any] = {}
-        if done.any():
-            final = np.full(self.num_envs, None, dtype=object)
+        if self._mode is AutoresetMode.NEXT_STEP and before.any():
+            observations = self._begin(before)
+            rewards[before], done[before] = 0.0, False
+        truncated = done & self.batch.outcome["truncated"]
+        if self._mode is not AutoresetMode.SAME_STEP:
+            self._ended = done
+        elif done.any():
+            last = np.full(self.num_envs, None, dtype=object)
             for row in np.flatnonzero(done):
-                final[row] = outcome["observation"][row].copy()
-            info: dict[str, Any] = {
-                "is_success": done & outcome["success"],
-                "survival": truncated.copy(),
-                "distance": np.where(done, outcome["distance"], 0.0),
-                "collision": done & outcome["collision"],
-                "out_of_range": done & outcome["out_of_range"],
-            }
-            info |= {f"_{key}": done.copy() for key in info}
-            infos = {"final_obs": final, "_final_obs": done.copy(), "final_info": info, "_final_info": done.copy()}
-        return observations, rewards, done & ~truncated, truncated, infos
+                last[row] = observations[row]
+            final = {"final_obs": last, "_final_obs": done, "final_info": self._infos(done), "_final_info": done}
+            observations = self._begin(done)
+        return observations, rewards, done & ~truncated, truncated, {**self._infos(), **final}
+
+    def _begin(self, rows: BoolArray) -> Float32Array:
+        """Begin the next episodes of rows, (n,); the observations of all."""
+        observations = self.batch.reset(rows)
+        self.batch.clear_outcome(rows)
+        return observations
+
+    def _infos(self, rows: BoolArray | None = None) -> dict[str, Any]:
+        """What the last step of some rows, (n,), was; None: of all. Elsewhere zeros."""
+        mask = np.ones(self.num_envs, dtype=np.bool_) if rows is None else rows.copy()
+        infos = {key: self.batch.outcome[field] * mask for key, field in _INFOS.items()}
+        return infos | {f"_{key}": mask for key in infos}

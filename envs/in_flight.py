@@ -11,6 +11,7 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.state import TARGET
+from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
 P = ParamSpec("P")
@@ -62,6 +63,21 @@ class InFlight:
     def target(self) -> FloatArray:
         """Targets r_T, (n, 3), world frame, m."""
         return self._by_row(self.batch.state[TARGET])
+
+    @property
+    def wrench(self) -> FloatArray:
+        """What :meth:`set_wrench` has set, (n, 12): force world, force body, torque world, torque body; N, N m."""
+        return self._by_row(self.batch.wrench)
+
+    @property
+    def task(self) -> TaskSpec:
+        """The task of the episodes that begin from now on, as it was given; ``task_kwargs`` are fields put over it."""
+        return self.batch.task
+
+    @property
+    def task_kwargs(self) -> dict[str, Any]:
+        """Fields of the task that are overridden."""
+        return dict(self.batch.task_kwargs)
 
     @property
     def noise(self) -> Any:

@@ -138,7 +138,8 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `set_observation_scaling(mean, std)` | mean and std of Eq. 3.16, (18,) each; `None` leaves one as it is |
     | `set_task(task, task_kwargs)` | the task from the next reset on |
 
-    `true_state()`, `target`, `noise`, `observation_mean`, `observation_std` and `vehicle` tell what holds.
+    `true_state()`, `target`, `wrench`, `noise`, `observation_mean`, `observation_std`, `task`, `task_kwargs` and `vehicle`
+    tell what holds.
 
     ## Version History
 
@@ -174,7 +175,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         self._body = BulletBody(self.vehicle, self._size if self.render_mode == "human" else None)
         self._renderer = None
         if self._body.has_window or self.render_mode == "rgb_array":
-            self._renderer = Renderer(self.vehicle, self._body, *self._size)
+            self._renderer = Renderer(self.vehicle, *self._size, self._body)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Float32Array, dict[str, Any]]:
         """Begin an episode; after :meth:`close`, in a new simulation.
@@ -199,8 +200,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             self._renderer.reset(batch.state[:, 0])
         if self.render_mode == "human":
             self._draw()
-        batch.outcome[:] = 0  # only the end of a control step is judged
-        batch.outcome["truncated"], batch.outcome["distance"] = True, self.true_state().distance
+        batch.clear_outcome()
         return self.observe(), self._info()
 
     def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:

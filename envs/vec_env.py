@@ -2,24 +2,31 @@
 
 import secrets
 import time
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import Wrapper
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 from typing_extensions import Unpack
 
+from sb3_quad.base.arrays import Image
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
+from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
 
-_ROW_ATTRIBUTES = ("target", "noise", "observation_mean", "observation_std")
+if TYPE_CHECKING:
+    from sb3_quad.envs.bullet import Renderer
+
+_SETTABLE = ("target", "noise", "observation_mean", "observation_std", "task")
+_OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench")
 _METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
 
 
@@ -47,7 +54,14 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
     infos of other rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are
     fresh.
 
-    See :class:`~sb3_quad.simulation.batch.QuadcopterBatch` for the arguments.
+    See :class:`~sb3_quad.simulation.batch.QuadcopterBatch` for the other arguments.
+
+    :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over ``max_episode_steps``, so
+        that the mean return and success of a training are of all its episodes, not at first of crashes alone.
+    :param render_mode: ``"rgb_array"``: :meth:`render` gives pictures, without a display; None: it gives none.
+    :param render_rows: the rows that are drawn; :meth:`render` tiles their pictures into one.
+    :param render_width: of one row's picture, pixels; ``render_height`` likewise.
+    :raises ConfigError: an argument that does not fit.
     """
 
     def __init__(
@@ -55,15 +69,34 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         n_envs: int,
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
+        staggered: bool = False,
+        render_mode: str | None = None,
+        render_rows: Sequence[int] = (0,),
+        render_width: int = 640,
+        render_height: int = 480,
         **keywords: Unpack[BatchKeywords],
     ) -> None:
         self.batch = QuadcopterBatch(n_envs, task, task_kwargs, **keywords)
-        self.render_mode: str | None = None
+        self.render_mode, self._staggered = render_mode, staggered
+        self._renderers = self._make_renderers(render_rows, render_width, render_height)
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces())
+        fps: Any = round(1.0 / self.vehicle.control_step)  # SB3's type of it knows lists alone
+        self.metadata["render_fps"] = fps
+
+    def _make_renderers(self, rows: Sequence[int], width: int, height: int) -> "dict[int, Renderer]":
+        if self.render_mode is None:
+            return {}
+        if self.render_mode != "rgb_array":
+            raise ConfigError(f"render_mode {self.render_mode!r}: the batched environment has 'rgb_array' only")
+        check_size(width, height)
+        from sb3_quad.envs.bullet import Renderer  # not at the top: trainings need no PyBullet
+
+        vehicles = self.batch.vehicle_list
+        return {row: Renderer(vehicles[row], width, height) for row in self.batch.rows(rows).tolist()}
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, 18)."""
@@ -73,7 +106,11 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         if any(seed is not None for seed in self._seeds):
             self.batch.seed(self._seeds)
             self._reset_seeds()
-        return self.batch.reset()
+        observations = self.batch.reset()
+        self._follow(range(self.batch.n))
+        if self._staggered:
+            self.batch.stagger()
+        return observations
 
     def step_async(self, actions: npt.NDArray[Any]) -> None:
         """Keep the actions, (n, 4), for :meth:`step_wait`."""
@@ -87,6 +124,7 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         rows = np.flatnonzero(dones)
         self._ended = rows.tolist()
         if self._ended:
+            self._follow(self._ended)
             elapsed = round(time.time() - self._start, 6)
             outcomes = self.batch.outcome[rows].tolist()  # of a copy, so that the last observations are fresh
             for row, outcome in zip(self._ended, outcomes, strict=True):
@@ -103,8 +141,21 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
                 }
         return observations, rewards, dones, self._infos
 
+    def _follow(self, rows: Iterable[int]) -> None:
+        """Let the cameras of rows that have just begun an episode jump there."""
+        for row in self._renderers.keys() & rows:
+            self._renderers[row].reset(self.batch.state[:, row])
+
+    def get_images(self) -> list[Image | None]:
+        """A picture of each of ``render_rows``, uint8 (height, width, 3)."""
+        batch = self.batch
+        return [renderer.render(batch.state[:, row], batch.wrench[:, row]) for row, renderer in self._renderers.items()]
+
     def close(self) -> None:
-        """Nothing to close; calling it twice is fine."""
+        """Give back what draws; calling it twice is fine."""
+        for renderer in self._renderers.values():
+            renderer.scene.close()
+        self._renderers = {}
 
     @property
     def max_episode_steps(self) -> int:
@@ -117,14 +168,14 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         if attr_name == "vehicle":
             return [self.batch.vehicle_list[row] for row in rows]
         value = getattr(self, attr_name)
-        return [value[row] if attr_name in _ROW_ATTRIBUTES else value for row in rows]
+        return [value[row] if attr_name in _OF_ROWS else value for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set ``target``, ``noise``, ``observation_mean``, ``observation_std`` of rows, or ``max_episode_steps`` of all."""
+        """Set ``target``, ``noise``, ``observation_mean``, ``observation_std``; of all ``task``, ``max_episode_steps``."""
         if attr_name == "max_episode_steps":
             self.batch.set_max_episode_steps(value)
-        elif attr_name not in _ROW_ATTRIBUTES:
-            raise AttributeError(f"{attr_name!r} cannot be set; these can: {', '.join(_ROW_ATTRIBUTES)}, max_episode_steps")
+        elif attr_name not in _SETTABLE:
+            raise AttributeError(f"{attr_name!r} cannot be set; these can: {', '.join(_SETTABLE)}, max_episode_steps")
         elif attr_name.startswith("observation_"):
             self.set_observation_scaling(**{attr_name.removeprefix("observation_"): value}, indices=indices)
         else:
@@ -143,5 +194,5 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         return [None] * rows.size
 
     def env_is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None) -> list[bool]:
-        """False for every row: rows are not Gymnasium environments."""
-        return [False] * self.batch.rows(indices).size
+        """True of SB3's ``Monitor``, whose ``info["episode"]`` the rows give; of no other wrapper."""
+        return [wrapper_class is Monitor] * self.batch.rows(indices).size

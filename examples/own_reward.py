@@ -44,7 +44,7 @@ class CalmActions(VecEnvWrapper):
 def make_env(n_envs, seed):
     """Coefficients of Eqs. 4.5 to 4.9 are `task_kwargs`: here a tilt costs twice as much as in the thesis."""
     env = QuadcopterVecEnv(n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed)
-    return VecMonitor(CalmActions(env, cost=0.05))  # so that ep_rew_mean is of the new reward
+    return VecMonitor(CalmActions(env, cost=0.05))  # ep_rew_mean is of the new reward; SB3 warns of that
 
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.results_plotter import load_results
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.callbacks import best_model
@@ -62,6 +63,22 @@ def test_evaluations_are_regular_and_recorded(tmp_path, algorithm):
         assert (np.diff(file["seconds"]) >= 0).all()
     assert len(lines) == 3
     assert (tmp_path / "best_model.zip").is_file()
+
+
+def logged(folder, tag):
+    """Timesteps and values that TensorBoard shows."""
+    events = EventAccumulator(str(folder)).Reload()
+    return [(event.step, event.value) for event in events.Scalars(tag)]
+
+
+def test_tensorboard_shows_every_evaluation_where_it_happened(tmp_path):
+    best, model = make_best(tmp_path, every=20), make_model(tensorboard_log=str(tmp_path))
+    model.learn(120, callback=best)  # two in each rollout
+    best.evaluate()
+    with np.load(tmp_path / "evaluations.npz") as file:
+        means = file["results"].mean(axis=1)
+    steps, shown = zip(*logged(tmp_path / "PPO_1", "eval/mean_reward"), strict=True)
+    assert steps == (20, 40, 60, 80, 100, 120, 120) and shown == pytest.approx(means, abs=1e-5)
 
 
 def test_success_comes_before_reward(tmp_path, monkeypatch):
@@ -143,12 +160,13 @@ def test_the_expert_flies_the_same_episodes_once(tmp_path):
 
     best = make_best(tmp_path, every=40, expert=expert, others={"far": make_vec_env(Walk, 2)})
     model = make_model()
-    seen = []
-    note = ConvertCallback(lambda *_: seen.append(dict(model.logger.name_to_value)) is None)
-    model.learn(80, callback=[best, note])
-    (logged, *_) = [values for values in seen if "eval/mean_reward" in values]
+    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
+    model.learn(80, callback=best)
     for group in ("eval", "eval_far"):
-        assert logged[f"{group}/reward_against_expert"] == pytest.approx(logged[f"{group}/mean_reward"] - 5.0)
+        (_, reward), (_, difference) = (
+            logged(tmp_path, f"{group}/{name}")[0] for name in ("mean_reward", "reward_against_expert")
+        )
+        assert difference == pytest.approx(reward - 5.0, abs=1e-5)
     assert asked == [2] * 40  # four episodes of ten steps in two environments, for two groups, and never again
 
 

@@ -15,6 +15,7 @@ import torch
 import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.results_plotter import load_results
 
 from sb3_quad.cli import compare, main
 from sb3_quad.settings.config import build_config
@@ -182,6 +183,20 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
     assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {"max_episode_steps": 60, "noise": 0.1}
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
+
+
+@pytest.mark.parametrize("vec_env", ["batch", "dummy"])
+def test_episodes_end_at_all_ages_from_the_first_rollout_on(tmp_path, vec_env):
+    result = train(job(tmp_path, vec_env=vec_env, n_timesteps=400), report=lambda line: None)  # 50 steps of at most 60
+    assert load_results(str(result.run.path)).l.tolist() == [8, 15, 23, 30, 38, 45]
+    assert [info["l"] for info in result.model.ep_info_buffer] == [8, 15, 23, 30, 38, 45]
+
+
+@pytest.mark.parametrize(("n_timesteps", "last"), [(400, 1e-3), (1000, 1e-3 / 3), (1200, 1e-3 / 3)])
+def test_the_last_update_learns(tmp_path, n_timesteps, last):
+    model = train(job(tmp_path, n_timesteps=n_timesteps), report=lambda line: None).model
+    assert model.logger.name_to_value["train/learning_rate"] == pytest.approx(last)
+    assert model.lr_schedule(1.0) == 1e-3
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])

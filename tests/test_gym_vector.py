@@ -4,7 +4,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers.vector import RecordEpisodeStatistics
+from gymnasium.wrappers.vector import (
+    ClipReward,
+    DictInfoToList,
+    NormalizeObservation,
+    NormalizeReward,
+    RecordEpisodeStatistics,
+)
 
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.base.errors import ConfigError
@@ -21,11 +27,10 @@ def test_it_is_made_by_gymnasium():
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     assert env.unwrapped.batch.max_episode_steps == env.spec.max_episode_steps == 1500
     observations, infos = env.reset(seed=1)
-    assert observations in env.observation_space and infos == {}
+    assert observations in env.observation_space and infos["distance"].tolist() == pytest.approx([10.0] * 3)
     assert env.observation_space.shape == (3, 18) and env.action_space.shape == (3, 4)
     observations, rewards, terminated, truncated, infos = env.step(env.action_space.sample())
     assert observations in env.observation_space and rewards.shape == terminated.shape == truncated.shape == (3,)
-    assert infos == {}
     env.close()
     recovery = gymnasium.make_vec("QuadStateRecovery-v0", num_envs=2, vectorization_mode="vector_entry_point")
     recovery.reset(seed=0)
@@ -83,12 +88,61 @@ def test_seeds_and_masks():
     )
 
 
-def test_gymnasiums_wrappers_work_on_it():
-    env = RecordEpisodeStatistics(make(4, max_episode_steps=10))
-    env.reset(seed=0)
-    for _ in range(10):
-        *_, truncated, infos = env.step(np.zeros((4, 4)))
-    assert truncated.all() and "episode" in {**infos, **infos["final_info"]}
+def same(ours, theirs):
+    """Whether infos agree, key by key and row by row."""
+    assert ours.keys() == theirs.keys()
+    for key, value in theirs.items():
+        if isinstance(value, dict):
+            same(ours[key], value)
+        elif value.dtype == object:  # the last observations, None where no episode has ended
+            assert [each is None for each in ours[key]] == [each is None for each in value]
+            for got, expected in zip(ours[key], value, strict=True):
+                assert expected is None or np.abs(got - expected).max() < 2e-6
+        else:
+            np.testing.assert_allclose(ours[key], value, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", AutoresetMode)
+def test_every_autoreset_mode_is_that_of_gymnasiums_own_vector_environment(mode):
+    kwargs = {"task_kwargs": {"max_distance": 10.02}, "max_episode_steps": 25}  # some fall out of range, others stay
+    env = make(4, autoreset_mode=mode, **kwargs)
+    singles = gymnasium.vector.SyncVectorEnv(
+        [lambda: gymnasium.make("QuadTargetTracking-v0", **kwargs) for _ in range(4)], autoreset_mode=mode
+    )
+    assert env.metadata["autoreset_mode"] is mode
+    (ours, our_infos), (theirs, their_infos) = env.reset(seed=3), singles.reset(seed=row_seeds(3, 4))
+    np.testing.assert_allclose(ours, theirs, atol=2e-6)
+    same(our_infos, their_infos)
+    terminations, truncations, actions = 0, 0, -np.ones((4, 4), dtype=np.float32)
+    for _ in range(60):
+        ours, theirs = env.step(actions), singles.step(actions)
+        for got, expected in zip(ours[:4], theirs[:4], strict=True):
+            np.testing.assert_allclose(got, expected, atol=2e-6)
+        same(ours[4], theirs[4])
+        ended = ours[2] | ours[3]
+        terminations, truncations = terminations + ours[2].sum(), truncations + ours[3].sum()
+        if mode is AutoresetMode.DISABLED and ended.any():
+            with pytest.raises(gymnasium.error.ResetNeeded, match=f"rows .*{np.flatnonzero(ended)[0]}"):
+                env.step(actions)
+            both = [each.reset(options={"reset_mask": ended.copy()}) for each in (env, singles)]
+            np.testing.assert_allclose(both[0][0], both[1][0], atol=2e-6)
+            same(both[0][1], both[1][1])
+    assert terminations > 2 and truncations > 2
+    singles.close()
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_gymnasiums_wrappers_count_each_episode_once(mode):
+    env = RecordEpisodeStatistics(make(4, max_episode_steps=10, autoreset_mode=mode))
+    wrapped = NormalizeReward(ClipReward(env, -1.0, 0.0))
+    if mode == "NextStep":  # which this one demands
+        wrapped = NormalizeObservation(wrapped)
+    wrapped.reset(seed=0)
+    for _ in range(35):
+        observations, rewards, *_ = wrapped.step(np.zeros((4, 4)))
+        assert np.isfinite(observations).all() and np.isfinite(rewards).all()
+    assert list(env.length_queue) == [10] * 12 and env.return_queue[0] == pytest.approx(-0.3, abs=0.01)
+    assert len(DictInfoToList(make(4)).reset(seed=0)[1]) == 4
 
 
 @pytest.mark.parametrize(
@@ -107,5 +161,7 @@ def test_bad_resets_are_refused(call, says):
 def test_bad_arguments_are_refused():
     with pytest.raises(ConfigError, match="n_envs 0"):
         make(0)
+    with pytest.raises(ConfigError, match="did you mean 'NextStep'"):
+        make(2, autoreset_mode="NextSteps")
     with pytest.raises(ConfigError, match="render_mode"):
         make(2, render_mode="human")

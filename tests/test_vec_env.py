@@ -3,10 +3,15 @@
 import subprocess
 import sys
 import threading
+import warnings
 
 import numpy as np
 import pytest
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 from sb3_quad.base.errors import ConfigError
@@ -302,6 +307,46 @@ def test_setters_reach_the_rows_they_name():
     assert env.get_attr("vehicle")[3].name == env.vehicle.name == "itm"
     assert [state.n for state in env.env_method("true_state")] == [1] * 4
     assert env.get_attr("render_mode") == [None] * 4 and env.env_is_wrapped(VecMonitor) == [False] * 4
+    env.set_wrench(force=(0.0, 2.0, 0.0), indices=[1])
+    assert [wrench.tolist() for wrench in env.get_attr("wrench", [0, 1])] == [[0.0] * 12, [0.0, 2.0] + [0.0] * 10]
+    env.set_attr("task", "state_recovery")
+    assert env.get_attr("task") == ["state_recovery"] * 4 and env.get_attr("task_kwargs") == [{}] * 4
+    env.set_task(MIXTURE, {"max_distance": 9.0})
+    assert (env.task, env.task_kwargs) == (MIXTURE, {"max_distance": 9.0})
+
+
+def test_its_episodes_are_a_monitors():
+    env = QuadcopterVecEnv(3, seed=0, max_episode_steps=20)
+    assert env.env_is_wrapped(Monitor, [0, 2]) == [True] * 2 and env.env_is_wrapped(TimeLimit) == [False] * 3
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rewards, lengths = evaluate_policy(_Hover(), env, 3, return_episode_rewards=True)
+        EvalCallback(env, n_eval_episodes=3)
+    assert lengths == [20] * 3 and rewards == pytest.approx([-0.6] * 3, abs=0.01)
+
+
+class _Hover:
+    def predict(self, observation, **_):
+        return np.zeros((len(observation), 4)), None
+
+
+def test_staggered_episodes_end_at_times_spread_evenly():
+    env = QuadcopterVecEnv(20, seed=0, max_episode_steps=100, staggered=True)
+    plain = QuadcopterVecEnv(20, seed=0, max_episode_steps=100)
+    env.reset()
+    plain.reset()
+    np.testing.assert_array_equal(env.true_state().array, plain.true_state().array)
+    ends = []
+    for step in range(1, 301):
+        infos = env.step(np.zeros((20, 4)))[3]
+        ends += [(step, info["episode"]["l"]) for info in infos if info]
+        if step == 50:
+            kept = env.batch.snapshot()
+    assert ends == [(5 * k, min(5 * k, 100)) for k in range(1, 61)]
+    again = QuadcopterVecEnv(20, max_episode_steps=100)
+    again.batch.restore(kept)
+    lengths = [info["episode"]["l"] for _ in range(10) for info in again.step(np.zeros((20, 4)))[3] if info]
+    assert lengths == [55, 60]
 
 
 def test_scaling_and_noise_of_one_row_act_on_that_row():

@@ -1,7 +1,7 @@
 """The settings of one training job, from rl-zoo's YAML: one file per algorithm, top keys environment ids.
 
 :class:`TrainingConfig` lists the keys of a job; any other key is a keyword of the algorithm's constructor, where ``lin_1e-3``
-falls linearly to 0 over the training.
+falls linearly to 0 over the training; a learning rate to its n-th part, in the last of n updates.
 """
 
 from collections.abc import Collection

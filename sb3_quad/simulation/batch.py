@@ -20,7 +20,7 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 _MODE = (JOB.names or ()).index("mode")
-_MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns")  # all that future flight depends on
+_MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns", "limits")  # all that future flight depends on
 
 
 class BatchKeywords(TypedDict, total=False):
@@ -74,6 +74,7 @@ class QuadcopterBatch:
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
         self.vehicles = np.stack([each.parameters() for each in columns], axis=1)
         self.tasks = resolve_tasks(task, task_kwargs)
+        self.task, self.task_kwargs = task, dict(task_kwargs or {})
         self.task_index = np.zeros(n, dtype=np.int64)
         self.state = np.zeros((STATE_SIZE, n))
         self.queue = np.zeros((self.vehicle_list[0].delay, 4, n))
@@ -84,6 +85,7 @@ class QuadcopterBatch:
         self.mean = DEFAULT_MEAN[:, None].copy()
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
+        self.limits = np.full(n, self.max_episode_steps, dtype=np.int64)  # control steps of the present episodes, at most
         self.outcome = np.zeros(n, dtype=OUTCOME)
         self._bind()
         self.set_noise(noise)
@@ -99,6 +101,10 @@ class QuadcopterBatch:
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
         return self._run(LOOK, self.rows(rows)).observations
+
+    def stagger(self) -> None:
+        """Truncate the present episodes at times spread evenly over ``max_episode_steps``; those that follow, after it."""
+        self.limits[:] = self.max_episode_steps - np.arange(self.n) * self.max_episode_steps // self.n
 
     def observe(self) -> Float32Array:
         """The present observations, float32 (n, 18); the same numbers until the next step."""
@@ -125,6 +131,13 @@ class QuadcopterBatch:
         """As :meth:`step`, of a control step that another simulator has flown and written into ``state``."""
         arrays = self._run(SCORE)
         return arrays.observations, arrays.rewards, arrays.dones
+
+    def clear_outcome(self, rows: Rows = None) -> None:
+        """Of rows that have just begun an episode: nothing has ended, and the distance is that of the start."""
+        chosen = self.rows(rows)
+        self.outcome[chosen] = 0
+        self.outcome["truncated"][chosen] = True
+        self.outcome["distance"][chosen] = self.true_state().distance[chosen]
 
     def _run(self, mode: int, resetting: IntArray | None = None) -> StepArrays:
         arrays = step_arrays(self.n)
@@ -213,6 +226,7 @@ class QuadcopterBatch:
     def set_max_episode_steps(self, steps: int) -> None:
         """Control steps after which an episode is truncated, for all rows from the next step on."""
         self.max_episode_steps = whole_number("max_episode_steps", steps)
+        self.limits[:] = self.max_episode_steps
         self._bind()
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
@@ -225,6 +239,7 @@ class QuadcopterBatch:
                 "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
             )
         new = resolve_tasks(task, task_kwargs)
+        self.task, self.task_kwargs = task, dict(task_kwargs or {})
         used, index = np.unique(self.task_index, return_inverse=True)
         parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
         # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.

@@ -23,11 +23,12 @@ class _Subproc(RowSeeds, SubprocVecEnv):
     pass
 
 
-def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:
+def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False) -> VecEnv:
     """``n_envs`` environments as the settings describe them; their rows fly by ``row_seeds`` of ``seed``.
 
     Each gives ``info["episode"]`` where an episode ends, as SB3's Monitor does.
 
+    :param staggered: whether the first episodes end at different times, as of :class:`QuadcopterVecEnv`.
     :raises ConfigError: keywords that the environment does not take.
     """
     env: VecEnv
@@ -35,11 +36,12 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:
         if config.vec_env == "batch":
             if config.env_wrapper:
                 raise ConfigError("env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy")
-            env = QuadcopterVecEnv(n_envs, seed=seed, **{"task": config.task, **config.env_kwargs})
+            env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs})
         else:
             in_worker = config.vec_env == "subproc"
             make = partial(_make_one, config.env_id, config.env_kwargs, config.env_wrapper, in_worker)
-            env = (_Subproc if in_worker else _Dummy)([make] * n_envs)
+            rows = range(n_envs) if staggered else [0] * n_envs
+            env = (_Subproc if in_worker else _Dummy)([partial(make, row, n_envs) for row in rows])
             env.seed(seed)
     except SB3QuadError:
         raise
@@ -51,11 +53,29 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:
 
 
 def _make_one(
-    env_id: str, kwargs: dict[str, Any], wrappers: list[tuple[str, dict[str, Any]]], in_worker: bool
+    env_id: str, kwargs: dict[str, Any], wrappers: list[tuple[str, dict[str, Any]]], in_worker: bool, row: int, n_envs: int
 ) -> gymnasium.Env[Any, Any]:
     if in_worker:
         ignore_interrupts()
-    env: gymnasium.Env[Any, Any] = Monitor(gymnasium.make(env_id, **kwargs))
+    made = gymnasium.make(env_id, **kwargs)
+    limit = (made.spec and made.spec.max_episode_steps) or 0
+    env: gymnasium.Env[Any, Any] = Monitor(_FirstEpisode(made, limit - row * limit // n_envs) if row and limit else made)
     for path, wrapper_kwargs in wrappers:
         env = import_class(path, "env_wrapper")(env, **wrapper_kwargs)
     return env
+
+
+class _FirstEpisode(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Truncates the first episode after so many steps."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any], steps: int) -> None:
+        super().__init__(env)
+        self._left = steps
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._left -= 1
+        truncated = truncated or self._left == 0
+        if terminated or truncated:
+            self._left = 0
+        return observation, reward, terminated, truncated, info

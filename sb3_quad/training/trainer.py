@@ -4,6 +4,7 @@ The snapshot of an interrupted run lies between two rollouts. Where the environm
 resumed run is bit for bit the one that was not interrupted; elsewhere episodes start anew.
 """
 
+import copy
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -13,6 +14,7 @@ from typing import Any
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
@@ -109,7 +111,8 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
     config = job.config
     evaluating: EvalEnvs = {}
     with ExitStack() as stack:
-        env = stack.enter_context(closing(make_environments(config, config.n_envs, seed_for("training", job.seed))))
+        made = make_environments(config, config.n_envs, seed_for("training", job.seed), staggered=True)
+        env = stack.enter_context(closing(made))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
             for task in (None, *config.eval_tasks):
@@ -131,7 +134,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
     :raises ConfigError: settings that it refuses.
     """
     config = job.config
-    keywords = {**config.hyperparams, **_expert(config)}
+    keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
@@ -141,6 +144,9 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
+    rate = keywords.get("learning_rate")
+    if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
+        rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
     env.seed(seed_for("training", job.seed))  # SB3 has just seeded it with the seed of the policy
     return model
 

@@ -4,6 +4,7 @@ What differs holds for our algorithms and for any algorithm on our environments;
 """
 
 import argparse
+import warnings
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
@@ -116,7 +117,10 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
             def make(makers: list[Callable[[], Any]]) -> VecEnv:
                 """As many rows as SB3's ``make_vec_env`` would make environments."""
-                return VecMonitor(QuadcopterVecEnv(len(makers), **kwargs), file, ("is_success",))
+                env = QuadcopterVecEnv(len(makers), staggered=not eval_env, **kwargs)
+                with warnings.catch_warnings():
+                    warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
+                    return VecMonitor(env, file, ("is_success",))  # writes the file
 
             self.vec_env_class = make
         return super().create_envs(n_envs, eval_env, no_log)

@@ -37,11 +37,12 @@ LOOK, SCORE, FLY = range(3)
 """What a job does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a control
 step that another simulator has flown; it flies and scores one."""
 
-# Columns of vehicles and of scaling: 1 where one serves all rows. max_steps: control steps of an episode.
+# Columns of vehicles and of scaling: 1 where one serves all rows. Control steps of an episode: limits of the present ones,
+# max_steps of those that follow.
 SIZES = ("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "scaling_columns", "mode", "autoreset")
 ARRAYS = (
     *("state", "queue", "wrench", "vehicles", "streams", "mean", "std", "noise_level", "task_index"),
-    *("task_parameters", "task_weights", "returns", "outcome"),
+    *("task_parameters", "task_weights", "returns", "limits", "outcome"),
 )
 STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
 _ADDRESSES = tuple(f"{name}_at" for name in ARRAYS + STEP_ARRAYS)
@@ -99,6 +100,7 @@ def run_block(job, number, b, fresh):
     vehicles = carray(pointer(job.vehicles_at), (_PARAMETERS, job.vehicle_columns), np.float64)
     queue = carray(pointer(job.queue_at), (job.delay, 4, n), np.float64)
     returns = carray(pointer(job.returns_at), (n,), np.float64)
+    limits = carray(pointer(job.limits_at), (n,), np.int64)
     observations = carray(pointer(job.observations_at), (n, OBSERVATION_SIZE), np.float32)
     dones = carray(pointer(job.dones_at), (n,), np.bool_)
     first = number * LANES
@@ -135,7 +137,7 @@ def run_block(job, number, b, fresh):
             returns[i] += b.reward[lane]
             rewards[i] = b.reward[lane]
             lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
-            dones[i] = lost | (streams[STEP, i] >= job.max_steps)
+            dones[i] = lost | (streams[STEP, i] >= limits[i])
             ended += dones[i]
         if ended == 0 and job.autoreset:
             return
@@ -158,7 +160,7 @@ def run_block(job, number, b, fresh):
     weights = carray(pointer(job.task_weights_at), (job.tasks,), np.float64)
     for i in range(first, first + count):
         if dones[i]:
-            returns[i] = 0.0
+            returns[i], limits[i] = 0.0, job.max_steps
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
     load_rows(state, first, count, b.state)
     load_rows(streams, first, count, b.stream)
