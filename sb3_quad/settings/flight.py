@@ -47,7 +47,7 @@ class FlightSettings(Frozen):
         return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
     def write_into(self, model: Any) -> None:
-        """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with all parameters of the vehicle.
+        """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with the vehicle's parameters.
 
         Its zips hold them from then on, and ``load`` of Stable-Baselines3 carries them along, also without this package.
 
@@ -63,7 +63,7 @@ class FlightSettings(Frozen):
 
     @staticmethod
     def of(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:
-        """How the agent in a zip flies, and the file that says so: the zip, else a run's settings beside it; None: neither does.
+        """How the agent in a zip flies, and the file that says so: the zip, else the run's settings beside it; None: neither.
 
         Beside it, ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the agent was judged with; without
         it, that is in its ``config.yml``. Where nothing says how it flies, that is as ``FlightSettings()``.

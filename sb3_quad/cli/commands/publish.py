@@ -51,7 +51,9 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
     if run.command.is_file():
         command = read_text(run.command).strip()
     start = arguments.get("trained_agent")
-    facts["algorithm"] += f" from `{Path(start).name}`" if start else ""
+    facts["algorithm"] = f"`{arguments.get('algo', saved_algorithm(model))}`, {timesteps:,} timesteps"
+    if start:
+        facts["algorithm"] += f" from `{Path(start).name}`"
     facts["environment"] = f"`{arguments.get('env', run.name)}`"
     if settings.get("expert"):
         facts["expert"] = f"`{settings['expert']}`"
