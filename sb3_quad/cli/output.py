@@ -23,7 +23,7 @@ def shows_progress(wanted: bool | None) -> bool:
     return sys.stderr.isatty() if wanted is None else wanted
 
 
-def output_file(given: str | None, name: str) -> Path:
+def output_file(given: str | Path | None, name: str) -> Path:
     """Where a command writes its one file: where ``-o`` says, if that is a file, else as ``name`` in that folder, or here."""
     path = Path(given or "")
     return path if path.suffix and not path.is_dir() else path / name

@@ -50,10 +50,11 @@ class ControllerSpec:
 
     def notice(self, vehicle: str | Path | Vehicle) -> str:
         """What is to be known of an agent that flies ``vehicle``, in a line: that it knows another, or says none; or empty."""
+        flown = load_vehicle(vehicle)
         if self.own is None:
-            assumed = f"{self.label}: {self.spec} does not say how its agent flies; assumed: itm, the scaling of Table A.2"
-            return assumed if self.spec.endswith(".zip") else ""
-        known, flown = load_vehicle(self.own.vehicle), load_vehicle(vehicle)
+            silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
+            return f"{silent} {flown.name}, with the scaling of Table A.2" if self.spec.endswith(".zip") else ""
+        known = load_vehicle(self.own.vehicle)
         if known.flies_as(flown):
             return ""
         same = " of other parameters" if known.name == flown.name else ""

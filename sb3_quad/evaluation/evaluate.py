@@ -58,7 +58,7 @@ class Job:
     @cached_property
     def key(self) -> str:
         """A hash of all that the flights depend on: equal keys, equal flights."""
-        parts = [self.scenario_key, self.record.content, self.record.scaling, self.record.offset]
+        parts: list[Any] = [self.scenario_key, self.record.content, self.record.scaling, self.record.offset]
         if self.spec.own is not None:  # a zip holds it, or what lies beside it
             vehicle = load_vehicle(self.spec.own.vehicle) if self.scenario.vehicle is None else None
             parts += [self.spec.observed, vehicle and vehicle.model_dump(mode="json")]
@@ -109,16 +109,17 @@ def evaluate(
     for spec in controllers:
         try:
             own = load_vehicle(spec.own.vehicle if spec.own else DEFAULT_VEHICLE)
-            flown = [own if each.vehicle is None else each.nominal_vehicle() for each in suite.scenarios]
-            loaded.append((spec, describe(spec, flown[0])))
+            flies = [own if each.vehicle is None else each.nominal_vehicle() for each in suite.scenarios]
+            loaded.append((spec, describe(spec, flies[0])))
             vehicles[spec.label] = own.name
-            for line in dict.fromkeys(filter(None, map(spec.notice, flown))):
-                report(line)
+            for line in dict.fromkeys(map(spec.notice, flies)):
+                if line:
+                    report(line)
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
     if len(set(vehicles.values())) > 1 and any(each.vehicle is None for each in suite.scenarios):
-        flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
-        report(f"not all fly the same vehicle: {flies}; --vehicle gives all of them one")
+        each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
+        report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
     jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
     missing = _missing(place, jobs, overwrite)
     done = len(jobs) - len(missing)
