@@ -53,13 +53,9 @@ class FlightSettings(Frozen):
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
-        scaling = ("observation_mean", "observation_std")
-        record = self.model_dump(mode="json", exclude={"vehicle", *scaling})
-        record["vehicle"] = load_vehicle(self.vehicle).model_dump(mode="json")
-        arrays = {name: getattr(self, name) for name in scaling}
-        setattr(
-            model, KEY, record | {name: None if each is None else np.array(each).tolist() for name, each in arrays.items()}
-        )
+        scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
+        lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
+        setattr(model, KEY, self.with_changes(vehicle=load_vehicle(self.vehicle), **lists).model_dump(mode="json"))
 
     @staticmethod
     def of(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:

@@ -154,7 +154,7 @@ def _learn(
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
     last_good, best = LastGoodModel(), None
-    if job.config.task is not None:
+    if job.config.task is not None and not (job.config.env_wrapper or job.config.vec_env_wrapper):  # flights have none
         job.flight_settings.write_into(model)
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
     if eval_envs:

@@ -33,9 +33,7 @@ def add_arguments(parser: Parser) -> None:
     add("--torque", nargs=3, type=float, metavar=("X", "Y", "Z"), help="an external torque, body frame, N m")
     add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
     add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
-    output = (
-        "write a file instead of opening a window: a film (.mp4, .gif), or the first episode as poses in one picture (.png)"
-    )
+    output = "write a film (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
     add("-o", "--output", metavar="FILE", help=output)
     add("--record", metavar="FILE", help="write a film, also beside a picture: .mp4 or .gif")
     add("--sequence", metavar="FILE", help="write a picture, also beside a film: .png")
