@@ -17,12 +17,14 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flightlog import read_flights
-from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.scaling import measure_mean
+from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.pretrained_policies import pretrained
 from sb3_quad.scenarios.load import load_suite
+from sb3_quad.scenarios.sample import sample_plan
 from sb3_quad.settings.flight import FlightSettings
 
 SUITE = """
@@ -346,9 +348,11 @@ def test_an_agent_sees_its_own_scaling(here, capsys):
     assert "silent.zip does not say how its agent flies; it flies itm" in warning
     results = load_results("out")
     rewards = {name: results.entry(name, "tracking").metrics.reward.value for name in ("silent", "telling")}
-    settings = {"task": load_suite("small.yaml").scenario("tracking").task, "max_steps": 200}
+    (tracking,) = load_suite("small.yaml").with_changes(["tracking"], 3).scenarios
     for name, scaling in (("silent", {}), ("telling", {"observation_std": std})):
-        assert rewards[name] == pytest.approx(fly(model, seed=524288, n_episodes=3, **settings, **scaling).reward.mean())
+        settings = flown_as(tracking).with_changes(**scaling)
+        flights = fly_settings(model, settings, tracking.episode_seeds(), plan=sample_plan(tracking, tracking.episode_seeds()))
+        assert rewards[name] == pytest.approx(flights.reward.mean())
     assert rewards["silent"] != pytest.approx(rewards["telling"])
 
 
