@@ -283,7 +283,8 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     assert "vehicle: heavy" in capsys.readouterr().out and (tmp_path / "best_model.pt").is_file()
     small = ["--suite", "quick", "--scenario", "recovery", "--episodes", "2", "--no-report", "-o", "out"]
     assert main(["evaluate", str(run.path), *small]) == 0
-    assert run.path.name in capsys.readouterr().out
+    output = capsys.readouterr()
+    assert run.path.name in output.out and f"{run.path.name} flies heavy, the reference flies itm" in output.err
     assert main(["publish", str(run.path), "--name", "mine", "--episodes", "2"]) == 0
     card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
     for part in (

@@ -117,7 +117,10 @@ def evaluate(
                     report(line)
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
-    if len(set(vehicles.values())) > 1 and any(each.vehicle is None for each in suite.scenarios):
+    unfixed = [each for each in suite.scenarios if each.vehicle is None]
+    if any(each.reference for each in unfixed):
+        vehicles["the reference"] = DEFAULT_VEHICLE
+    if len(set(vehicles.values())) > 1 and unfixed:
         each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
         report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
     jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
