@@ -18,9 +18,12 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.results_plotter import load_results
 
 from sb3_quad.cli import compare, main
+from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.settings.config import build_config
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 ENV = "QuadTargetTracking-v0"
 SMALL = {
@@ -262,6 +265,55 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after
         assert torch.equal(tensor, ours["policy"][name]), name
     assert str(ours["policy.optimizer"]["param_groups"]) == str(theirs["policy.optimizer"]["param_groups"])
     assert not again.run.resume_state.exists()
+
+
+def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_path, monkeypatch, capsys):
+    std = [2.0] * 18
+    (tmp_path / "heavy.yaml").write_text(
+        load_vehicle("itm").model_copy(update={"mass": 1.6, "name": "heavy"}).model_dump_json()
+    )
+    own = {"vehicle": str(tmp_path / "heavy.yaml"), "observation_std": std, "max_episode_steps": 40}
+    config = build_config(
+        "ppo", "QuadStateRecovery-v0", {**SMALL, "n_timesteps": 800, "env_kwargs": own, "eval_env_kwargs": {"noise": 0}}
+    )
+    job = TrainingJob(config=config, log_folder=str(tmp_path / "logs"), eval_freq=400, eval_episodes=2, save_freq=400)
+    run = train(job, report=lambda line: None).run
+    (tmp_path / "heavy.yaml").unlink()
+    zips = list(run.path.glob("*.zip"))
+    assert len(zips) == 4
+    for path in zips:
+        mailed = tmp_path / f"mailed_{path.name}"
+        mailed.write_bytes(path.read_bytes())
+        settings, source = FlightSettings.of(mailed)
+        assert source == mailed and (settings.vehicle.mass, settings.vehicle.name) == (1.6, "heavy")
+        assert (settings.task, settings.noise, settings.observation_std) == ("state_recovery", 0, std)
+    monkeypatch.chdir(tmp_path)
+    assert agent_path(str(run.path)) == str(run.best_model)
+    assert main(["enjoy", "mailed_best_model.zip", "--no-render"]) == 0
+    output = capsys.readouterr()
+    assert "0.40 s" in output.out and not output.err.count("warning")
+    assert main(["enjoy", str(run.path), "--no-render", "--env-kwargs", "vehicle:itm"]) == 0
+    assert f"{run.path.name}: was trained on the vehicle heavy and flies itm" in capsys.readouterr().err
+    assert main(["export", str(run.path), "--format", "torchscript"]) == 0
+    assert "vehicle: heavy" in capsys.readouterr().out and (tmp_path / "best_model.pt").is_file()
+    small = ["--suite", "quick", "--scenario", "recovery", "--episodes", "2", "--no-report", "-o", "out"]
+    assert main(["evaluate", str(run.path), *small]) == 0
+    output = capsys.readouterr()
+    assert run.path.name in output.out and f"{run.path.name} flies heavy, the reference flies itm" in output.err
+    assert main(["publish", str(run.path), "--name", "mine", "--episodes", "2"]) == 0
+    card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
+    for part in (
+        "vehicle `heavy`",
+        "scaled by a mean and std of its own",
+        arguments["commit"],
+        arguments["versions"],
+        "| seed | 0 |",
+    ):
+        assert part in card
+    assert run.command.read_text().strip() in card
+    assert FlightSettings.of("mine.zip")[0] == FlightSettings.of("mailed_best_model.zip")[0]
+    assert main(["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]) == 2
+    assert f"{run.best_model}: layer" in capsys.readouterr().err  # of other sizes
 
 
 def test_only_interrupted_runs_resume(tmp_path, capsys):

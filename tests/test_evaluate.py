@@ -8,6 +8,7 @@ import zipfile
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 
 from sb3_quad.base.errors import ConfigError
@@ -16,9 +17,15 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flightlog import read_flights
+from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.scaling import measure_mean
+from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.experts.models import load_model, saved_algorithm
+from sb3_quad.pretrained_policies import pretrained
+from sb3_quad.scenarios.load import load_suite
+from sb3_quad.scenarios.sample import sample_plan
+from sb3_quad.settings.flight import FlightSettings
 
 SUITE = """
 name: small
@@ -295,6 +302,66 @@ def test_adaptive_scaling_is_measured_and_another_controller(here, capsys, monke
     assert {record.label for record in results.controllers} == {"agent", "agent (adaptive)", "pid"}
     keys = {entry.key for entry in results.entries}
     assert len(keys) == len(results.entries) == 3
+
+
+RECOVERY = """
+name: recoveries
+scenarios:
+  - {name: recovery, start: {attitude: uniform}, duration: 3, episodes: 8}
+"""
+
+
+def test_each_agent_flies_its_own_vehicle_unless_another_is_asked_for(here, capsys):
+    (here / "small.yaml").write_text(RECOVERY)
+    zipped = here / "mailed.zip"
+    zipped.write_bytes(pretrained("crazyflie-recovery").read_bytes())
+    assert evaluate("mailed.zip", "itm-recovery", "pid") == 0
+    results = load_results("out")
+    assert {name: results.entry(name, "recovery").metrics.success.value for name in ("mailed", "itm-recovery")} == {
+        "mailed": 1.0,
+        "itm-recovery": 1.0,
+    }
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert "mailed flies crazyflie, itm-recovery flies itm, pid flies itm" in warning
+    assert evaluate("mailed.zip", "--vehicle", "itm", folder="other") == 0
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert "mailed: was trained on the vehicle crazyflie and flies itm" in warning
+    assert evaluate("mailed.zip", "--vehicle", "crazyflie", folder="third") == 0
+    assert not capsys.readouterr().err
+    before = times_of_change(here)
+    assert evaluate("mailed.zip", "itm-recovery", "pid") == 0
+    assert times_of_change(here) == before
+
+
+def test_an_agent_sees_its_own_scaling(here, capsys):
+    std = np.linspace(1.0, 3.0, 18)
+    env = QuadcopterVecEnv(2, seed=0, observation_std=std)
+    model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0)
+    with torch.no_grad():
+        model.policy.action_net.weight *= 50.0
+    model.save("silent.zip")
+    FlightSettings(observation_std=std).write_into(model)
+    model.save("telling.zip")
+    arguments = ["--scenario", "tracking", "--episodes", "3"]
+    assert evaluate("silent.zip", "telling.zip", *arguments) == 0
+    (warning,) = capsys.readouterr().err.splitlines()
+    assert "silent.zip does not say how its agent flies; it flies itm" in warning
+    results = load_results("out")
+    rewards = {name: results.entry(name, "tracking").metrics.reward.value for name in ("silent", "telling")}
+    (tracking,) = load_suite("small.yaml").with_changes(["tracking"], 3).scenarios
+    for name, scaling in (("silent", {}), ("telling", {"observation_std": std})):
+        settings = flown_as(tracking).with_changes(**scaling)
+        flights = fly_settings(model, settings, tracking.episode_seeds(), plan=sample_plan(tracking, tracking.episode_seeds()))
+        assert rewards[name] == pytest.approx(flights.reward.mean())
+    assert rewards["silent"] != pytest.approx(rewards["telling"])
+
+
+def test_nothing_flown_leaves_no_folder_and_a_bad_module_is_told_once(here, capsys):
+    assert evaluate("missing.zip", "no_such_module:make") == 1
+    output = capsys.readouterr()
+    assert output.err.count("missing.zip: no such file") == output.err.count("cannot be imported") == 1
+    assert output.err.count("\n") == 2 and "results in" not in output.out
+    assert not (here / "out").exists()
 
 
 @pytest.mark.slow

@@ -1,6 +1,7 @@
 """Policies that come with the package, and the command that makes them."""
 
 import base64
+import importlib.util
 import io
 import json
 import pickle
@@ -18,7 +19,9 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.resolve import resolve_expert
-from sb3_quad.pretrained_policies import agent_path, pretrained_names
+from sb3_quad.pretrained_policies import FOLDER, agent_path, pretrained_names
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 PICKLED = {"stable_baselines3.common.buffers.RolloutBuffer", "stable_baselines3.common.policies.ActorCriticPolicy"}
 
@@ -129,6 +132,32 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folde
     assert (tmp_path / "mine.zip").read_bytes() == before
 
 
+@pytest.mark.parametrize("name", pretrained_names())
+def test_each_says_how_it_flies(name):
+    settings, source = FlightSettings.of(sb3_quad.pretrained(name))
+    assert source == sb3_quad.pretrained(name) and settings.vehicle == load_vehicle(name.split("-")[0])
+    assert settings.task == "state_recovery"
+
+
+def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    before = sorted(FOLDER.iterdir())
+    assert main(["export", "crazyflie-recovery", "--format", "torchscript"]) == 0
+    output = capsys.readouterr().out
+    assert "vehicle: crazyflie" in output and "crazyflie-recovery.zip" in output
+    assert main(["export", "itm-recovery", "--format", "torchscript", "-o", "there"]) == 0
+    assert sorted(path.name for path in tmp_path.rglob("*.pt")) == ["crazyflie-recovery.pt", "itm-recovery.pt"]
+    assert (tmp_path / "there" / "itm-recovery.pt").is_file()
+    assert main(["enjoy", "crazyflie-recovery", "-n", "40", "-o", "poses.png", "--size", "64x64"]) == 0
+    assert (tmp_path / "poses.png").is_file() and "warning" not in capsys.readouterr().err
+    if importlib.util.find_spec("imageio_ffmpeg") is not None:
+        assert main(["record-video", "-i", "itm-recovery", "-n", "3", "--size", "64x64"]) == 0
+        assert main(["record-video", "-i", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "a.gif"]) == 0
+        assert main(["enjoy", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "b.mp4"]) == 0
+        assert {path.suffix for path in tmp_path.iterdir()} >= {".mp4", ".gif"} and (tmp_path / "b.mp4").is_file()
+    assert sorted(FOLDER.iterdir()) == before
+
+
 def test_a_policy_can_be_trained_further():
     model = sb3_quad.load_pretrained("itm-recovery", env=QuadcopterVecEnv(8, seed=0), n_steps=16)
     before = model.policy.action_net.weight.detach().clone()
@@ -136,13 +165,23 @@ def test_a_policy_can_be_trained_further():
     assert (model.policy.action_net.weight != before).any()
 
 
+def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
+    env = QuadcopterVecEnv(2, seed=0)
+    PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).save(tmp_path / "alone.zip")
+    assert main(["publish", str(tmp_path / "alone.zip"), "--name", "x", "-o", str(tmp_path), "--episodes", "2"]) == 0
+    card = (tmp_path / "x.md").read_text()
+    for part in ("`PPO`, 0 timesteps", "| run | not recorded |", "# not recorded", "not recorded; measured on `itm`"):
+        assert part in card
+    for part in ("commit", "seed", "versions", "None"):
+        assert part not in card
+    assert FlightSettings.of(tmp_path / "x.zip") == (FlightSettings(), None)
+
+
 def test_publish_refuses_what_it_cannot_describe(run_folder, tmp_path, capsys):
     source = run_folder / "QuadStateRecovery-v0.zip"
-    elsewhere = tmp_path / "alone.zip"
-    elsewhere.write_bytes(source.read_bytes())
     for arguments, message in (
         ([str(tmp_path / "none.zip"), "--name", "x"], "no such file"),
-        ([str(elsewhere), "--name", "x"], "holds no run"),
+        ([str(tmp_path), "--name", "x"], "no run with an agent"),
         ([str(source), "--name", "a/b"], "without folders"),
         ([str(source), "--name", "x", "--episodes", "0"], "must be at least 1"),
     ):

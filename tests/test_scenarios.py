@@ -14,7 +14,7 @@ from sb3_quad.scenarios.load import SUITES, axis_label, load_suite, parse_suite
 from sb3_quad.scenarios.parts import VehicleChanges
 from sb3_quad.scenarios.sample import sample_plan
 from sb3_quad.scenarios.scenario import Scenario, Suite
-from sb3_quad.simulation.state import QuadcopterState
+from sb3_quad.simulation.state import QuadcopterState, make_wrench
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 
@@ -138,6 +138,21 @@ def test_vary_is_a_grid_of_named_cells():
         assert cell.group == "s0"
         assert (cell.noise, cell.start.attitude.tilt) == (cell.cell["noise"], cell.cell["start.attitude.tilt"])
     assert axis_label("start.attitude.tilt") == "tilt (deg)"
+
+
+@pytest.mark.parametrize("name", ["itm", "crazyflie"])
+def test_wrenches_in_weights_grow_with_the_vehicle_and_change_no_others(name):
+    vehicle = load_vehicle(name)
+    push = "{force: [0, 0, -0.5], torque: [2, 0, 0], unit: weight}"
+    each = scenario(f"vehicle: {name}, vehicle_changes: {{mass: 1.2}}, wrenches: [{push}, {{start: 1, force: [1, 0, 0]}}]")
+    first, second = sample_plan(each, [0]).wrenches.values()
+    weight = vehicle.mass * vehicle.gravity  # of the vehicle as its controller knows it
+    torque = 2 * weight * vehicle.arm_length
+    both = make_wrench(np.array([[0, 0, -0.5 * weight], [1, 0, 0]]), np.array([[torque, 0, 0], [0, 0, 0]]))
+    np.testing.assert_allclose([first[0], (second - first)[0]], both.T, atol=1e-12)
+    varied = suite("wrenches: [{force: {magnitude: 0}, unit: weight}], vary: {wrenches.0.force.magnitude: [0, 1]}")
+    assert axis_label("wrenches.0.force.magnitude", varied.scenarios[1]) == "force (weights)"
+    assert "unit" not in each.wrenches[1].model_dump()  # results of earlier versions keep their hashes
 
 
 @given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))

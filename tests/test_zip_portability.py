@@ -13,6 +13,8 @@ from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.pretrained_policies import pretrained_names
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 FLY = """
 import json, sys
@@ -22,6 +24,8 @@ from stable_baselines3 import PPO
 observations, *zips = sys.argv[1:]
 models = [PPO.load(path, device="cpu") for path in zips]
 assert not any(name.startswith("sb3_quad.") for name in sys.modules)
+assert all(model.flight_settings["vehicle"]["mass"] > 0 for model in models)
+models[0].save("again.zip")
 actions = [model.predict(np.load(observations), deterministic=True)[0].tolist() for model in models]
 json.dump([actions, [model.num_timesteps for model in models]], sys.stdout)
 """
@@ -39,6 +43,7 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     for number, model in enumerate(models):
         model.learn(256, callback=CoefficientSchedule("bc_coef", 1.0, 0.0) if number == 2 else None)
         assert model.ep_info_buffer  # it is saved too, so it must not be empty here
+        FlightSettings(vehicle="crazyflie", noise=0.1 * number, observation_mean=np.full(18, 0.5)).write_into(model)
         model.save(tmp_path / f"{number}.zip")
     observations = env.reset()
     np.save(tmp_path / "observations.npy", observations)
@@ -49,5 +54,9 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     assert result.returncode == 0, result.stderr
     actions, timesteps = json.loads(result.stdout)
     assert timesteps[: len(models)] == [256] * len(models)
+    for path, noise in (("again.zip", 0.0), ("2.zip", 0.2)):
+        settings, source = FlightSettings.of(tmp_path / path)
+        assert source == tmp_path / path and settings.vehicle == load_vehicle("crazyflie")
+        assert (settings.noise, settings.observation_mean, settings.task) == (noise, [0.5] * 18, "target_tracking")
     for model, flown in zip([*models, *map(PPO.load, shipped)], actions, strict=True):
         np.testing.assert_array_equal(np.float32(flown), model.predict(observations, deterministic=True)[0])

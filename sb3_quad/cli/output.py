@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -20,6 +21,12 @@ def console() -> Console:
 def shows_progress(wanted: bool | None) -> bool:
     """Whether a progress bar is shown: in a terminal, unless asked otherwise."""
     return sys.stderr.isatty() if wanted is None else wanted
+
+
+def output_file(given: str | Path | None, name: str) -> Path:
+    """Where a command writes its one file: where ``-o`` says, if that is a file, else as ``name`` in that folder, or here."""
+    path = Path(given or "")
+    return path if path.suffix and not path.is_dir() else path / name
 
 
 @contextmanager

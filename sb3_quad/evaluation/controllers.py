@@ -7,6 +7,7 @@ import re
 import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,10 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.evaluation.records import ControllerRecord, Scaling
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.experts.models import saved_algorithm
-from sb3_quad.experts.resolve import EXPERTS, resolve_expert
+from sb3_quad.experts.resolve import EXPERTS, import_factory, resolve_expert
 from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
 @dataclass(frozen=True)
@@ -31,6 +33,32 @@ class ControllerSpec:
     label: str
     spec: str
     scaling: Scaling = "none"
+
+    @cached_property
+    def own(self) -> FlightSettings | None:
+        """How the agent in a zip says that it flies; None: experts, factories, and zips that say nothing.
+
+        :raises ConfigError: see :meth:`FlightSettings.of`.
+        """
+        settings, source = FlightSettings.of(self.spec) if self.spec.endswith(".zip") else (None, None)
+        return settings if source else None
+
+    @property
+    def observed(self) -> dict[str, Any]:
+        """What goes with the agent wherever it flies: ``observation_mean`` and ``observation_std`` of its environment."""
+        return (self.own or FlightSettings()).model_dump(include={"observation_mean", "observation_std"})
+
+    def notice(self, vehicle: str | Path | Vehicle) -> str:
+        """What is to be known of an agent that flies ``vehicle``, in a line: that it knows another, or says none; or empty."""
+        flown = load_vehicle(vehicle)
+        if self.own is None:
+            silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
+            return f"{silent} {flown.name}, with the scaling of Table A.2" if self.spec.endswith(".zip") else ""
+        known = load_vehicle(self.own.vehicle)
+        if known.flies_as(flown):
+            return ""
+        same = " of other parameters" if known.name == flown.name else ""
+        return f"{self.label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"
 
 
 def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[ControllerSpec]:
@@ -60,7 +88,7 @@ def file_name(label: str) -> str:
     return re.sub(r"[^A-Za-z0-9_.-]+", "_", label).strip("_.") or "_"
 
 
-def describe(spec: ControllerSpec, vehicle: str) -> ControllerRecord:
+def describe(spec: ControllerSpec, vehicle: str | Vehicle) -> ControllerRecord:
     """Who a controller is; with adaptive scaling also the offset that it needs, measured by flying to targets.
 
     :param vehicle: what it is measured with.
@@ -77,12 +105,12 @@ def describe(spec: ControllerSpec, vehicle: str) -> ControllerRecord:
     if spec.scaling == "adaptive":
         controller = build(spec, vehicle)
         if isinstance(controller, AdaptiveScaling):
-            mean = measure_mean(controller.policy, settings=FlightSettings(vehicle=vehicle))
+            mean = measure_mean(controller.policy, settings=FlightSettings(vehicle=vehicle, **spec.observed))
             who |= {"scaling": "adaptive", "offset": mean.tolist()}
     return ControllerRecord(label=spec.label, content=hashlib.sha256(content).hexdigest(), **who)
 
 
-def build(spec: ControllerSpec, vehicle: str, mean: Sequence[float] | None = None) -> Any:
+def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | None = None) -> Any:
     """A controller, ready to fly.
 
     :param vehicle: what experts and factories are given, the one they are to know.
@@ -93,7 +121,7 @@ def build(spec: ControllerSpec, vehicle: str, mean: Sequence[float] | None = Non
     controller = resolve_expert(spec.spec, vehicle, "controller")
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
-    return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0))
+    return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0), spec.observed["observation_std"])
 
 
 def _label_and_spec(text: str) -> tuple[str, str]:
@@ -101,7 +129,7 @@ def _label_and_spec(text: str) -> tuple[str, str]:
     label, equals, spec = text.partition("=")
     if not equals or "/" in label or "\\" in label:  # an equals sign further on belongs to the path
         path = agent_path(text)
-        return ("" if path == text else text), path
+        return ("" if path == text else Path(text).name), path
     if not label or not spec:
         raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
     return label, agent_path(spec)
@@ -118,12 +146,13 @@ def _short(path: str, paths: Sequence[str]) -> str:
 
 
 def _source(location: str) -> bytes:
-    """The source of the module that holds an expert or factory, or what else tells its versions apart."""
-    module_name, colon, _ = location.partition(":")
-    if not colon:
-        resolve_expert(location, kind="controller")  # says what is wrong
+    """The source of the module that holds an expert or factory, or what else tells its versions apart.
+
+    :raises ConfigError: it cannot be imported.
+    """
+    import_factory(location, "controller")  # says what is wrong
     try:
-        file = inspect.getsourcefile(importlib.import_module(module_name))
-    except Exception:  # build() says what is wrong with it
+        file = inspect.getsourcefile(importlib.import_module(location.partition(":")[0]))
+    except TypeError:  # it is built in
         return location.encode()
     return location.encode() + (Path(file).read_bytes() if file is not None else b"")

@@ -25,7 +25,8 @@ from sb3_quad.evaluation.folder import RESULTS, flights_path, load_results, read
 from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry, Failure, Results
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.summary import summarise
-from sb3_quad.scenarios.scenario import Scenario, Suite
+from sb3_quad.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
 _SILENT = {"title", "description", "reference", "group", "cell"}  # fields of a scenario that change no flight
@@ -35,6 +36,7 @@ _SILENT = {"title", "description", "reference", "group", "cell"}  # fields of a 
 class Job:
     """A controller in a scenario.
 
+    :param scenario: as the suite has it.
     :param folder: path of the folder that its :class:`Entry` is left in.
     """
 
@@ -50,12 +52,25 @@ class Job:
         scenario = self.scenario
         vehicles = [vehicle.model_dump(mode="json") for vehicle in (scenario.nominal_vehicle(), scenario.flown_vehicle())]
         content = scenario.model_dump(mode="json", exclude=_SILENT)
+        content["vehicle"] = content["vehicle"] or DEFAULT_VEHICLE
         return _digest([SCHEMA_VERSION, __version__, self.backend, content, vehicles])
 
     @cached_property
     def key(self) -> str:
         """A hash of all that the flights depend on: equal keys, equal flights."""
-        return _digest([self.scenario_key, self.record.content, self.record.scaling, self.record.offset])
+        parts: list[Any] = [self.scenario_key, self.record.content, self.record.scaling, self.record.offset]
+        if self.spec.own is not None:  # a zip holds it, or what lies beside it
+            vehicle = load_vehicle(self.spec.own.vehicle) if self.scenario.vehicle is None else None
+            parts += [self.spec.observed, vehicle and vehicle.model_dump(mode="json")]
+        return _digest(parts)
+
+    @property
+    def flown(self) -> Scenario:
+        """The scenario, on the vehicle that this controller flies there.
+
+        :raises ConfigError: it is impossible for that vehicle.
+        """
+        return self.scenario.flown_by(self.spec.own and self.spec.own.vehicle)
 
 
 def evaluate(
@@ -66,6 +81,7 @@ def evaluate(
     workers: int = 1,
     overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
+    report: Callable[[str], None] = lambda line: None,
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
@@ -74,7 +90,8 @@ def evaluate(
 
     :param folder: of the results.
     :param overwrite: replace earlier results of these controllers that were flown otherwise, instead of refusing.
-    :return: all results in the folder, those of earlier calls included.
+    :param report: told in one line of each agent that flies another vehicle than it was trained on, or does not say on which.
+    :return: all results in the folder, those of earlier calls included; where nothing has been flown, it is not written.
     :raises ConfigError: an unknown backend; results in the folder of the same names that were flown otherwise; a folder that
         cannot be written.
     """
@@ -88,11 +105,24 @@ def evaluate(
     earlier = [] if before is None else before.failures
     failures = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
     loaded: list[tuple[ControllerSpec, ControllerRecord]] = []
+    vehicles: dict[str, str] = {}  # by label, where a scenario names none
     for spec in controllers:
         try:
-            loaded.append((spec, describe(spec, suite.scenarios[0].vehicle)))
+            own = load_vehicle(spec.own.vehicle if spec.own else DEFAULT_VEHICLE)
+            flies = [own if each.vehicle is None else each.nominal_vehicle() for each in suite.scenarios]
+            loaded.append((spec, describe(spec, flies[0])))
+            vehicles[spec.label] = own.name
+            for line in dict.fromkeys(map(spec.notice, flies)):
+                if line:
+                    report(line)
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
+    unfixed = [each for each in suite.scenarios if each.vehicle is None]
+    if any(each.reference for each in unfixed):
+        vehicles["the reference"] = DEFAULT_VEHICLE
+    if len(set(vehicles.values())) > 1 and unfixed:
+        each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
+        report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
     jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
     missing = _missing(place, jobs, overwrite)
     done = len(jobs) - len(missing)
@@ -105,7 +135,7 @@ def evaluate(
             progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
     finally:  # an interrupt, too, leaves what is done in order
         results = _collect(place, before, suite, [record for _, record in loaded], failures)
-        if results.entries or results.failures:
+        if results.entries or before is not None:
             write_results(place, results)
     return results
 
@@ -159,9 +189,11 @@ def run_job(job: Job) -> Entry | Failure:
     label, scenario = job.record.label, job.scenario
     start = time.perf_counter()
     try:
-        controller = build(job.spec, scenario.vehicle, job.record.offset)
-        flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None)
-        limit = find_limit(controller, scenario, job.backend)
+        scenario = job.flown
+        controller = build(job.spec, scenario.nominal_vehicle(), job.record.offset)
+        own = job.spec.observed
+        flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None, own=own)
+        limit = find_limit(controller, scenario, job.backend, own)
     except SB3QuadError as error:
         return _failure(label, scenario.name, error)
     entry = Entry(

@@ -35,13 +35,13 @@ class AdaptiveScaling:
 
     :param policy: an SB3 model, or a function of observations.
     :param mean: position components of μ, (3,), m; zero: only α.
-    :param std: position components of the σ the environment scales by, (3,), m; None: Table A.2.
+    :param std: σ that the environment scales by, (18,); None: Table A.2.
     """
 
     def __init__(self, policy: Any, mean: npt.ArrayLike = (0.0, 0.0, 0.0), std: npt.ArrayLike | None = None) -> None:
         self.policy, self.observation_space = policy, getattr(policy, "observation_space", None)
         self.mean = np.asarray(mean, dtype=np.float64)
-        self.std = np.asarray(DEFAULT_STD[_POSITION] if std is None else std, dtype=np.float64)
+        self.std = np.asarray(DEFAULT_STD if std is None else std, dtype=np.float64)[_POSITION]
         self._ask = observation_function(policy)
 
     def __call__(self, observation: Float32Array) -> Any:
@@ -79,6 +79,6 @@ def measure_mean(policy: Any, n_flights: int = N_FLIGHTS, settings: FlightSettin
     """
     mean = np.zeros(3)
     for number in range(ROUNDS):
-        seed = seed_for("offset", number)
-        mean = mean - hover_offset(AdaptiveScaling(policy, mean), n_flights, seed, settings)
+        seed, std = seed_for("offset", number), None if settings is None else settings.observation_std
+        mean = mean - hover_offset(AdaptiveScaling(policy, mean, std), n_flights, seed, settings)
     return mean

@@ -1,6 +1,6 @@
 """Flying the episodes of a scenario, and finding how large a hit a controller survives there."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ def fly_scenario(
     seeds: Sequence[int] | None = None,
     factors: FloatArray | None = None,
     recorded: int | None = 0,
+    own: Mapping[str, Any] | None = None,
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
 
@@ -34,6 +35,7 @@ def fly_scenario(
     :param seeds: of the episodes; None: the scenario's own.
     :param factors: of each episode's wrenches, (n,); None: 1.
     :param recorded: flights to sample; None: all of a scenario that is the same each time, the first few of others.
+    :param own: changes to how it is flown that go with the controller: ``observation_mean``, ``observation_std``.
     :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
     :raises ConfigError: an unknown backend, or a controller that cannot be asked.
     :raises ControllerError: a controller that fails in flight.
@@ -41,7 +43,7 @@ def fly_scenario(
     chosen = scenario.episode_seeds() if seeds is None else seeds
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
-    size, settings = PART_SIZES.get(backend, 1), flown_as(scenario)
+    size, settings = PART_SIZES.get(backend, 1), flown_as(scenario).with_changes(**(own or {}))
     parts, recorder = [], Recorder(recorded)
     for first in range(0, len(chosen), size):
         part = slice(first, first + size)
@@ -57,13 +59,16 @@ def flown_as(scenario: Scenario) -> FlightSettings:
     return FlightSettings(task=scenario.task, vehicle=vehicle, noise=scenario.noise, max_episode_steps=scenario.steps)
 
 
-def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> HitLimit | None:
+def find_limit(
+    controller: Any, scenario: Scenario, backend: str = "batch", own: Mapping[str, Any] | None = None
+) -> HitLimit | None:
     """The least factor of a scenario's wrenches, force and torque alike, at which half of the flights are lost.
 
     A grid of factors from 0 to ``hit_search.largest`` is flown first, so that survival need not fall evenly; then the interval
     in which it first drops to a half is divided again and again, until it is narrower than ``hit_search.resolution`` of its
     upper end. All factors see the same episodes.
 
+    :param own: as for :func:`fly_scenario`.
     :return: None for a scenario without ``hit_search``.
     :raises ControllerError: a controller that fails in flight.
     """
@@ -76,7 +81,7 @@ def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> H
     grid = np.linspace(low, high, FIRST_GRID + 1)
     for _ in range(MAX_ROUNDS):
         factors = np.repeat(grid, search.episodes)
-        flights, _ = fly_scenario(controller, scenario, backend, seeds * grid.size, factors)
+        flights, _ = fly_scenario(controller, scenario, backend, seeds * grid.size, factors, own=own)
         survived = flights.survival.reshape(grid.size, search.episodes)
         tried |= {factor: share(row) for factor, row in zip(grid.tolist(), survived, strict=True)}
         lost = next((factor for factor in sorted(tried) if tried[factor].value <= 0.5), None)
@@ -90,12 +95,12 @@ def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> H
     if lost is not None and low < high:  # where the line between the two shares passes a half
         above, below = tried[low].value, tried[high].value
         factor = low + (high - low) * (above - 0.5) / (above - below)
-    end = np.inf if lost is None else lost
+    end, nominal = np.inf if lost is None else lost, scenario.nominal_vehicle()
     return HitLimit(
         factor=factor,
         low=max((each for each in tried if tried[each].low > 0.5 and each < end), default=0.0),
         high=min((each for each in tried if tried[each].high < 0.5 and each >= end), default=None),
-        force=max(wrench.force.largest for wrench in scenario.wrenches),
-        torque=max(wrench.torque.largest for wrench in scenario.wrenches),
+        force=max(wrench.force.largest * wrench.units(nominal)[0] for wrench in scenario.wrenches),
+        torque=max(wrench.torque.largest * wrench.units(nominal)[1] for wrench in scenario.wrenches),
         trials=[HitTrial(factor=each, survived=tried[each]) for each in sorted(tried)],
     )

@@ -3,6 +3,7 @@
 import json
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import stable_baselines3
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -20,6 +21,21 @@ _FAMILIES = {
 _OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
 
 
+def saved_data(path: str | Path) -> dict[str, Any]:
+    """The attributes of the model in an SB3 ``.zip`` as its JSON has them; those that are pickled there stay so.
+
+    :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise ConfigError(f"model {file}: " + ("no run with an agent in this folder" if file.is_dir() else "no such file"))
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return dict(json.loads(archive.read("data")))
+    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+        raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
+
+
 def saved_algorithm(path: str | Path) -> str:
     """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG or DQN, or PPOBC or DAgger of this package.
 
@@ -27,17 +43,13 @@ def saved_algorithm(path: str | Path) -> str:
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an unknown family.
     """
-    file = Path(path)
-    if not file.is_file():
-        raise ConfigError(f"model {file}: no such file")
+    data = saved_data(path)
     try:
-        with zipfile.ZipFile(file) as archive:
-            data = json.loads(archive.read("data"))
         module = str(data["policy_class"]["__module__"])
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
-        raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
+    except (KeyError, TypeError) as error:
+        raise ConfigError(f"model {path}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
     if module not in _FAMILIES:
-        raise ConfigError(f"model {file}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
+        raise ConfigError(f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
     if module == _ACTOR_CRITIC:
         own = next((name for key, name in _OURS.items() if key in data), None)
         return own or ("PPO" if "n_epochs" in data else "A2C")

@@ -32,17 +32,25 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)
-    location = EXPERTS.get(text, text)
-    if ":" not in location:
-        valid = [*EXPERTS, *pretrained_names()]
-        raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
-    try:
-        factory = pkgutil.resolve_name(location)
-    except Exception as error:  # whatever the module does when it is imported
-        raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error
+    factory = import_factory(text, kind)
     try:
         return factory(load_vehicle(vehicle))
     except SB3QuadError:
         raise
     except Exception as error:
         raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
+
+
+def import_factory(text: str, kind: str = "expert") -> Any:
+    """What makes the expert of a name, or is at ``package.module:factory``.
+
+    :raises ConfigError: an unknown name, or a factory that cannot be imported.
+    """
+    location = EXPERTS.get(text, text)
+    if ":" not in location:
+        valid = [*EXPERTS, *pretrained_names()]
+        raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
+    try:
+        return pkgutil.resolve_name(location)
+    except Exception as error:  # whatever the module does when it is imported
+        raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error

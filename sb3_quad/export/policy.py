@@ -50,8 +50,8 @@ def export_policy(
     """The policy of an on-policy SB3 zip (PPO, A2C, DAgger, PPOBC; ``MlpPolicy``) as a file that flies by itself.
 
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
-    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Vehicle and scaling that are not given are those of
-    the settings in the zip's run folder, or else ``itm`` and Table A.2.
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Vehicle and scaling that are not given are those
+    that :meth:`FlightSettings.of` finds in or beside the zip, or else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
@@ -73,7 +73,7 @@ def export_policy(
     if file_format not in formats:
         raise ConfigError(unknown("format", file_format, formats))
     write, load = formats[file_format]
-    algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), FlightSettings.beside(path)
+    algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), FlightSettings.of(path)
     changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
     row = QuadcopterBatch(1, **dict(settings), n_threads=1)  # it checks them
@@ -123,12 +123,13 @@ def _compact(values: Iterable[float]) -> str:
     return ", ".join(f"{word} ({len(list(group))} times)" for word, group in groupby(f"{value:.6g}" for value in values))
 
 
-def slim_bytes(path: str | Path) -> bytes:
+def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> bytes:
     """The zip of a stock PPO model with the policy of an on-policy agent's zip, to hand on; SB3 2.4 and later read it.
 
     Gone are the optimizer's moments, the last observations and the episodes' statistics; the settings are PPO's own, as plain
     numbers, since SB3's classes of schedules differ from version to version. The weights are the same.
 
+    :param settings: how it flies, for the zip to say; None: it says nothing.
     :raises ConfigError: a file that cannot be read, or whose policy is not ``MlpPolicy`` of an on-policy algorithm.
     """
     source: Any = load_model(path)
@@ -141,6 +142,8 @@ def slim_bytes(path: str | Path) -> bytes:
     model._setup_model()
     model.policy.load_state_dict(source.policy.state_dict())
     model.num_timesteps = source.num_timesteps
+    if settings is not None:
+        settings.write_into(model)
     model.clip_range = 0.2  # plain numbers, of which loading makes the schedules of its own version
     buffer = io.BytesIO()
     model.save(buffer, exclude=["lr_schedule", "clip_range_vf", "start_time"])

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
 FOLDER = Path(__file__).parent
+TRIMMED, BEST = "trimmed_model.zip", "best_model.zip"  # in a run folder
 
 
 def pretrained_names() -> list[str]:
@@ -49,5 +50,17 @@ def load_pretrained(name: str, **kwargs: Any) -> "PPO":
 
 
 def agent_path(text: str) -> str:
-    """The path of a zip, from the name of a policy that comes with the package or from a path, which is returned as it is."""
-    return str(pretrained(text)) if text in pretrained_names() else text
+    """The path of an agent's zip, from what stands for one: the name of a policy that comes with the package, or a run folder.
+
+    Anything else is returned as it is.
+    """
+    if text in pretrained_names():
+        return str(pretrained(text))
+    configs = sorted(Path(text).glob("*/config.yml"))
+    return str(run_agent(Path(text), configs[0].parent.name)) if len(configs) == 1 else text
+
+
+def run_agent(folder: Path, name: str) -> Path:
+    """What a run has to offer: its trimmed agent, else its best one, else its last one, ``<name>.zip``."""
+    zips = [folder / file for file in (TRIMMED, BEST, f"{name}.zip")]
+    return next((path for path in zips if path.is_file()), zips[-1])

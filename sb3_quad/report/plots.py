@@ -238,8 +238,8 @@ def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mappin
 
 def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, str]) -> list[Plot]:
     (key,) = first.cell
-    success, shares = _axes(HALF, axis_label(key), "success (%)")
-    error, distances = _axes(HALF, axis_label(key), "final distance (m)")
+    success, shares = _axes(HALF, axis_label(key, first), "success (%)")
+    error, distances = _axes(HALF, axis_label(key, first), "final distance (m)")
     for label, cells in flown.items():
         x = np.array([scenario.cell[key] for scenario, _ in cells])
         band(
@@ -281,7 +281,7 @@ def _heat_map(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours
             axes.set_xticks(np.arange(len(x_values)) + 0.5, [f"{value:g}" for value in x_values])
             axes.set_yticks(np.arange(len(y_values)) + 0.5, [f"{value:g}" for value in y_values])
             axes.grid(visible=False)
-            axes.set(xlabel=axis_label(keys[0]), ylabel=axis_label(keys[1]))
+            axes.set(**{f"{axis}label": axis_label(key, scenarios[0]) for axis, key in zip("xy", keys, strict=False)})
             axes.label_outer()
     figure.colorbar(image, ax=panels.ravel().tolist(), label="success (%)", shrink=0.9)
     names = ", ".join(axis_name(key).replace("_", " ") for key in keys)

@@ -61,7 +61,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             tables, plots = [], group_plots(results, scenarios, colours)
             if len(first.cell) == 1:
                 cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
-                corner = f"{axis_label(next(iter(first.cell)))}: success (%)"
+                corner = f"{axis_label(next(iter(first.cell)), first)}: success (%)"
                 tables.append(_share_table(SUCCESS, results, cells, colours, corner))
         facts = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "

@@ -25,6 +25,7 @@ UNITS = dict(
     noise="relative std",
     duration="s",
 )
+WEIGHTS = {"force": "weights", "torque": "weights × arm length"}  # units of wrenches whose unit is weight
 _SILENT = {"magnitude", "std", "value"}
 
 
@@ -111,8 +112,13 @@ def axis_name(key: str) -> str:
     return parts[-1]
 
 
-def axis_label(key: str) -> str:
-    """The name of a varied key with its unit, as the axes of plots carry it."""
+def axis_label(key: str, scenario: Scenario | None = None) -> str:
+    """The name of a varied key with its unit, as the axes of plots carry it.
+
+    :param scenario: one of those that vary, which says the unit of its wrenches; None: they are in SI units.
+    """
     name = axis_name(key)
-    words = name.replace("_", " ")
-    return f"{words} ({UNITS[name]})" if name in UNITS else words
+    words, unit = name.replace("_", " "), UNITS.get(name)
+    if name in WEIGHTS and scenario is not None and scenario.wrenches[int(key.split(".")[1])].unit == "weight":
+        unit = WEIGHTS[name]
+    return f"{words} ({unit})" if unit else words

@@ -3,7 +3,16 @@
 import math
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveFloat, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    PositiveFloat,
+    SerializerFunctionWrapHandler,
+    ValidationInfo,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from sb3_quad.base.errors import unknown
 from sb3_quad.base.validate import Frozen
@@ -136,10 +145,23 @@ class Wrench(Frozen):
 
     start: NonNegativeFloat = Field(default=0.0, description="when it begins, s")
     duration: PositiveFloat | None = Field(default=None, description="how long it acts, s; left out: to the end")
-    force: VectorDistribution = Field(default=ZERO, description="N: [x, y, z], {std: …} or {magnitude: …}")
-    torque: VectorDistribution = Field(default=ZERO, description="N m: [x, y, z], {std: …} or {magnitude: …}")
+    force: VectorDistribution = Field(default=ZERO, description="N, or as unit says: [x, y, z], {std: …} or {magnitude: …}")
+    torque: VectorDistribution = Field(default=ZERO, description="N m, or as unit says: as force is given")
+    unit: Literal["SI", "weight"] = Field(
+        default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
+    )
     force_frame: Frame = Field(default="world", description="world or body: the axes of force")
     torque_frame: Frame = Field(default="body", description="world or body: the axes of torque")
+
+    def units(self, vehicle: Vehicle) -> tuple[float, float]:
+        """The units of force, N, and torque, N m, on a vehicle before its changes."""
+        weight = vehicle.mass * vehicle.gravity
+        return (weight, weight * vehicle.arm_length) if self.unit == "weight" else (1.0, 1.0)
+
+    @model_serializer(mode="wrap")
+    def _default_left_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """``unit`` is younger than results and their hashes."""
+        return {key: value for key, value in handler(self).items() if (key, value) != ("unit", "SI")}
 
 
 class VehicleChanges(Frozen):

@@ -10,6 +10,7 @@ from sb3_quad.base.seeds import SCENARIO_STREAM
 from sb3_quad.scenarios.parts import Attitude, VectorDistribution, Wrench
 from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench
+from sb3_quad.vehicles.vehicle import Vehicle
 
 Generators = Sequence[np.random.Generator]  # one for each episode
 
@@ -48,25 +49,25 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int], factors: FloatArray | 
             start[name] = _vectors(distribution, generators)
     if target.points:
         start["target"] = np.tile(np.array(target.points[0]), (len(seeds), 1))
-    control_step = scenario.nominal_vehicle().control_step
-    wrenches = sample_wrenches(scenario.wrenches, control_step, scenario.steps, generators, factors)
+    wrenches = sample_wrenches(scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators, factors)
     return Plan(start, wrenches, np.array(target.waypoints or np.zeros((0, 3))), target.radius or Plan.radius)
 
 
 def sample_wrenches(
-    wrenches: Sequence[Wrench], control_step: float, steps: int, generators: Generators, factors: FloatArray | None = None
+    wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators, factors: FloatArray | None = None
 ) -> dict[int, FloatArray]:
     """The sum of some wrenches over the time of n episodes, as a :class:`Plan` holds it.
 
-    :param control_step: s.
+    :param vehicle: gives the control step, and weights their size.
     :param steps: control steps of an episode.
     :param factors: of the wrenches of each episode, (n,); None: 1.
     """
     acting = []
     for wrench in wrenches:
-        first = round(wrench.start / control_step)
-        length = steps if wrench.duration is None else max(1, round(wrench.duration / control_step))
-        vectors = _vectors(wrench.force, generators), _vectors(wrench.torque, generators)
+        first = round(wrench.start / vehicle.control_step)
+        length = steps if wrench.duration is None else max(1, round(wrench.duration / vehicle.control_step))
+        newton, newton_metre = wrench.units(vehicle)
+        vectors = newton * _vectors(wrench.force, generators), newton_metre * _vectors(wrench.torque, generators)
         values = make_wrench(*vectors, wrench.force_frame, wrench.torque_frame).T
         acting.append((first, first + length, values if factors is None else factors[:, None] * values))
     times = sorted({time for first, last, _ in acting for time in (first, last) if time < steps})

@@ -18,6 +18,7 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
+DEFAULT_VEHICLE = "itm"
 NumberOrRange = float | tuple[float, float]
 
 
@@ -65,7 +66,9 @@ class Scenario(Frozen):
     )
     duration: Annotated[float, Field(gt=0, le=600)] = Field(default=15.0, description="of an episode; the unit is s")
     max_distance: PositiveFloat = Field(default=30.0, description="farther than this from the target ends an episode, m")
-    vehicle: str = Field(default="itm", description="name, or path of a YAML file (relative to the suite's)")
+    vehicle: str | Vehicle | None = Field(
+        default=None, description="name, or path of a YAML file (relative to the suite's); left out: the agent's own, or itm"
+    )
     vehicle_changes: VehicleChanges = Field(default=VehicleChanges(), description="unknown to the controller")
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(default=240, description="how many are flown")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=0, description="from which every episode gets its own")
@@ -102,8 +105,21 @@ class Scenario(Frozen):
 
         :raises ConfigError: it cannot be loaded.
         """
-        path = Path(self.vehicle)
-        return _load(self.vehicle, path.stat().st_mtime_ns if path.is_file() else 0)
+        if isinstance(self.vehicle, Vehicle):
+            return self.vehicle
+        name = self.vehicle or DEFAULT_VEHICLE
+        path = Path(name)
+        return _load(name, path.stat().st_mtime_ns if path.is_file() else 0)
+
+    def flown_by(self, own: Any) -> "Scenario":
+        """The scenario with an agent's ``own`` vehicle (None: it has none), unless it names one itself.
+
+        :raises ConfigError: it is impossible for that vehicle.
+        """
+        if own is None or self.vehicle is not None:
+            return self
+        vehicle = load_vehicle(own)
+        return validate(Scenario, {**self.model_dump(), "vehicle": vehicle}, f"scenario {self.name}, flown by {vehicle.name}")
 
     def flown_vehicle(self) -> Vehicle:
         """The vehicle that flies, changes included.

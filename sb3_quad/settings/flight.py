@@ -1,15 +1,21 @@
-"""How a run flies: the one record of it, written by training, read by all that flies its agent."""
+"""How a run flies: the one record of it, written by training into every zip, read by all that flies its agent."""
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from pydantic import Field, PositiveInt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import parse_mapping_file
-from sb3_quad.envs.registration import MAX_EPISODE_STEPS
+from sb3_quad.envs.registration import ENVIRONMENTS, MAX_EPISODE_STEPS
+from sb3_quad.experts.models import saved_data
 from sb3_quad.settings.literals import ZooLoader, parse_mapping
+from sb3_quad.simulation.tasks import Task
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+
+KEY = "flight_settings"  # of a model, and so of the JSON in its zip
 
 
 class FlightSettings(Frozen):
@@ -40,16 +46,33 @@ class FlightSettings(Frozen):
         """
         return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
+    def write_into(self, model: Any) -> None:
+        """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with the vehicle's parameters.
+
+        Its zips hold them from then on, and ``load`` of Stable-Baselines3 carries them along, also without this package.
+
+        :raises ConfigError: a vehicle that cannot be loaded.
+        """
+        scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
+        lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
+        setattr(model, KEY, self.with_changes(vehicle=load_vehicle(self.vehicle), **lists).model_dump(mode="json"))
+
     @staticmethod
-    def beside(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:
-        """How the agent in a zip flies, from the run folder that it lies in, and the file that says so; None: there is none.
+    def of(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:
+        """How the agent in a zip flies, and the file that says so: the zip, else the run's settings beside it; None: neither.
 
-        A zip itself holds no such settings. ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the
-        agent was judged with; without it, that is in its ``config.yml``.
+        Beside it, ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the agent was judged with; without
+        it, that is in its ``config.yml``. Where nothing says how it flies, that is as ``FlightSettings()``.
 
-        :raises ConfigError: several run folders' settings lie there, they cannot be read or do not fit, or they hold
+        :raises ConfigError: a zip or settings that cannot be read or do not fit; several runs' settings lie there, or
             statistics of VecNormalize, which are no part of a zip.
         """
+        record = saved_data(zip_file).get(KEY)
+        if isinstance(record, dict):
+            where, task, vehicle = f"{zip_file}: {KEY}", record.get("task"), record.get("vehicle")
+            if isinstance(task, dict) and "name" in task:  # else a mixture
+                record["task"] = validate(Task, task, where)
+            return validate(FlightSettings, {**record, "vehicle": validate(Vehicle, vehicle, where)}, where), Path(zip_file)
         folder = Path(zip_file).parent
         statistics = sorted(folder.glob("*/vecnormalize.pkl"))
         if statistics:
@@ -63,5 +86,8 @@ class FlightSettings(Frozen):
         file = files[0].with_name("args.yml")
         judged = parse_mapping_file(file, ZooLoader).get("env_kwargs") if file.is_file() else None
         parts = [judged] if judged is not None else [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
-        given = {name: value for part in parts for name, value in parse_mapping(part, where).items()}
+        name = files[0].parent.name
+        given: dict[str, Any] = {"task": ENVIRONMENTS[name]} if name in ENVIRONMENTS else {}
+        for part in parts:
+            given |= parse_mapping(part, where)
         return validate(FlightSettings, given, where), files[0]

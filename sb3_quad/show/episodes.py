@@ -84,6 +84,7 @@ class Setting(NamedTuple):
     vehicle: Any  # that experts are made for; in a scenario another one may fly
     settings: FlightSettings  # how all episodes are flown
     plan: Callable[[int], Plan]  # what happens in an episode, by its seed
+    own: Mapping[str, Mapping[str, Any]] = {}  # changes to the settings that go with a controller, by its label
 
 
 def fixed_setting(
@@ -103,21 +104,22 @@ def fixed_setting(
             raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
     wrenches = [validate(Wrench, push, "the push")] if push else []
     generators = [np.random.default_rng(0)]
-    acting = sample_wrenches(wrenches, vehicle.control_step, settings.max_episode_steps, generators)
+    acting = sample_wrenches(wrenches, vehicle, settings.max_episode_steps, generators)
     plan = Plan(start, acting)
     return Setting(settings.vehicle, settings, lambda seed: plan)
 
 
-def scenario_setting(text: str) -> Setting:
+def scenario_setting(text: str, own: Any = None) -> Setting:
     """Episodes of a scenario, named by ``suite:name``.
 
+    :param own: the vehicle of an agent, for a scenario that names none.
     :raises ConfigError: an unknown suite or name.
     """
     suite, colon, name = text.rpartition(":")
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
-    scenario = load_suite(suite).scenario(name)
-    return Setting(scenario.vehicle, flown_as(scenario), lambda seed: sample_plan(scenario, [seed]))
+    scenario = load_suite(suite).scenario(name).flown_by(own)
+    return Setting(scenario.nominal_vehicle(), flown_as(scenario), lambda seed: sample_plan(scenario, [seed]))
 
 
 def fly_all(
@@ -149,7 +151,8 @@ def fly_all(
             for each in range(seed, seed + n_envs):
                 label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
                 try:
-                    together.append(_record(label, colour, flown, settings, setting.plan(each), each))
+                    its = settings.with_changes(**setting.own.get(name, {}))
+                    together.append(_record(label, colour, flown, its, setting.plan(each), each))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
         yield together

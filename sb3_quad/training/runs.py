@@ -1,17 +1,24 @@
 """Run folders, laid out as rl-zoo's: ``logs/<algo>/<Env>_<run>/``."""
 
 import shlex
+import subprocess
 import sys
 import uuid
 from pathlib import Path
 from typing import Any
 
+import stable_baselines3
+import torch
 import yaml
 
+import sb3_quad
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.base.yaml_files import parse_mapping_file
+from sb3_quad.pretrained_policies import BEST, TRIMMED, run_agent
 from sb3_quad.settings.literals import ZooLoader
+
+MADE_WITH = ("commit", "versions")  # keys of args.yml
 
 
 class RunFolder:
@@ -24,8 +31,8 @@ class RunFolder:
     def __init__(self, path: Path, name: str) -> None:
         self.path, self.name = path, name
         self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
-        self.best_model = path / "best_model.zip"  # of the evaluations: by success, then by mean reward
-        self.trimmed_model = path / "trimmed_model.zip"  # the same after trimming, where a pipeline does that
+        self.best_model = path / BEST  # of the evaluations: by success, then by mean reward
+        self.trimmed_model = path / TRIMMED  # the same after trimming, where a pipeline does that
         self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
         self.resume_state = path / "resume.npz"  # of an interrupted run: random numbers and environments
@@ -37,7 +44,7 @@ class RunFolder:
     @property
     def result(self) -> Path:
         """What the run has to offer: its trimmed agent, else its best one, else its last one."""
-        return next((path for path in (self.trimmed_model, self.best_model) if path.is_file()), self.model)
+        return run_agent(self.path, self.name)
 
     def checkpoint(self, timesteps: int) -> Path:
         """Where the model after ``timesteps`` goes."""
@@ -69,6 +76,18 @@ class RunFolder:
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
         return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
+
+
+def made_with() -> dict[str, str]:
+    """The commit of the checkout, with a mark where files differ from it, and the versions of what a run is made with."""
+    checkout = Path(sb3_quad.__file__).resolve().parent.parent
+    command = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty= and changes"]
+    try:
+        commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        commit = "not a checkout"
+    versions = f"stable-baselines3 {stable_baselines3.__version__}, torch {torch.__version__}"
+    return dict(zip(MADE_WITH, (commit, f"sb3_quad {sb3_quad.__version__}, {versions}"), strict=True))
 
 
 def file_name(env_id: str) -> str:

@@ -33,7 +33,7 @@ from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.runs import RunFolder, claim_run, open_run
+from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
@@ -76,7 +76,7 @@ def train(
         if job.trained_agent is not None:
             transfer_policy(job.trained_agent, model)
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
-        run.write_yaml(config.settings, job.arguments())
+        run.write_yaml(config.settings, job.arguments() | made_with())
         on_start(run)
         return _learn(job, run, model, eval_envs, signals, report, should_continue)
 
@@ -92,7 +92,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     if not {"algo", "env"} <= arguments.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
-    given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs")}
+    given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs", *MADE_WITH)}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
@@ -161,6 +161,8 @@ def _learn(
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
     last_good, best = LastGoodModel(), None
+    if job.config.task is not None and not (job.config.env_wrapper or job.config.vec_env_wrapper):  # flights have none
+        job.flight_settings.write_into(model)
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
     if eval_envs:
         best = BestModel(

@@ -125,6 +125,11 @@ class Vehicle(Frozen):
         own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & OTHER_LIMITS.keys() else None)
         return Vehicle.model_validate({**own, **changes})
 
+    def flies_as(self, other: "Vehicle") -> bool:
+        """Whether both have the same parameters; names and an expert's gains do not matter."""
+        ours, theirs = (each.model_dump(exclude={"name", "geometric_gains"}) for each in (self, other))
+        return ours == theirs
+
     @property
     def mixer(self) -> FloatArray:
         """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N.

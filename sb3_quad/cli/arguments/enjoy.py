@@ -3,12 +3,13 @@
 examples:
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs          the latest run's agent, in a window
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
-  sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 --record recovery.mp4
-  sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 --sequence s1.png
-  sb3-quad enjoy agent.zip --target 5 0 20 --force -20 -20 0 --torque -5 -5 -5 --at 2.5 --for 0.02 --record hit.mp4 --speed 0.5
+  sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 -o recovery.mp4
+  sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
+  sb3-quad enjoy agent.zip --target 5 0 20 --force -20 -20 0 --torque -5 -5 -5 --at 2.5 --for 0.02 -o hit.mp4 --speed 0.5
   sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml -n 3000 --no-render
 
-A controller is pid, geometric, the path of an SB3 zip, or package.module:factory; a prefix name=… labels it.
+A controller is pid, geometric, the path of an SB3 zip or a run folder, or package.module:factory; name=… labels it.
+The first agent says which vehicle, task and observation all fly with, unless --env, --task, --scenario or --env-kwargs do.
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
 
@@ -32,8 +33,10 @@ def add_arguments(parser: Parser) -> None:
     add("--torque", nargs=3, type=float, metavar=("X", "Y", "Z"), help="an external torque, body frame, N m")
     add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
     add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
-    add("--record", metavar="FILE", help="write a film instead of opening a window: .mp4 or .gif")
-    add("--sequence", metavar="FILE", help="write the first episode as poses in one picture: .png")
+    output = "write a film (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
+    add("-o", "--output", metavar="FILE", help=output)
+    add("--record", metavar="FILE", help="write a film, also beside a picture: .mp4 or .gif")
+    add("--sequence", metavar="FILE", help="write a picture, also beside a film: .png")
     add("--times", nargs="+", type=float, metavar="S", help="times of the sequence's poses, s (wherever they do not overlap)")
 
 

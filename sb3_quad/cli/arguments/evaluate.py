@@ -2,7 +2,7 @@
 
 controllers:
   pid, geometric          the experts
-  path/to/agent.zip       an agent of any Stable-Baselines3 algorithm
+  path/to/agent.zip       an agent of any Stable-Baselines3 algorithm, or the run folder of one
   package.module:factory  a function that takes the vehicle and returns a controller
   name=…                  any of these, under that name in the tables
 
@@ -34,7 +34,7 @@ def add_arguments(parser: Parser) -> None:
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
     add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
     add("--seed", type=whole, metavar="N", help="seed of each scenario, instead of its own")
-    add("--vehicle", metavar="V", help="vehicle for all scenarios, by name or YAML file")
+    add("--vehicle", metavar="V", help="vehicle for all, by name or YAML file (each agent's own, where the suite names none)")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")

@@ -19,11 +19,11 @@ from sb3_quad.pretrained_policies import agent_path
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    agent = "an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy, or a name such as itm-recovery"
-    add("model", type=agent_path, metavar="MODEL.zip", help=agent)
+    agent = "an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy: a zip, a run folder, or a name such as itm-recovery"
+    add("model", type=agent_path, metavar="MODEL", help=agent)
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
-    add("-o", metavar="FILE", dest="file", help="file to write (beside the zip, ending in .onnx, .pt or .h)")
+    add("-o", metavar="FILE", dest="file", help="file to write, or a folder for it (here, named as the zip, .onnx, .pt or .h)")
     add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
-    add("--vehicle", metavar="VEHICLE", help="name or YAML file (the one in the zip's run folder, else itm)")
+    add("--vehicle", metavar="VEHICLE", help="name or YAML file (the one that the zip or its run folder says)")
     add("--name", metavar="NAME", help="name the C function NAME_policy (the file's name without its ending)")
     add("--overwrite", action="store_true", help="replace FILE if it exists")

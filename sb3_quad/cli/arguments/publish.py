@@ -7,17 +7,19 @@ examples:
   sb3-quad publish logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent
   sb3-quad publish logs/ppo/QuadStateRecovery-v0_2/best_model.zip --name other --command "python my.py" -o published
 
-The zip must lie in its run folder, which records how it was trained.
+How it was trained is taken from its run folder. What is recorded nowhere, the card calls so.
 """
 
 from sb3_quad.cli.parser import Parser, positive
+from sb3_quad.pretrained_policies import agent_path
 
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("model", metavar="MODEL.zip", help="an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy")
+    agent = "an agent of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) with MlpPolicy: a zip or a run folder"
+    add("model", type=agent_path, metavar="MODEL", help=agent)
     add("--name", required=True, metavar="NAME", help="name of the files, NAME.zip and NAME.md")
-    add("-o", metavar="FOLDER", dest="folder", default=".", help="where they go (current folder)")
-    add("--command", metavar="TEXT", dest="made_by", help="the command that trained it (as noted in the run folder)")
+    add("-o", metavar="FOLDER", dest="folder", default=".", help="folder for both (here)")
+    add("--command", metavar="TEXT", dest="made_by", help="the command that trained it (command.txt of the run)")
     add("--episodes", type=positive, default=960, metavar="N", help="episodes of each task (960; recoveries: 4 times as many)")
     add("--overwrite", action="store_true", help="replace existing files")

@@ -19,9 +19,9 @@ def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``record_video.py``, with their meanings."""
     add = parser.add_argument
     add_flight_arguments(parser)
-    agent = "an agent of any SB3 algorithm, or a name such as itm-recovery, instead of one from the log folder"
+    agent = "an agent of any SB3 algorithm: a zip, a run folder or a name such as itm-recovery, instead of --algo"
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=agent)
     add("-n", "--n-timesteps", type=positive, default=1000, metavar="N", help="control steps, over as many episodes (1000)")
-    add("-o", "--output-folder", metavar="DIR", help="where the film goes (videos, beside the agent's zip)")
-    only_enjoy = ("task", "scenario", "target", "force", "torque", "start", "duration", "sequence", "times")
+    add("-o", "--output-folder", metavar="PATH", help="file or folder for the film (videos in the run folder; of -i: here)")
+    only_enjoy = ("task", "scenario", "target", "force", "torque", "start", "duration", "sequence", "times", "output")
     parser.set_defaults(**dict.fromkeys(only_enjoy), controllers=[], no_render=False)

@@ -38,7 +38,7 @@ def add_settings(parser: Parser) -> None:
     add("--env-kwargs", action=Pairs, nargs="+", metavar="K:V", help="environment keywords, such as noise:0")
     add("--eval-env-kwargs", action=Pairs, nargs="+", metavar="K:V", help="the same, for evaluations only")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
-    start = "agent to start from (policy and critic): an SB3 on-policy zip, or a name such as itm-recovery"
+    start = "agent to start from (policy and critic): an SB3 on-policy zip, a run folder, or a name such as itm-recovery"
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
     add("--n-eval-envs", type=whole, metavar="N", help="environments of an evaluation (batch: one per episode; else 1)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")

@@ -17,8 +17,7 @@ from sb3_quad.cli.arguments.enjoy import DEFAULT_ENV
 from sb3_quad.cli.parser import given
 from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.evaluation.controllers import build, parse_controllers
-from sb3_quad.experts.models import load_model
+from sb3_quad.evaluation.controllers import ControllerSpec, build, parse_controllers
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.episodes import Recording, Setting, fixed_setting, fly_all, scenario_setting
@@ -32,6 +31,8 @@ SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, an
 
 def run(options: argparse.Namespace) -> int:
     """Fly, show, print how it went. Returns the exit code."""
+    if options.output:
+        vars(options)["sequence" if options.output.lower().endswith(".png") else "record"] = options.output
     window = not (options.no_render or options.record or options.sequence)
     _check(options, window)
     size = _size(options.size)
@@ -60,15 +61,13 @@ def known_environment(options: argparse.Namespace) -> str:
     return str(env_id)
 
 
-def chosen_agent(options: argparse.Namespace) -> tuple[str, Path, FlightSettings]:
+def chosen_agent(options: argparse.Namespace) -> ControllerSpec:
     """The agent of record-video's ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
-    :return: a label, its zip, and the settings that it was judged with.
     :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
     """
     if options.trained_agent is not None:
-        path = Path(options.trained_agent)
-        return path.stem, path, FlightSettings()
+        return ControllerSpec(Path(options.trained_agent).stem, options.trained_agent)
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # says so if there is none of that name
     run = find_run(options.folder, options.algo, known_environment(options), options.exp_id)
@@ -85,7 +84,7 @@ def chosen_agent(options: argparse.Namespace) -> tuple[str, Path, FlightSettings
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
         if settings.get(key):
             raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    return f"{options.algo} {path.name}", path, FlightSettings.beside(path)[0]
+    return ControllerSpec(f"{options.algo} {path.name}", str(path))
 
 
 def _check(options: argparse.Namespace, window: bool) -> None:
@@ -96,6 +95,7 @@ def _check(options: argparse.Namespace, window: bool) -> None:
         raise ConfigError("--env, --task and --scenario each say what is flown; give one")
     if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
+    FlightSettings().with_changes(**options.env_kwargs)  # says what does not fit
     if options.speed <= 0:
         raise ConfigError(f"--speed {options.speed:g}: must be above 0")
     if options.times is not None and not options.sequence:
@@ -116,25 +116,29 @@ def _check(options: argparse.Namespace, window: bool) -> None:
 def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
     """What is flown, and who flies, by label."""
     env_id = known_environment(options)
-    agent = chosen_agent(options) if options.algo or options.trained_agent else None
+    chosen = [chosen_agent(options)] if options.algo or options.trained_agent else []
+    specs = {spec.label: spec for spec in [*chosen, *parse_controllers(options.controllers)]}
+    agents = [spec.own for spec in specs.values() if spec.own is not None]  # the first says how all are flown
     push = given(options, "force", "torque", "start", "duration")
     if options.scenario is not None:
         if options.env_kwargs or options.target or push:
             raise ConfigError("--scenario says all about a flight; leave --env-kwargs, --target, --force and --torque away")
-        setting = scenario_setting(options.scenario)
+        setting = scenario_setting(options.scenario, agents[0].vehicle if agents else None)
     else:
-        named = {"task": options.task} if options.task else {}
-        kept = agent[2].given() if agent else {}
-        settings = FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **kept, **named, **options.env_kwargs})
-        setting = fixed_setting(settings, options.target, push)
-    controllers: dict[str, Any] = {}
-    if agent:
-        label, path, _ = agent
-        print(f"agent: {path}")
-        controllers[label] = load_model(path)
-    for spec in parse_controllers(options.controllers):
-        controllers[spec.label] = build(spec, setting.vehicle)
-    return setting, controllers
+        kept = agents[0] if agents else FlightSettings(task=ENVIRONMENTS[env_id])
+        task = options.task or (ENVIRONMENTS[env_id] if options.env and not options.algo else kept.task)
+        changes = {"task": task} | ({} if task == kept.task else {"task_kwargs": None}) | options.env_kwargs
+        setting = fixed_setting(kept.with_changes(**changes), options.target, push)
+    for spec in chosen:
+        print(f"agent: {spec.spec}")
+    controllers = {label: build(spec, setting.vehicle) for label, spec in specs.items()}
+    for line in filter(None, (spec.notice(setting.vehicle) for spec in specs.values())):
+        print(f"warning: {line}", file=sys.stderr)
+    own = {
+        label: {name: value for name, value in spec.observed.items() if name not in options.env_kwargs}
+        for label, spec in specs.items()
+    }
+    return setting._replace(own=own), controllers
 
 
 def _write_sequence(options: argparse.Namespace, episode: Sequence[Recording], size: tuple[int, int] | None) -> None:

@@ -22,12 +22,14 @@ def run(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
-        results = evaluate(suite, controllers, folder, options.backend, options.workers, options.overwrite, show)
+        how = options.backend, options.workers, options.overwrite
+        results = evaluate(suite, controllers, folder, *how, show, lambda line: print(f"warning: {line}", file=sys.stderr))
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
     if labels:
         console().print(overview(flown, labels))
-    print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
+    if results.entries:
+        print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and results.entries:
         try:
             report(folder, overwrite=True, pictures=True)
