@@ -12,10 +12,14 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.cli.arguments.train import DEFAULT_PIPELINE
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.experts.resolve import DEFAULT_EXPERT
 from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
 from sb3_quad.settings.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.settings.values import convert, qualified_classes, takes_whole
+from sb3_quad.training.pipeline import load_pipeline
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -246,6 +250,15 @@ def test_packaged_files_hold_good_settings(name):
     assert algo in ALGORITHMS
     for env_id in content:
         assert load_config(algo, env_id, name).n_timesteps > 0
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
+    for algo in ("dagger", "ppo_bc"):
+        assert load_config(algo, env_id).expert == build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT == "geometric"
+        assert {load_config(algo, env_id, f"{folder}/{algo}.yml").expert for folder in ("pid", "thesis")} == {"pid"}
+    for file, expert in ((DEFAULT_PIPELINE, "geometric"), ("thesis/two_stage.yml", "pid")):
+        assert {load_config(each.algo, each.env, each.conf_file).expert for each in load_pipeline(file).stages} == {expert}
 
 
 def test_thesis_settings_are_table_a4():

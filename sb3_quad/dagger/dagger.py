@@ -57,7 +57,7 @@ class DAgger(OnPolicyAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds ``log_std_init``, it
         begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3
+    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``GeometricExpert``, another SB3
         model, or a function from observations to actions; :class:`~sb3_quad.experts.controller.Controller` says what
         each is shown. It is never saved: give it to ``load`` again, or call :meth:`set_expert`, before learning continues
     :param batch_size: Minibatch size, in pairs of the dataset

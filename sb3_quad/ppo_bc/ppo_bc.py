@@ -137,7 +137,7 @@ class PPOBC(PPO):
     def _check_cloning(self) -> None:
         if self.expert is None:
             raise ExpertError(
-                "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
+                "PPOBC needs an expert to clone: PPOBC(..., expert=GeometricExpert()), model.set_expert(...), or bc_coef=0"
             )
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")

@@ -15,6 +15,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.experts.resolve import DEFAULT_EXPERT
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping, parse_number
@@ -22,7 +23,7 @@ from sb3_quad.settings.values import as_list, check, convert, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
-SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("geometric", "thesis"))
+SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("pid", "thesis"))
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
 
@@ -170,7 +171,7 @@ def build_config(
     }
     defaults: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
     if takes_expert(get_algorithm(algo)):
-        defaults["expert"] = "pid"
+        defaults["expert"] = DEFAULT_EXPERT
     whole = {**defaults, **given, "algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": dict(settings)}
     if "n_timesteps" not in whole:
         raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")

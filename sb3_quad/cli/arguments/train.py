@@ -2,7 +2,7 @@
 
 examples:
   sb3-quad train                                          both stages, in the batched environment
-  sb3-quad train --conf-file two_stage.yml                both stages from the PID expert, as in the thesis
+  sb3-quad train --conf-file thesis/two_stage.yml         both stages from the PID expert, as in the thesis
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger                            stage one alone
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, a process per environment
@@ -20,7 +20,7 @@ import argparse
 from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
-DEFAULT_PIPELINE = "geometric/two_stage.yml"
+DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 

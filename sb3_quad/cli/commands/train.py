@@ -16,7 +16,7 @@ from sb3_quad.cli.compare import agent_and_expert, print_tables
 from sb3_quad.cli.output import console, shows_progress
 from sb3_quad.cli.parser import given
 from sb3_quad.experts.models import load_model
-from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.settings.config import TrainingConfig, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import (
@@ -115,7 +115,7 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
         return result.exit_code
     seconds, config = time.perf_counter() - start, result.job.config
     times = {name: entry.seconds for name, entry in result.stages.items()}
-    controllers = {"expert": resolve_expert(config.expert or "pid", result.job.flight_settings.vehicle)}
+    controllers = {"expert": resolve_expert(config.expert or DEFAULT_EXPERT, result.job.flight_settings.vehicle)}
     controllers |= {name: load_model(entry.agent) for name, entry in result.stages.items()}
     if reference:
         settings: dict[str, Any] = {"vec_env": config.vec_env, "env_kwargs": config.flight_settings.in_any_task()}
