@@ -98,6 +98,8 @@ def one_line_of_error(capsys) -> str:
         (["train", "--algo", "dagger", "--expert", "pit"], "unknown expert"),
         (["train", "--algo", "dagger", "--conf-file", "thesis/dager.yml"], "did you mean 'thesis/dagger.yml'"),
         (["train", "--algo", "dagger", "-i", "missing.zip"], "missing.zip: no such file"),
+        (["train", "--algo", "dagger", "--device", "cuda"], "device cuda: PyTorch finds no CUDA"),
+        (["train", "--device", "cuda:1"], "device cuda:1"),
         (["train", "--algo", "dagger", "--seed", str(2**40)], "seed"),
         (["train", "--algo", "dagger", "--gym-packages", "no_such_package"], "no_such_package"),
         (["train", "--algo", "dagger", "--num-threads", "0"], "at least 1"),
@@ -117,6 +119,14 @@ def test_a_log_folder_that_cannot_be_written(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     assert main(["train", "--algo", "dagger", "-f", str(tmp_path / "file")]) == 2
     assert "cannot be written" in one_line_of_error(capsys)
+
+
+def test_a_tensorboard_folder_that_cannot_be_written_leaves_no_run(capsys, tmp_path, settings_file):
+    (tmp_path / "file").write_text("")
+    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs")]
+    assert main([*arguments, "-tb", str(tmp_path / "file" / "tb")]) == 2
+    assert "TensorBoard folder" in one_line_of_error(capsys)
+    assert not (tmp_path / "logs").exists()
 
 
 def damaged_zip(tmp_path, kind):
@@ -150,10 +160,11 @@ def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, set
     assert not (tmp_path / "logs").exists()
 
 
-def test_help_has_examples_and_needs_no_torch():
+def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():
     code = (
         "import sys\nfrom sb3_quad.cli import main\n"
         "codes = [main(a) for a in (['--help'], ['train', '--help'], ['benchmark', '--help'])]\n"
+        "codes.append(main(['train', '-i', 'missing.zip']) != 2)\n"
         "sys.exit(any(codes) or 'torch' in sys.modules or 'numba' in sys.modules)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)

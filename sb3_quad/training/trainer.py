@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch as th
@@ -69,6 +71,7 @@ def train(
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
+    _check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         if job.trained_agent is not None:
@@ -92,11 +95,29 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
     given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs")}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
+    _check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = _load_snapshot(run, config.algo, env, job.device, **attributes)
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         return _learn(job, run, model, eval_envs, signals, report)
+
+
+def _check_tensorboard(job: TrainingJob) -> None:
+    """Make the folder for TensorBoard, before a run folder is there that would stay empty.
+
+    :raises ConfigError: it cannot be written.
+    """
+    if job.tensorboard_log is None:
+        return
+    try:
+        Path(job.tensorboard_log).mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=job.tensorboard_log).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigError(
+            f"TensorBoard folder {job.tensorboard_log}: cannot be written ({reason}); give another with -tb"
+        ) from None
 
 
 @contextmanager

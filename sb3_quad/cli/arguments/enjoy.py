@@ -43,7 +43,7 @@ def add_flight_arguments(parser: Parser) -> None:
     add("--algo", help="algorithm of a trained agent, looked up in the log folder")
     add("--env", help=f"environment id ({DEFAULT_ENV})")
     add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
-    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest (0)")
+    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--load-best", dest="which", action="store_const", const="best", help="the best agent of the evaluations"

@@ -16,6 +16,7 @@ examples:
 """
 
 import argparse
+from pathlib import Path
 
 from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
@@ -39,11 +40,19 @@ def add_settings(parser: Parser) -> None:
     add("--eval-env-kwargs", action=Pairs, nargs="+", metavar="K:V", help="the same, for evaluations only")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
     start = "agent to start from (policy and critic): an SB3 on-policy zip, or a name such as itm-recovery"
-    add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
+    add("-i", "--trained-agent", type=_agent, metavar="ZIP", help=start)
     add("--n-eval-envs", type=whole, metavar="N", help="environments of an evaluation (batch: one per episode; else 1)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
     add("--device", help="cpu (default), cuda or auto")
     add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
+
+
+def _agent(text: str) -> str:
+    """The path of an agent's zip that is there; named at once, while nothing is imported yet."""
+    path = agent_path(text)
+    if not any(Path(f"{path}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds the suffix
+        raise argparse.ArgumentTypeError(f"{path}: no such file")
+    return path
 
 
 def add_arguments(parser: Parser) -> None:
