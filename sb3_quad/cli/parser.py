@@ -2,6 +2,7 @@
 
 import argparse
 import random
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -10,6 +11,9 @@ from sb3_quad.settings.literals import parse_number, parse_value
 
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
+
+    elsewhere: Mapping[str, str] = {}
+    """By options of rl-zoo that a command lacks: what else to call."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs})
@@ -25,8 +29,10 @@ class Parser(argparse.ArgumentParser):
         """
         options, rest = super().parse_known_args(args, namespace)
         for text in rest:
+            if (name := text.split("=")[0]) in self.elsewhere:
+                raise ConfigError(f"{name} {self.elsewhere[name]}")
             valid = [option for action in self._actions for option in action.option_strings]
-            raise ConfigError(unknown("option", text.split("=")[0], valid).split("(valid:")[0].rstrip(": ") + "; see --help")
+            raise ConfigError(unknown("option", name, valid).split("(valid:")[0].rstrip(": ") + "; see --help")
         return options, rest
 
 

@@ -14,11 +14,16 @@ Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip
 
 from sb3_quad.cli.parser import Pairs, Parser, positive, whole
 
+BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo enjoy --help, docs/zoo.md"
+LACKED = ("--num-threads", "--verbose", "--device", "--norm-reward", "--reward-log", "--gym-packages", "--custom-objects")
+ELSEWHERE = dict.fromkeys((*LACKED, "-P", "--progress"), BRIDGE)
+"""Flags of rl-zoo's ``enjoy.py`` that ours lacks, and where to find what they do."""
 DEFAULT_ENV = "QuadTargetTracking-v0"
 
 
 def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
+    parser.elsewhere = ELSEWHERE
     add = parser.add_argument
     add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
     add_flight_arguments(parser)

@@ -16,7 +16,6 @@ examples:
 """
 
 import argparse
-from pathlib import Path
 
 from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
@@ -25,13 +24,30 @@ DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
+SEARCH, BRIDGE = (
+    "is of rl-zoo's search for hyperparameters, here a command of its own: sb3-quad tune --help, docs/tune.md",
+    "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo train --help, docs/zoo.md",
+)
+ELSEWHERE = {
+    **dict.fromkeys(
+        ("-optimize", "--optimize-hyperparameters", "--n-trials", "--max-total-trials", "--sampler", "--pruner"), SEARCH
+    ),
+    **dict.fromkeys(("--n-startup-trials", "--n-evaluations", "--storage", "--study-name", "--n-jobs", "--trial-id"), SEARCH),
+    **dict.fromkeys(("--no-optim-plots", "--optimization-log-path"), SEARCH),
+    **dict.fromkeys(("--track", "--wandb-project-name", "--wandb-entity", "--wandb-group", "-tags", "--wandb-tags"), BRIDGE),
+    **dict.fromkeys(("--save-replay-buffer", "--truncate-last-trajectory"), BRIDGE),
+}
+"""Flags of rl-zoo's ``train.py`` that ours lacks, and where to find what they do."""
+
+
 def add_settings(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py`` for what is trained, with their meanings."""
+    parser.elsewhere = ELSEWHERE
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc or ppo ({DEFAULT_ALGO})")
     add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
     add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
-    add("-n", "--n-timesteps", type=whole, metavar="N", help="timesteps to train on")
+    add("-n", "--n-timesteps", type=whole, metavar="N", help="timesteps, in whole rollouts; fewer than one shorten it")
     add("--n-envs", type=whole, metavar="N", help="environments side by side")
     add("--vec-env", metavar="KIND", help="batch (compiled), dummy (PyBullet, one process) or subproc (one process each)")
     add("--expert", metavar="SPEC", help="pid, geometric, path/to/model.zip or package.module:factory")
@@ -40,19 +56,11 @@ def add_settings(parser: Parser) -> None:
     add("--eval-env-kwargs", action=Pairs, nargs="+", metavar="K:V", help="the same, for evaluations only")
     add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
     start = "agent to start from (policy and critic): an SB3 on-policy zip, or a name such as itm-recovery"
-    add("-i", "--trained-agent", type=_agent, metavar="ZIP", help=start)
+    add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
     add("--n-eval-envs", type=whole, metavar="N", help="environments of an evaluation (batch: one per episode; else 1)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
     add("--device", help="cpu (default), cuda or auto")
     add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
-
-
-def _agent(text: str) -> str:
-    """The path of an agent's zip that is there; named at once, while nothing is imported yet."""
-    path = agent_path(text)
-    if not any(Path(f"{path}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds the suffix
-        raise argparse.ArgumentTypeError(f"{path}: no such file")
-    return path
 
 
 def add_arguments(parser: Parser) -> None:
