@@ -33,6 +33,7 @@ from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import RunFolder, claim_run, open_run
 
 Report = Callable[[str], None]
@@ -193,6 +194,8 @@ def _learn(
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
     callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
+    if job.progress:
+        callbacks.append(ProgressBar())
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
     start = time.perf_counter()
     try:
@@ -202,7 +205,6 @@ def _learn(
             log_interval=job.log_interval,
             tb_log_name=f"{job.config.algo}_{run.path.name}",
             reset_num_timesteps=model.num_timesteps == 0,
-            progress_bar=job.progress,
         )
         if best is not None and signals.received is None and not best.stopped:
             best.evaluate()
