@@ -2,6 +2,8 @@
 
 import json
 import os
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -17,6 +19,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.cli import compare, main
+from sb3_quad.cli.app import COMMANDS
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
@@ -193,6 +196,26 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
     assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {"max_episode_steps": 60, "noise": 0.1}
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
+
+
+def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert main(["train", "--algo", "dagger", "--conf-file", settings_file, "--eval-episodes", "0", "--no-progress"]) == 0
+    lines = capsys.readouterr().out.split("next:\n")[1].splitlines()
+    agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
+    for line, more, made in zip(
+        lines,
+        ([], ["--episodes", "2", "--no-report"], ["-o", "agent.pt"]),
+        (f"dagger_{ENV}_1.png", f"evaluations/dagger_{ENV}_1/results.json", "agent.pt"),
+        strict=True,
+    ):
+        words = shlex.split(line)
+        arguments = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
+        assert main([*arguments, *more]) == 0
+        assert Path(made).is_file()
+    assert agent in lines[1] and agent in lines[2]
+    assert shutil.which(shlex.split(lines[0])[0])
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])
