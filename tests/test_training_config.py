@@ -19,6 +19,7 @@ from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get
 from sb3_quad.settings.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.settings.values import convert, qualified_classes, takes_whole
+from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline
 
 ENV = "QuadTargetTracking-v0"
@@ -125,6 +126,21 @@ def test_there_is_at_least_one_environment(n_envs):
         build(n_envs=n_envs)
 
 
+@pytest.mark.parametrize("algo", ["dagger", "ppo_bc", "ppo"])
+@pytest.mark.parametrize("n_timesteps", [1000, 60_000, 130_000, 6_000_000])
+def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_trained(algo, n_timesteps):
+    config, shipped = load_config(algo, ENV, None, {"n_timesteps": n_timesteps}), load_config(algo, ENV)
+    rollout = config.hyperparams["n_steps"] * config.n_envs
+    assert rollout < n_timesteps + config.n_envs and config.hyperparams["batch_size"] <= rollout
+    longest = shipped.hyperparams["n_steps"] * shipped.n_envs
+    assert rollout == longest if n_timesteps >= longest else rollout >= n_timesteps
+    trained = -(-n_timesteps // rollout) * rollout
+    line = describe(TrainingJob(config=config))
+    assert f": {trained:,} timesteps" in line
+    assert (f"({n_timesteps:,} were asked for)" in line) == (trained != n_timesteps)
+    assert ("will not learn" in line) == (algo == "ppo_bc" and trained <= 4 * rollout)
+
+
 def test_unknown_names_come_with_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'dagger'"):
         load_config("dager", ENV)
@@ -167,7 +183,9 @@ def test_yaml_cannot_make_objects(tmp_path):
 
 def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
     path = tmp_path / "mine.yml"
-    path.write_text(yaml.safe_dump({ENV: {"n_timesteps": 10, "gamma": 0.9, "env_kwargs": {"noise": 0.1, "vehicle": "itm"}}}))
+    path.write_text(
+        yaml.safe_dump({ENV: {"n_timesteps": 10_000, "gamma": 0.9, "env_kwargs": {"noise": 0.1, "vehicle": "itm"}}})
+    )
     config = load_config("ppo", ENV, path, {"gamma": 0.8, "env_kwargs": {"noise": 0}})
     assert config.hyperparams == {"gamma": 0.8}
     assert config.env_kwargs == {"noise": 0, "vehicle": "itm"}

@@ -114,6 +114,11 @@ class PPOBC(PPO):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "expert", "rollout_buffer_class", "rollout_buffer_kwargs"]
 
+    @property
+    def policy_is_idle(self) -> bool:
+        """Whether the policy is still the one that it began with, since only the critic has learnt (``critic_warmup``)."""
+        return 0 < self.critic_warmup >= self._n_rollouts_trained
+
     def set_expert(self, expert: Any) -> None:
         """Clone ``expert`` from the next rollout on, as a model must that was loaded without one."""
         self.expert = expert

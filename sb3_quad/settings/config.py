@@ -80,6 +80,17 @@ class TrainingConfig(Frozen):
         """How an agent of this job flies, of an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
 
+    def keyword(self, name: str) -> Any:
+        """What the algorithm's constructor is given as ``name``, or its default."""
+        return self.hyperparams.get(name, constructor_parameters(get_algorithm(self.algo))[name].default)
+
+    def shorter_rollout(self) -> dict[str, int]:
+        """The settings that fit a rollout to a budget of less than one, which SB3 would fly whole; none otherwise."""
+        n_steps = -(-self.n_timesteps // self.n_envs)
+        if n_steps >= self.keyword("n_steps"):
+            return {}
+        return {"n_steps": n_steps, "batch_size": min(self.keyword("batch_size"), n_steps * self.n_envs)}
+
     @field_validator("policy", mode="before")
     @classmethod
     def _known_policy(cls, value: Any, info: ValidationInfo) -> str:
@@ -126,6 +137,8 @@ def load_config(
 ) -> TrainingConfig:
     """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for ``env_kwargs``).
 
+    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size`` to no more than that.
+
     :param conf_file: path of a file, or the name of one that comes with the package such as ``thesis/dagger.yml``;
         None for ``<algo>.yml`` of the package.
     :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that does not fit.
@@ -143,7 +156,9 @@ def load_config(
     if "env_kwargs" in changes:
         base = parse_mapping(settings.get("env_kwargs"), f"{where}: env_kwargs")
         changes["env_kwargs"] = {**base, **parse_mapping(changes["env_kwargs"], "env_kwargs")}
-    return build_config(algo, env_id, {**settings, **changes}, where, changes)
+    config = build_config(algo, env_id, {**settings, **changes}, where, changes)
+    shorter = config.shorter_rollout()
+    return build_config(algo, env_id, {**config.settings, **shorter}, where, changes) if shorter else config
 
 
 def build_config(

@@ -57,11 +57,17 @@ class TrainingJob(Frozen):
 
 
 def describe(job: TrainingJob) -> str:
-    """One line that says what is about to be trained."""
+    """One line that says what is about to be trained: whole rollouts, as SB3 does."""
     config = job.config
+    n_steps = config.keyword("n_steps")
+    rollouts = -(-config.n_timesteps // (n_steps * config.n_envs))
+    timesteps = rollouts * n_steps * config.n_envs
+    asked = "" if timesteps == config.n_timesteps else f" ({config.n_timesteps:,} were asked for)"
+    warming = rollouts <= config.hyperparams.get("critic_warmup", 0)
+    idle = "; critic_warmup lasts all of it, so that the policy will not learn" if warming else ""
     start = f", from {job.trained_agent}" if job.trained_agent else ""
     expert = f", expert {config.expert}" if config.expert is not None else ""
     return (
-        f"{config.algo} on {config.env_id}: {config.n_timesteps:,} timesteps, {config.n_envs} environments "
-        f"({config.vec_env}){expert}, seed {job.seed}{start}"
+        f"{config.algo} on {config.env_id}: {timesteps:,} timesteps{asked}, rollouts of {n_steps} steps, "
+        f"{config.n_envs} environments ({config.vec_env}){expert}, seed {job.seed}{start}{idle}"
     )

@@ -26,7 +26,7 @@ def run(options: argparse.Namespace) -> int:
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
     content, run = slim_bytes(options.model), open_run(Path(options.model).parent)
-    command, facts, settings = options.made_by or _command(run), _facts(run), _settings(options.model)
+    command, facts, settings = options.made_by or _command(run), _facts(run, options.model), _settings(options.model)
     write_bytes(zip_file, content)
     rows = measure(load_model(zip_file), options.episodes, **settings)
     card = write_card(options.name, rows, command, facts, settings)
@@ -50,11 +50,11 @@ def _command(run: RunFolder) -> str:
     return read_text(run.command).strip()
 
 
-def _facts(run: RunFolder) -> dict[str, str]:
-    """What the run folder and the checkout know."""
+def _facts(run: RunFolder, model: str) -> dict[str, str]:
+    """What the zip, the run folder and the checkout know."""
     settings, arguments = run.read_yaml()
     return {
-        "algorithm": f"`{arguments.get('algo')}`, {int(settings['n_timesteps']):,} timesteps"
+        "algorithm": f"`{arguments.get('algo')}`, {load_model(model).num_timesteps:,} timesteps"
         + (" after the agent of the stage before" if arguments.get("trained_agent") else ""),
         "environment": f"`{arguments.get('env')}`",
         "expert": f"`{settings.get('expert')}`",
