@@ -124,10 +124,10 @@ def test_a_log_folder_that_cannot_be_written(capsys, tmp_path):
     assert "cannot be written" in one_line_of_error(capsys)
 
 
-def test_a_tensorboard_folder_that_cannot_be_written_leaves_no_run(capsys, tmp_path, settings_file):
+@pytest.mark.parametrize("what", [[], ["--algo", "dagger"]])
+def test_a_tensorboard_folder_that_cannot_be_written_leaves_no_run(what, capsys, tmp_path):
     (tmp_path / "file").write_text("")
-    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs")]
-    assert main([*arguments, "-tb", str(tmp_path / "file" / "tb")]) == 2
+    assert main(["train", *what, "-f", str(tmp_path / "logs"), "-tb", str(tmp_path / "file" / "tb")]) == 2
     assert "TensorBoard folder" in one_line_of_error(capsys)
     assert not (tmp_path / "logs").exists()
 

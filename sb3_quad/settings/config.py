@@ -173,6 +173,8 @@ def build_config(
     parameters = constructor_parameters(get_algorithm(algo))
     check_environment(env_id)
     settings = {key: with_vehicle_path(value) if key.endswith("env_kwargs") else value for key, value in settings.items()}
+    if takes_expert(get_algorithm(algo)):
+        settings["expert"] = settings.get("expert") or DEFAULT_EXPERT  # so that config.yml names it
 
     def source(key: str) -> str:
         return "command line" if key in changes else where
@@ -185,8 +187,6 @@ def build_config(
         key: convert(value, parameters[key], f"{source(key)}: {key}") for key, value in settings.items() if key in parameters
     }
     defaults: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
-    if takes_expert(get_algorithm(algo)):
-        defaults["expert"] = DEFAULT_EXPERT
     whole = {**defaults, **given, "algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": dict(settings)}
     if "n_timesteps" not in whole:
         raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")

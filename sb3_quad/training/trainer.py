@@ -72,7 +72,7 @@ def train(
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
-    _check_tensorboard(job)
+    check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         if job.trained_agent is not None:
@@ -96,7 +96,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
     given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs")}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
-    _check_tensorboard(job)
+    check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = _load_snapshot(run, config.algo, env, job.device, **attributes)
@@ -104,7 +104,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         return _learn(job, run, model, eval_envs, signals, report)
 
 
-def _check_tensorboard(job: TrainingJob) -> None:
+def check_tensorboard(job: TrainingJob) -> None:
     """Make the folder for TensorBoard, before a run folder is there that would stay empty.
 
     :raises ConfigError: it cannot be written.

@@ -40,21 +40,21 @@ def run(options: argparse.Namespace) -> int:
         print(f"{signals.name}: writing the best of {search.trials_done} so far")
     seeds = row_seeds(seed_for("expert", options.seed), FRESH_SETS)
     tried = search.first, search.best
-    flown = [measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, FRESH_EPISODES) for each in tried]
-    costs = [fresh_cost(metrics) for metrics, _ in flown]
+    results = [measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, FRESH_EPISODES) for each in tried]
+    costs = [fresh_cost(metrics) for metrics, _ in results]
     chosen = 1 if costs[1] < costs[0] else 0
-    gains, (measured, recoveries) = tried[chosen], flown[chosen]
+    gains, (measured, recoveries) = tried[chosen], results[chosen]
     content = with_gains(text, gains.model_copy(update={"measured": measured}))
     search.note_output(content.encode("utf-8"))
     write_text(output, content)
 
     rows = [
-        ("state recovery: episodes", *(str(each.recovery_episodes) for each, _ in flown)),
-        ("state recovery: success", *(f"{100 * each.recovery_success:.2f} %" for each, _ in flown)),
-        ("target tracking: episodes", *(str(each.tracking_episodes) for each, _ in flown)),
-        ("target tracking: success", *(f"{100 * each.tracking_success:.2f} %" for each, _ in flown)),
-        ("target tracking: mean time to 0.1 m", *(f"{each.time_to_0_1_m:.3f} s" for each, _ in flown)),
-        ("target tracking: mean reward", *(f"{each.tracking_reward:.3f}" for each, _ in flown)),
+        ("state recovery: episodes", *(str(each.recovery_episodes) for each, _ in results)),
+        ("state recovery: success", *(f"{100 * each.recovery_success:.2f} %" for each, _ in results)),
+        ("target tracking: episodes", *(str(each.tracking_episodes) for each, _ in results)),
+        ("target tracking: success", *(f"{100 * each.tracking_success:.2f} %" for each, _ in results)),
+        ("target tracking: mean time to 0.1 m", *(f"{each.time_to_0_1_m:.3f} s" for each, _ in results)),
+        ("target tracking: mean reward", *(f"{each.tracking_reward:.3f}" for each, _ in results)),
     ]
     console().print(text_table("on fresh episodes, true state", ("gains", "before", "best of the search"), rows))
     if not chosen:

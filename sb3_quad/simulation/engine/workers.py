@@ -97,7 +97,8 @@ def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
 
 def compilation_notice() -> AbstractContextManager[None]:
     """Say on stderr, once, that numba compiles something meanwhile; what it finds in its cache is not compiled."""
-    return event.install_listener("numba:compile", _Notice())
+    notice: AbstractContextManager[None] = event.install_listener("numba:compile", _Notice())
+    return notice
 
 
 class _Notice(event.Listener):
