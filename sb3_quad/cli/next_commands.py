@@ -1,6 +1,5 @@
 """What to type after a training."""
 
-import os
 import shlex
 import shutil
 import sys
@@ -31,11 +30,6 @@ def print_next(run: RunFolder) -> None:
 
 def _program() -> list[str]:
     """``sb3-quad`` where a shell would find that of this Python, else the module of this Python."""
-    script = shutil.which("sb3-quad")
-    if script is not None and Path(script).parent == Path(sys.executable).parent:
+    if Path(shutil.which("sb3-quad") or "").parent == Path(sys.executable).parent:
         return ["sb3-quad"]
-    return [
-        os.path.relpath(sys.executable) if Path.cwd() in Path(sys.executable).parents else sys.executable,
-        "-m",
-        "sb3_quad.cli",
-    ]
+    return [sys.executable, "-m", "sb3_quad.cli"]

@@ -8,6 +8,8 @@ from typing import Any, NoReturn
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.settings.literals import parse_number, parse_value
 
+BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo {}, docs/zoo.md"
+
 
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
@@ -34,6 +36,11 @@ class Parser(argparse.ArgumentParser):
             valid = [option for action in self._actions for option in action.option_strings]
             raise ConfigError(unknown("option", name, valid).split("(valid:")[0].rstrip(": ") + "; see --help")
         return options, rest
+
+
+def pointers(flags: str, where: str) -> dict[str, str]:
+    """:attr:`Parser.elsewhere` of some flags, which stand apart by spaces."""
+    return dict.fromkeys(flags.split(), where)
 
 
 def whole(text: str) -> int:

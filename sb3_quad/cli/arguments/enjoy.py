@@ -12,18 +12,15 @@ A controller is pid, geometric, the path of an SB3 zip, or package.module:factor
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-from sb3_quad.cli.parser import Pairs, Parser, positive, whole
+from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, whole
 
-BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo enjoy --help, docs/zoo.md"
-LACKED = ("--num-threads", "--verbose", "--device", "--norm-reward", "--reward-log", "--gym-packages", "--custom-objects")
-ELSEWHERE = dict.fromkeys((*LACKED, "-P", "--progress"), BRIDGE)
-"""Flags of rl-zoo's ``enjoy.py`` that ours lacks, and where to find what they do."""
+LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects -P --progress"
 DEFAULT_ENV = "QuadTargetTracking-v0"
 
 
 def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
-    parser.elsewhere = ELSEWHERE
+    parser.elsewhere = pointers(LACKED, BRIDGE.format("enjoy"))
     add = parser.add_argument
     add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
     add_flight_arguments(parser)

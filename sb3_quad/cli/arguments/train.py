@@ -17,25 +17,21 @@ examples:
 
 import argparse
 
-from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
+from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
 DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 
-SEARCH, BRIDGE = (
-    "is of rl-zoo's search for hyperparameters, here a command of its own: sb3-quad tune --help, docs/tune.md",
-    "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo train --help, docs/zoo.md",
-)
+SEARCH = "is of rl-zoo's search for hyperparameters, here a command of its own: sb3-quad tune --help, docs/tune.md"
 ELSEWHERE = {
-    **dict.fromkeys(
-        ("-optimize", "--optimize-hyperparameters", "--n-trials", "--max-total-trials", "--sampler", "--pruner"), SEARCH
+    **pointers(
+        "-optimize --optimize-hyperparameters --n-trials --max-total-trials --sampler --pruner --n-startup-trials", SEARCH
     ),
-    **dict.fromkeys(("--n-startup-trials", "--n-evaluations", "--storage", "--study-name", "--n-jobs", "--trial-id"), SEARCH),
-    **dict.fromkeys(("--no-optim-plots", "--optimization-log-path"), SEARCH),
-    **dict.fromkeys(("--track", "--wandb-project-name", "--wandb-entity", "--wandb-group", "-tags", "--wandb-tags"), BRIDGE),
-    **dict.fromkeys(("--save-replay-buffer", "--truncate-last-trajectory"), BRIDGE),
+    **pointers("--n-evaluations --storage --study-name --n-jobs --trial-id --no-optim-plots --optimization-log-path", SEARCH),
+    **pointers("--track --wandb-project-name --wandb-entity --wandb-group -tags --wandb-tags", BRIDGE.format("train")),
+    **pointers("--save-replay-buffer --truncate-last-trajectory", BRIDGE.format("train")),
 }
 """Flags of rl-zoo's ``train.py`` that ours lacks, and where to find what they do."""
 
