@@ -107,6 +107,8 @@ class BestModel(EveryTimesteps):
             for group, (success, reward) in scores.items()
         ]
         line = f"{self.num_timesteps:>12,} timesteps, {seconds:6.1f} s: " + "; ".join(words).removeprefix("eval: ")
+        if getattr(self.model, "policy_is_idle", False):
+            line += " (critic warm-up: the policy does not learn yet)"
         score = scores["eval"]
         if score > self.best:
             self.best = score

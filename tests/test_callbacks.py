@@ -20,6 +20,7 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal, random_state, set_random_state
+from sb3_quad.training.progress import ProgressBar
 
 
 class Walk(gymnasium.Env):
@@ -49,6 +50,19 @@ def make_model(algorithm=PPO, n_envs=2, **kwargs):
 
 def make_best(tmp_path, every=1000, **kwargs):
     return BestModel(make_vec_env(Walk, 2), every, 4, 5, tmp_path / "best_model.zip", tmp_path / "evaluations.npz", **kwargs)
+
+
+def test_the_bar_says_why_it_stands_still_and_shows_all_that_was_flown(monkeypatch):
+    bar, seen, train = ProgressBar(), [], PPO.train
+
+    def look_and_train(model):
+        seen.append((bar.pbar.desc, bar.pbar._prog.tasks[0].completed))
+        train(model)
+
+    monkeypatch.setattr(PPO, "train", look_and_train)
+    flying = ConvertCallback(lambda *_: bar.pbar.desc.startswith("flying"))  # False would end the training
+    make_model().learn(80, callback=[bar, flying])
+    assert seen == [("learning: ", 40), ("learning: ", 80)]
 
 
 @pytest.mark.parametrize("algorithm", [PPO, A2C])

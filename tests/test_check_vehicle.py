@@ -114,6 +114,18 @@ def test_what_cannot_hover_leaves_with_1(tmp_path, capsys):
     assert error.startswith("cannot hover") and "heavy.yaml" in error and error.count("\n") == 1
 
 
+@pytest.mark.parametrize("name", VEHICLES.names())
+@pytest.mark.parametrize("limits", [{}, {"thrust_limits": None, "rotor_thrust_limits": [0.02, 9.0]}])
+def test_a_mass_in_grams_is_blamed_on_the_mass_and_leaves_with_1(name, limits, tmp_path, capsys):
+    vehicle = load_vehicle(name).model_copy(update={"name": "grams"}).model_dump(mode="json", exclude={"geometric_gains"})
+    grams = written(tmp_path / "grams.yaml", **{**vehicle, **limits, "mass": 1000 * vehicle["mass"]})
+    assert main(["check-vehicle", grams, "-n", "0"]) == 1
+    error = capsys.readouterr().err
+    assert (
+        error.startswith("cannot hover") and "grams.yaml" in error and "is the mass in kg" in error and "inertia" not in error
+    )
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

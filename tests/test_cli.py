@@ -2,6 +2,8 @@
 
 import json
 import os
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -18,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.results_plotter import load_results
 
 from sb3_quad.cli import compare, main
+from sb3_quad.cli.app import COMMANDS
 from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.settings.config import build_config
 from sb3_quad.settings.flight import FlightSettings
@@ -102,6 +105,8 @@ def one_line_of_error(capsys) -> str:
         (["train", "--algo", "dagger", "--expert", "pit"], "unknown expert"),
         (["train", "--algo", "dagger", "--conf-file", "thesis/dager.yml"], "did you mean 'thesis/dagger.yml'"),
         (["train", "--algo", "dagger", "-i", "missing.zip"], "missing.zip: no such file"),
+        (["train", "--algo", "dagger", "--device", "cuda"], "device cuda: PyTorch finds no CUDA"),
+        (["train", "--device", "cuda:1"], "device cuda:1"),
         (["train", "--algo", "dagger", "--seed", str(2**40)], "seed"),
         (["train", "--algo", "dagger", "--gym-packages", "no_such_package"], "no_such_package"),
         (["train", "--algo", "dagger", "--num-threads", "0"], "at least 1"),
@@ -121,6 +126,14 @@ def test_a_log_folder_that_cannot_be_written(capsys, tmp_path):
     (tmp_path / "file").write_text("")
     assert main(["train", "--algo", "dagger", "-f", str(tmp_path / "file")]) == 2
     assert "cannot be written" in one_line_of_error(capsys)
+
+
+@pytest.mark.parametrize("what", [[], ["--algo", "dagger"]])
+def test_a_tensorboard_folder_that_cannot_be_written_leaves_no_run(what, capsys, tmp_path):
+    (tmp_path / "file").write_text("")
+    assert main(["train", *what, "-f", str(tmp_path / "logs"), "-tb", str(tmp_path / "file" / "tb")]) == 2
+    assert "TensorBoard folder" in one_line_of_error(capsys)
+    assert not (tmp_path / "logs").exists()
 
 
 def damaged_zip(tmp_path, kind):
@@ -154,10 +167,11 @@ def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, set
     assert not (tmp_path / "logs").exists()
 
 
-def test_help_has_examples_and_needs_no_torch():
+def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():
     code = (
         "import sys\nfrom sb3_quad.cli import main\n"
         "codes = [main(a) for a in (['--help'], ['train', '--help'], ['benchmark', '--help'])]\n"
+        "codes.append(main(['train', '-i', 'missing.zip']) != 2)\n"
         "sys.exit(any(codes) or 'torch' in sys.modules or 'numba' in sys.modules)"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
@@ -200,6 +214,26 @@ def test_the_last_update_learns(tmp_path, n_timesteps, last):
     model = train(job(tmp_path, n_timesteps=n_timesteps), report=lambda line: None).model
     assert model.logger.name_to_value["train/learning_rate"] == pytest.approx(last)
     assert model.lr_schedule(1.0) == 1e-3
+
+
+def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    assert main(["train", "--algo", "dagger", "--conf-file", settings_file, "--eval-episodes", "0", "--no-progress"]) == 0
+    lines = capsys.readouterr().out.split("next:\n")[1].splitlines()
+    agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
+    for line, more, made in zip(
+        lines,
+        ([], ["--episodes", "2", "--no-report"], ["-o", "agent.pt"]),
+        (f"dagger_{ENV}_1.png", f"evaluations/dagger_{ENV}_1/results.json", "agent.pt"),
+        strict=True,
+    ):
+        words = shlex.split(line)
+        arguments = words[next(k for k, word in enumerate(words) if word in COMMANDS) :]
+        assert main([*arguments, *more]) == 0
+        assert Path(made).is_file()
+    assert agent in lines[1] and agent in lines[2]
+    assert shutil.which(shlex.split(lines[0])[0])
 
 
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])

@@ -94,6 +94,14 @@ def test_it_learns_to_fly_from_the_true_state():
     assert np.median(flight.true_state().distance) < 5.0  # of the 10 m it began with; the expert's 2.9 m
 
 
+def test_a_rollout_may_be_shorter_than_its_update():
+    model = build(n_steps=4, batch_size=8, n_epochs=2, gradient_steps=1000)
+    rows = 4 * model.n_envs
+    model.learn(rows)
+    assert model._n_updates == 2 * rows  # a row at least for the critic in each
+    assert all(th.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
 @pytest.mark.parametrize("bc_loss", CLONING_LOSSES)
 def test_an_sb3_model_teaches(bc_loss):
     teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")

@@ -132,6 +132,8 @@ def test_the_reference_agent_stands_in_the_same_table(tmp_path, capsys, monkeypa
     arguments = ["train", "--conf-file", str(small_file(tmp_path)), "-f", str(tmp_path / "logs"), "--eval-episodes", "0"]
     assert main([*arguments, "--reference"]) == 0
     output = capsys.readouterr().out
+    (agent,) = (tmp_path / "logs" / "ppo_bc").rglob("QuadStateRecovery-v0.zip")
+    assert f"export {agent}" in output.split("next:\n")[1]
     assert output.count("PPO only") >= 4 and output.count("fresh episodes, the same for all") == 2
     alone = PPO.load(next((tmp_path / "logs" / "ppo").rglob("QuadStateRecovery-v0.zip")))
     assert alone.num_timesteps >= 2 * TINY["n_timesteps"]

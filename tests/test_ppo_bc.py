@@ -9,10 +9,12 @@ import pytest
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.common import CLONING_LOSSES, evaluate_actions
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.settings.algorithms import constructor_parameters
@@ -147,6 +149,21 @@ def test_critic_warmup_moves_the_critic_only():
     assert not all(th.equal(old, part(model, "value_net")[key]) for key, old in before["value_net"].items())
     model.learn(64, reset_num_timesteps=False)
     assert not th.equal(before["log_std"]["log_std"], part(model, "log_std")["log_std"])
+
+
+def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
+    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=2, **SMALL)
+    before, told, unchanged = part(model, "log_std")["log_std"], [], []
+
+    def report(line):
+        told.append("critic warm-up: the policy does not learn yet" in line)
+        unchanged.append(th.equal(before, part(model, "log_std")["log_std"]))
+
+    files = tmp_path / "best_model.zip", tmp_path / "evaluations.npz"
+    best = BestModel(make_vec_env("Pendulum-v1", 1), 64, 1, 0, *files, report=report)
+    model.learn(256, callback=best)
+    best.evaluate()
+    assert told == unchanged == [True, True, True, False, False]
 
 
 def test_l2_shrinks_the_weights():

@@ -12,10 +12,15 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.cli.arguments.train import DEFAULT_PIPELINE
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.experts.resolve import DEFAULT_EXPERT
 from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
 from sb3_quad.settings.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.settings.values import convert, qualified_classes, takes_whole
+from sb3_quad.training.job import TrainingJob, describe
+from sb3_quad.training.pipeline import load_pipeline
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -121,6 +126,21 @@ def test_there_is_at_least_one_environment(n_envs):
         build(n_envs=n_envs)
 
 
+@pytest.mark.parametrize("algo", ["dagger", "ppo_bc", "ppo"])
+@pytest.mark.parametrize("n_timesteps", [1000, 60_000, 130_000, 6_000_000])
+def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_trained(algo, n_timesteps):
+    config, shipped = load_config(algo, ENV, None, {"n_timesteps": n_timesteps}), load_config(algo, ENV)
+    rollout = config.hyperparams["n_steps"] * config.n_envs
+    assert rollout < n_timesteps + config.n_envs and config.hyperparams["batch_size"] <= rollout
+    longest = shipped.hyperparams["n_steps"] * shipped.n_envs
+    assert rollout == longest if n_timesteps >= longest else rollout >= n_timesteps
+    trained = -(-n_timesteps // rollout) * rollout
+    line = describe(TrainingJob(config=config))
+    assert f": {trained:,} timesteps" in line
+    assert (f"({n_timesteps:,} were asked for)" in line) == (trained != n_timesteps)
+    assert ("will not learn" in line) == (algo == "ppo_bc" and trained <= 4 * rollout)
+
+
 def test_unknown_names_come_with_the_nearest():
     with pytest.raises(ConfigError, match="did you mean 'dagger'"):
         load_config("dager", ENV)
@@ -163,7 +183,9 @@ def test_yaml_cannot_make_objects(tmp_path):
 
 def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
     path = tmp_path / "mine.yml"
-    path.write_text(yaml.safe_dump({ENV: {"n_timesteps": 10, "gamma": 0.9, "env_kwargs": {"noise": 0.1, "vehicle": "itm"}}}))
+    path.write_text(
+        yaml.safe_dump({ENV: {"n_timesteps": 10_000, "gamma": 0.9, "env_kwargs": {"noise": 0.1, "vehicle": "itm"}}})
+    )
     config = load_config("ppo", ENV, path, {"gamma": 0.8, "env_kwargs": {"noise": 0}})
     assert config.hyperparams == {"gamma": 0.8}
     assert config.env_kwargs == {"noise": 0, "vehicle": "itm"}
@@ -246,6 +268,16 @@ def test_packaged_files_hold_good_settings(name):
     assert algo in ALGORITHMS
     for env_id in content:
         assert load_config(algo, env_id, name).n_timesteps > 0
+
+
+@pytest.mark.parametrize("env_id", ENVIRONMENTS)
+def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
+    for algo in ("dagger", "ppo_bc"):
+        assert load_config(algo, env_id).expert == build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT == "geometric"
+        assert build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT  # which config.yml then names
+        assert {load_config(algo, env_id, f"{folder}/{algo}.yml").expert for folder in ("pid", "thesis")} == {"pid"}
+    for file, expert in ((DEFAULT_PIPELINE, "geometric"), ("thesis/two_stage.yml", "pid")):
+        assert {load_config(each.algo, each.env, each.conf_file).expert for each in load_pipeline(file).stages} == {expert}
 
 
 def test_thesis_settings_are_table_a4():

@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import re
 import signal
 import sys
 from pathlib import Path
@@ -129,6 +130,18 @@ def test_it_writes_a_vehicle_that_flies_and_goes_on_where_it_was_left(slow_itm, 
     assert main([*command, "-n", "20"]) == 2
     assert "exists" in capsys.readouterr().err and output.read_text().endswith("# mine\n")
     assert main([*command, "-n", "20", "--overwrite"]) == 0
+
+
+def test_gains_that_are_worse_on_fresh_episodes_are_not_written(tmp_path, monkeypatch, capsys):
+    timid = GAINS.model_copy(update={"position": GAINS.position / 2, "measured": None})
+    monkeypatch.setattr(ExpertSearch, "best", timid)  # as if the search's own episodes had been kind to it
+    output = tmp_path / "tuned.yaml"
+    assert main(["tune-expert", "-o", str(output), *SMALL, "-n", "1", "--no-progress"]) == 0
+    printed = capsys.readouterr().out
+    written = load_vehicle(output).geometric_gains
+    assert written.model_copy(update={"measured": None}) == GAINS.model_copy(update={"measured": None})
+    times = re.search(r"mean time to 0.1 m +│ +([\d.]+) s │ +([\d.]+) s", printed)
+    assert float(times[1]) == written.measured.time_to_0_1_m < float(times[2]) and "nothing better" in printed
 
 
 def test_an_interrupt_keeps_the_best(tmp_path, monkeypatch, capsys):

@@ -3,8 +3,10 @@
 import subprocess
 import sys
 import threading
+import time
 import warnings
 
+import numba
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
@@ -19,6 +21,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.simulation.engine.workers import compilation_notice
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("target_tracking", "state_recovery")
@@ -184,6 +187,22 @@ if child: assert os.waitpid(child, 0)[1] == 0
 
 
 # --- ends of episodes
+
+
+def test_compiling_is_told_where_something_is_compiled_and_nowhere_else(capsys):
+    @numba.njit
+    def doubled(x):
+        return x + x
+
+    with compilation_notice():
+        time.sleep(1.6)  # a busy machine
+    assert capsys.readouterr().err == ""
+    with compilation_notice():
+        assert (doubled(1), doubled(1.0)) == (2, 2.0)  # compiled twice
+    assert capsys.readouterr().err.count("sb3_quad: compiling") == 1
+    with compilation_notice():
+        doubled(1)
+    assert capsys.readouterr().err == ""
 
 
 def test_the_end_of_an_episode():

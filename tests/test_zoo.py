@@ -79,6 +79,21 @@ def test_the_table_is_true_of_ours():
                 assert flag in our_flags(elsewhere), (script, flags, remark)
 
 
+@pytest.mark.parametrize("script", ["train", "enjoy"])
+def test_flags_that_are_missing_are_pointed_to(script, capsys):
+    """No other flag is proposed in their place."""
+    missing = [flag for flags, _, _ in table()[script] for flag in flags if flag not in our_flags(script)]
+    assert len(missing) > 8
+    for flag in missing:
+        assert main([script, flag, "1"]) == 2
+        error = capsys.readouterr().err
+        assert (
+            f"{flag} is of rl" in error
+            and re.search(r"sb3-quad tune|python -m sb3_quad\.zoo", error)
+            and "did you" not in error
+        )
+
+
 ZOO_FLAGS = """
 import argparse, importlib, json, runpy, sys
 class Seen(Exception): pass

@@ -5,6 +5,7 @@ import io
 import pkgutil
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.cli import arguments
@@ -57,6 +58,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         if options.command is None:
             parser.print_help()
             return 0
+        agent = getattr(options, "trained_agent", None)
+        if agent is not None and not any(Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds it
+            raise ConfigError(f"-i {agent}: no such file")  # at once: what the command imports takes seconds
         command = importlib.import_module(f"sb3_quad.cli.commands.{options.command.replace('-', '_')}")
         return int(command.run(options))
     except SB3QuadError as error:

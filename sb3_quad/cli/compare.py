@@ -9,7 +9,7 @@ from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.scenarios.load import load_suite
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.job import TrainingJob
@@ -55,6 +55,6 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     settings = job.flight_settings
-    controllers = {"agent": model, "expert": resolve_expert(job.config.expert or "pid", settings.vehicle)}
+    controllers = {"agent": model, "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle)}
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))

@@ -2,14 +2,20 @@
 
 import argparse
 import random
+from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.settings.literals import parse_number, parse_value
 
+BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo {}, docs/zoo.md"
+
 
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
+
+    elsewhere: Mapping[str, str] = {}
+    """By options of rl-zoo that a command lacks: what else to call."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs})
@@ -25,9 +31,16 @@ class Parser(argparse.ArgumentParser):
         """
         options, rest = super().parse_known_args(args, namespace)
         for text in rest:
+            if (name := text.split("=")[0]) in self.elsewhere:
+                raise ConfigError(f"{name} {self.elsewhere[name]}")
             valid = [option for action in self._actions for option in action.option_strings]
-            raise ConfigError(unknown("option", text.split("=")[0], valid).split("(valid:")[0].rstrip(": ") + "; see --help")
+            raise ConfigError(unknown("option", name, valid).split("(valid:")[0].rstrip(": ") + "; see --help")
         return options, rest
+
+
+def pointers(flags: str, where: str) -> dict[str, str]:
+    """:attr:`Parser.elsewhere` of some flags, which stand apart by spaces."""
+    return dict.fromkeys(flags.split(), where)
 
 
 def whole(text: str) -> int:

@@ -57,7 +57,7 @@ class DAgger(OnPolicyAlgorithm):
     :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds ``log_std_init``, it
         begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
     :param env: The environment to learn from (if registered in Gym, can be str)
-    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``PIDExpert``, another SB3
+    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``GeometricExpert``, another SB3
         model, or a function from observations to actions; :class:`~sb3_quad.experts.controller.Controller` says what
         each is shown. It is never saved: give it to ``load`` again, or call :meth:`set_expert`, before learning continues
     :param batch_size: Minibatch size, in pairs of the dataset
@@ -67,8 +67,9 @@ class DAgger(OnPolicyAlgorithm):
     :param ent_coef: Entropy coefficient c_H
     :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a
         large error of the critic does not hold up the actor. None: no clipping
-    :param gradient_steps: Optimiser steps after each rollout. Each takes ``batch_size`` pairs of the dataset and an equal
-        share of the critic's ``n_epochs`` passes. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO
+    :param gradient_steps: Optimiser steps after each rollout, at most one for each row of the critic's ``n_epochs`` passes.
+        Each takes ``batch_size`` pairs of the dataset and an equal share of these passes. None:
+        ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO
     :param beta: β of the first rollout, from 0 to 1
     :param beta_decay: What β loses with every rollout
     :param beta_final: Where β stops falling
@@ -315,6 +316,7 @@ class DAgger(OnPolicyAlgorithm):
         buffer = self.rollout_buffer
         n_rows = buffer.buffer_size * buffer.n_envs
         n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
+        n_batches = min(n_batches, self.n_epochs * n_rows)  # a row at least for the critic in each
         actor_batches = th.from_numpy(sample_rows(len(self.dataset), n_batches * self.batch_size, rng)).view(n_batches, -1)
         critic_batches = th.from_numpy(sample_rows(n_rows, self.n_epochs * n_rows, rng)).tensor_split(n_batches)
         flown = th.from_numpy(buffer.observations.reshape(n_rows, *buffer.obs_shape))

@@ -20,7 +20,7 @@ class Controller:
 
     The first of these that fits is used:
 
-    1. ``source.actions(state)`` (such as ``PIDExpert``), where the true state is to be had: it is free of noise.
+    1. ``source.actions(state)`` (such as ``GeometricExpert``), where the true state is to be had: it is free of noise.
     2. ``source.predict(observation)``, deterministic: an SB3 model, or an ``Expert`` of this package without a true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 

@@ -13,6 +13,8 @@ EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
 }
+DEFAULT_EXPERT = "geometric"
+"""Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
 
 
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:

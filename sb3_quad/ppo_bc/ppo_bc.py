@@ -114,6 +114,11 @@ class PPOBC(PPO):
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "expert", "rollout_buffer_class", "rollout_buffer_kwargs"]
 
+    @property
+    def policy_is_idle(self) -> bool:
+        """Whether the policy is still the one that it began with, since only the critic has learnt (``critic_warmup``)."""
+        return 0 < self.critic_warmup >= self._n_rollouts_trained
+
     def set_expert(self, expert: Any) -> None:
         """Clone ``expert`` from the next rollout on, as a model must that was loaded without one."""
         self.expert = expert
@@ -137,7 +142,7 @@ class PPOBC(PPO):
     def _check_cloning(self) -> None:
         if self.expert is None:
             raise ExpertError(
-                "PPOBC needs an expert to clone: PPOBC(..., expert=PIDExpert()), model.set_expert(...), or bc_coef=0"
+                "PPOBC needs an expert to clone: PPOBC(..., expert=GeometricExpert()), model.set_expert(...), or bc_coef=0"
             )
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")

@@ -2,11 +2,13 @@
 
 import math
 
+from sb3_quad.base.errors import CannotHover
 from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SLIM_THRUST = 1.2  # thrust-to-weight ratio below which little is left to turn and brake with
+FASTEST_HOVER = 10_000.0  # rad/s, some 95,000 rpm; above it a unit must be wrong
 RPM = 60.0 / (2.0 * math.pi)  # rpm per rad/s
 
 
@@ -50,6 +52,15 @@ def authority_table(able: Authority) -> Table:
     heads = ("axis", "greatest moment", "acceleration", "moment in hover", "acceleration")
     caption = "in hover: total thrust kept at hover, no moment about the other axes"
     return text_table("authority", heads, rows, caption=caption)
+
+
+def check_rotor_speed(vehicle: Vehicle, where: str) -> None:
+    """:raises CannotHover: no rotor turns as fast as hover asks for, which limits in hover thrusts do not show."""
+    if (speed := vehicle.hover_rotor_speed) > FASTEST_HOVER:
+        units = "is the mass in kg, and thrust_coefficient in N s²?"
+        raise CannotHover(
+            f"{where}: mass {vehicle.mass:g} kg: no rotor turns at the {speed * RPM:,.0f} rpm that hover takes; {units}"
+        )
 
 
 def warnings(vehicle: Vehicle, able: Authority) -> list[str]:

@@ -15,6 +15,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.experts.resolve import DEFAULT_EXPERT
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping, parse_number
@@ -22,7 +23,7 @@ from sb3_quad.settings.values import as_list, check, convert, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
-SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("geometric", "thesis"))
+SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("pid", "thesis"))
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
 
@@ -79,6 +80,17 @@ class TrainingConfig(Frozen):
         """How an agent of this job flies, of an environment of this package."""
         return FlightSettings().with_changes(**{"task": self.task, **self.env_kwargs})
 
+    def keyword(self, name: str) -> Any:
+        """What the algorithm's constructor is given as ``name``, or its default."""
+        return self.hyperparams.get(name, constructor_parameters(get_algorithm(self.algo))[name].default)
+
+    def shorter_rollout(self) -> dict[str, int]:
+        """The settings that fit a rollout to a budget of less than one, which SB3 would fly whole; none otherwise."""
+        n_steps = -(-self.n_timesteps // self.n_envs)
+        if n_steps >= self.keyword("n_steps"):
+            return {}
+        return {"n_steps": n_steps, "batch_size": min(self.keyword("batch_size"), n_steps * self.n_envs)}
+
     @field_validator("policy", mode="before")
     @classmethod
     def _known_policy(cls, value: Any, info: ValidationInfo) -> str:
@@ -125,6 +137,8 @@ def load_config(
 ) -> TrainingConfig:
     """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for ``env_kwargs``).
 
+    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size`` to no more than that.
+
     :param conf_file: path of a file, or the name of one that comes with the package such as ``thesis/dagger.yml``;
         None for ``<algo>.yml`` of the package.
     :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that does not fit.
@@ -142,7 +156,9 @@ def load_config(
     if "env_kwargs" in changes:
         base = parse_mapping(settings.get("env_kwargs"), f"{where}: env_kwargs")
         changes["env_kwargs"] = {**base, **parse_mapping(changes["env_kwargs"], "env_kwargs")}
-    return build_config(algo, env_id, {**settings, **changes}, where, changes)
+    config = build_config(algo, env_id, {**settings, **changes}, where, changes)
+    shorter = config.shorter_rollout()
+    return build_config(algo, env_id, {**config.settings, **shorter}, where, changes) if shorter else config
 
 
 def build_config(
@@ -157,6 +173,8 @@ def build_config(
     parameters = constructor_parameters(get_algorithm(algo))
     check_environment(env_id)
     settings = {key: with_vehicle_path(value) if key.endswith("env_kwargs") else value for key, value in settings.items()}
+    if takes_expert(get_algorithm(algo)):
+        settings["expert"] = settings.get("expert") or DEFAULT_EXPERT  # so that config.yml names it
 
     def source(key: str) -> str:
         return "command line" if key in changes else where
@@ -169,8 +187,6 @@ def build_config(
         key: convert(value, parameters[key], f"{source(key)}: {key}") for key, value in settings.items() if key in parameters
     }
     defaults: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
-    if takes_expert(get_algorithm(algo)):
-        defaults["expert"] = "pid"
     whole = {**defaults, **given, "algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": dict(settings)}
     if "n_timesteps" not in whole:
         raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")

@@ -2,12 +2,21 @@
 
 from typing import Annotated, Any
 
+import torch as th
 from pydantic import AfterValidator, Field, PositiveInt
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import check_seed
 from sb3_quad.base.validate import Frozen
 from sb3_quad.settings.config import TrainingConfig
 from sb3_quad.settings.flight import FlightSettings
+
+
+def _check_device(device: str) -> str:
+    """SB3 itself takes the CPU, without a word, where there is no CUDA."""
+    if device.startswith("cuda") and not th.cuda.is_available():
+        raise ConfigError(f"device {device}: PyTorch finds no CUDA here; give cpu or auto")
+    return device
 
 
 class TrainingJob(Frozen):
@@ -16,7 +25,9 @@ class TrainingJob(Frozen):
     config: TrainingConfig = Field(description="the settings")
     log_folder: str = Field(default="logs", description="where run folders go")
     seed: Annotated[int, AfterValidator(check_seed)] = Field(default=0, description="of policy, environments and exploration")
-    device: str = Field(default="cpu", description="cpu, cuda or auto; small networks are fastest on the cpu")
+    device: Annotated[str, AfterValidator(_check_device)] = Field(
+        default="cpu", description="cpu, cuda or auto; small networks are fastest on the cpu"
+    )
     trained_agent: str | None = Field(default=None, description="zip whose policy and critic to start from")
     eval_freq: int = Field(default=250_000, description="timesteps between evaluations; below 1 only one at the end")
     eval_episodes: int = Field(default=48, description="episodes of one evaluation; below 1 none at all")
@@ -46,11 +57,17 @@ class TrainingJob(Frozen):
 
 
 def describe(job: TrainingJob) -> str:
-    """One line that says what is about to be trained."""
+    """One line that says what is about to be trained: whole rollouts, as SB3 does."""
     config = job.config
+    n_steps = config.keyword("n_steps")
+    rollouts = -(-config.n_timesteps // (n_steps * config.n_envs))
+    timesteps = rollouts * n_steps * config.n_envs
+    asked = "" if timesteps == config.n_timesteps else f" ({config.n_timesteps:,} were asked for)"
+    warming = rollouts <= config.hyperparams.get("critic_warmup", 0)
+    idle = "; critic_warmup lasts all of it, so that the policy will not learn" if warming else ""
     start = f", from {job.trained_agent}" if job.trained_agent else ""
     expert = f", expert {config.expert}" if config.expert is not None else ""
     return (
-        f"{config.algo} on {config.env_id}: {config.n_timesteps:,} timesteps, {config.n_envs} environments "
-        f"({config.vec_env}){expert}, seed {job.seed}{start}"
+        f"{config.algo} on {config.env_id}: {timesteps:,} timesteps{asked}, rollouts of {n_steps} steps, "
+        f"{config.n_envs} environments ({config.vec_env}){expert}, seed {job.seed}{start}{idle}"
     )

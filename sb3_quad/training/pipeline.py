@@ -32,7 +32,7 @@ from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import resume, train
+from sb3_quad.training.trainer import check_tensorboard, resume, train
 from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
@@ -146,6 +146,7 @@ def run_pipeline(
     """
     status = Status(stages=pipeline.stages, job=dict(job), done=(), current=None)
     jobs = _make_jobs(status)
+    check_tensorboard(jobs[0])
     return _go_on(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
 

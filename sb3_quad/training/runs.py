@@ -148,12 +148,13 @@ def open_run(path: str | Path) -> RunFolder:
 def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
     """A run by rl-zoo's ``--exp-id``.
 
-    :param exp_id: number of the run; 0: the latest.
+    :param exp_id: number of the run; 0: the latest that has an agent.
     :raises ConfigError: there is no such run; the message names those there are.
     """
     parent, name = Path(log_folder) / algo, file_name(env_id)
     runs = _runs(parent, name)
-    number = exp_id if exp_id > 0 else max(runs, default=0)
+    with_agent = [number for number, path in runs.items() if any(path.glob("*.zip"))]
+    number = exp_id if exp_id > 0 else max(with_agent or runs, default=0)
     if number in runs:
         return RunFolder(runs[number], name)
     there = ", ".join(entry.name for entry in runs.values()) or "no run of this environment"

@@ -9,6 +9,8 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch as th
@@ -33,6 +35,7 @@ from sb3_quad.settings.values import import_class
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 
 Report = Callable[[str], None]
@@ -71,6 +74,7 @@ def train(
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
+    check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         if job.trained_agent is not None:
@@ -94,12 +98,30 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
     given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs", *MADE_WITH)}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
+    check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
         model = _load_snapshot(run, config.algo, env, job.device, **attributes)
         env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         return _learn(job, run, model, eval_envs, signals, report)
+
+
+def check_tensorboard(job: TrainingJob) -> None:
+    """Make the folder for TensorBoard, before a run folder is there that would stay empty.
+
+    :raises ConfigError: it cannot be written.
+    """
+    if job.tensorboard_log is None:
+        return
+    try:
+        Path(job.tensorboard_log).mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=job.tensorboard_log).close()
+    except OSError as error:
+        reason = error.strerror or error
+        raise ConfigError(
+            f"TensorBoard folder {job.tensorboard_log}: cannot be written ({reason}); give another with -tb"
+        ) from None
 
 
 @contextmanager
@@ -181,6 +203,8 @@ def _learn(
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
     callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
+    if job.progress:
+        callbacks.append(ProgressBar())
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
     start = time.perf_counter()
     try:
@@ -190,7 +214,6 @@ def _learn(
             log_interval=job.log_interval,
             tb_log_name=f"{job.config.algo}_{run.path.name}",
             reset_num_timesteps=model.num_timesteps == 0,
-            progress_bar=job.progress,
         )
         if best is not None and signals.received is None and not best.stopped:
             best.evaluate()

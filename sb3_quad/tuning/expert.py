@@ -23,7 +23,7 @@ from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.tuning.study import open_study
-from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
+from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
 from sb3_quad.vehicles.vehicle import Vehicle
 
 NEAR = 0.1  # m
@@ -56,6 +56,12 @@ class Cost(NamedTuple):
     settling: float
     tracking_reward: float
     recovery_reward: float
+
+
+def fresh_cost(metrics: GeometricMetrics) -> float:
+    """What gains cost on fresh episodes, with the weights of :class:`Cost`, in seconds."""
+    lost = LOST * (1.0 - metrics.recovery_success)
+    return lost + metrics.time_to_0_1_m - TRACKING_REWARD * metrics.tracking_reward
 
 
 class ExpertObjective:

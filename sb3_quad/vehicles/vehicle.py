@@ -93,7 +93,8 @@ class Vehicle(Frozen):
     def _consistent(self) -> "Vehicle":
         low, high = self.thrust_limits
         if not low < 1.0 < high:
-            raise CannotHover(f"thrust_limits [{low:.4g}, {high:.4g}]: hover (1.0) must lie between them, or it cannot hover")
+            limits = f"thrust_limits [{low:.4g}, {high:.4g}] for a mass of {self.mass:g} kg"
+            raise CannotHover(f"{limits}: hover (1.0) must lie between them, or it cannot hover; is the mass in kg?")
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
             raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
         ixx, iyy, izz = self.inertia

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.settings.algorithms import takes_expert
 from sb3_quad.settings.config import SETTINGS, VEC_ENVS
 from sb3_quad.settings.literals import parse_mapping
@@ -85,7 +85,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             print("eval_tasks: left out, rl_zoo3 evaluates on the environment's own task")
         expert = hyperparams.pop("expert", None)
         if takes_expert(ALGOS[self.algo]):
-            hyperparams["expert"] = resolve_expert(expert or "pid", hyperparams["env_kwargs"].get("vehicle", "itm"))
+            hyperparams["expert"] = resolve_expert(expert or DEFAULT_EXPERT, hyperparams["env_kwargs"].get("vehicle", "itm"))
         hyperparams = to_keywords(self.algo, hyperparams, self.config)
         processed = super()._preprocess_hyperparams(hyperparams)
         self.eval_env_kwargs = {**self.env_kwargs, **evaluation, **(self._eval_env_kwargs_args or {})}

@@ -3,7 +3,7 @@
 examples:
   sb3-quad benchmark                                   everything, about a minute
   sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
-  sb3-quad benchmark --algo ppo_bc --conf-file ppo_bc.yml --output benchmark.json
+  sb3-quad benchmark --algo ppo_bc --conf-file pid/ppo_bc.yml --output benchmark.json
 """
 
 import argparse

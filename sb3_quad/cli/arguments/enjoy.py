@@ -13,13 +13,15 @@ The first agent says which vehicle, task and observation all fly with, unless --
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
 
-from sb3_quad.cli.parser import Pairs, Parser, positive, whole
+from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, whole
 
+LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects -P --progress"
 DEFAULT_ENV = "QuadTargetTracking-v0"
 
 
 def add_arguments(parser: Parser) -> None:
     """The flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
+    parser.elsewhere = pointers(LACKED, BRIDGE.format("enjoy"))
     add = parser.add_argument
     add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
     add_flight_arguments(parser)
@@ -46,7 +48,7 @@ def add_flight_arguments(parser: Parser) -> None:
     add("--algo", help="algorithm of a trained agent, looked up in the log folder")
     add("--env", help=f"environment id ({DEFAULT_ENV})")
     add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
-    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest (0)")
+    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")
     which = parser.add_mutually_exclusive_group()
     which.add_argument(
         "--load-best", dest="which", action="store_const", const="best", help="the best agent of the evaluations"

@@ -2,7 +2,7 @@
 
 examples:
   sb3-quad train                                          both stages, in the batched environment
-  sb3-quad train --conf-file two_stage.yml                both stages from the PID expert, as in the thesis
+  sb3-quad train --conf-file thesis/two_stage.yml         both stages from the PID expert, as in the thesis
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger                            stage one alone
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, a process per environment
@@ -17,20 +17,33 @@ examples:
 
 import argparse
 
-from sb3_quad.cli.parser import Pairs, Parser, positive, seed, whole
+from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
-DEFAULT_PIPELINE = "geometric/two_stage.yml"
+DEFAULT_PIPELINE = "two_stage.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
+
+
+SEARCH = "is of rl-zoo's search for hyperparameters, here a command of its own: sb3-quad tune --help, docs/tune.md"
+ELSEWHERE = {
+    **pointers(
+        "-optimize --optimize-hyperparameters --n-trials --max-total-trials --sampler --pruner --n-startup-trials", SEARCH
+    ),
+    **pointers("--n-evaluations --storage --study-name --n-jobs --trial-id --no-optim-plots --optimization-log-path", SEARCH),
+    **pointers("--track --wandb-project-name --wandb-entity --wandb-group -tags --wandb-tags", BRIDGE.format("train")),
+    **pointers("--save-replay-buffer --truncate-last-trajectory", BRIDGE.format("train")),
+}
+"""Flags of rl-zoo's ``train.py`` that ours lacks, and where to find what they do."""
 
 
 def add_settings(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py`` for what is trained, with their meanings."""
+    parser.elsewhere = ELSEWHERE
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc or ppo ({DEFAULT_ALGO})")
     add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
     add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
-    add("-n", "--n-timesteps", type=whole, metavar="N", help="timesteps to train on")
+    add("-n", "--n-timesteps", type=whole, metavar="N", help="timesteps, in whole rollouts; fewer than one shorten it")
     add("--n-envs", type=whole, metavar="N", help="environments side by side")
     add("--vec-env", metavar="KIND", help="batch (compiled), dummy (PyBullet, one process) or subproc (one process each)")
     add("--expert", metavar="SPEC", help="pid, geometric, path/to/model.zip or package.module:factory")

@@ -6,7 +6,8 @@ examples:
   sb3-quad tune-expert -n 2000                           continues the first search, up to 2000 gains in all
   sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
-Ctrl-C writes the best gains so far; the same command continues. Needs pip install 'sb3_quad[tune]'.
+The first gains stay where those found are no better on fresh episodes.
+Ctrl-C writes the best so far; the same command continues. Needs pip install 'sb3_quad[tune]'.
 """
 
 import argparse

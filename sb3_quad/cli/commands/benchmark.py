@@ -8,7 +8,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.cli.output import console
 from sb3_quad.evaluation.tables import text_table
-from sb3_quad.settings.config import SETTINGS, load_config
+from sb3_quad.settings.config import load_config
 from sb3_quad.training.benchmark import ENV_ID, machine, single, training_loop, vectorised
 
 
@@ -17,9 +17,7 @@ def run(options: argparse.Namespace) -> int:
     if options.seconds <= 0:
         raise ConfigError(f"--seconds {options.seconds:g}: must be above 0")
     screen = console()
-    default = f"geometric/{options.algo}.yml"
-    conf_file = options.conf_file or (default if default in SETTINGS.names() else None)
-    config = load_config(options.algo, ENV_ID, conf_file) if options.training else None
+    config = load_config(options.algo, ENV_ID, options.conf_file) if options.training else None
     measurements = []
     with screen.status("one PyBullet environment"):
         measurements.append(single(options.seconds))

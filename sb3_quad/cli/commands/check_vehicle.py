@@ -4,13 +4,12 @@ import argparse
 import sys
 
 from sb3_quad.base.errors import CannotHover
-from sb3_quad.base.files import one_line
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli.compare import print_tables
 from sb3_quad.cli.output import console
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.report.vehicle import authority_table, parameter_table, warnings
+from sb3_quad.report.vehicle import authority_table, check_rotor_speed, parameter_table, warnings
 from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -19,8 +18,9 @@ def run(options: argparse.Namespace) -> int:
     """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
     try:
         vehicle = load_vehicle(options.vehicle)
+        check_rotor_speed(vehicle, options.vehicle)
     except CannotHover as error:
-        print(f"cannot hover: {one_line(error)}", file=sys.stderr)
+        print(f"cannot hover: {error}", file=sys.stderr)
         return 1
     able = Authority(vehicle)
     console().print(parameter_table(vehicle, able))

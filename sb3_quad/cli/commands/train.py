@@ -13,10 +13,11 @@ from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.compare import agent_and_expert, print_tables
+from sb3_quad.cli.next_commands import print_next
 from sb3_quad.cli.output import console, shows_progress
 from sb3_quad.cli.parser import given
 from sb3_quad.experts.models import load_model
-from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.settings.config import TrainingConfig, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import (
@@ -28,6 +29,7 @@ from sb3_quad.training.pipeline import (
     run_pipeline,
     with_settings,
 )
+from sb3_quad.training.runs import open_run
 from sb3_quad.training.trainer import TrainingResult, resume, train
 
 KEPT_BY_RESUME = (
@@ -102,6 +104,7 @@ def _finish(result: TrainingResult) -> int:
         told += f", flown for this table in {time.perf_counter() - start:.1f} s"
     print(told)
     print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
+    print_next(result.run)
     return 0
 
 
@@ -115,7 +118,7 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
         return result.exit_code
     seconds, config = time.perf_counter() - start, result.job.config
     times = {name: entry.seconds for name, entry in result.stages.items()}
-    controllers = {"expert": resolve_expert(config.expert or "pid", result.job.flight_settings.vehicle)}
+    controllers = {"expert": resolve_expert(config.expert or DEFAULT_EXPERT, result.job.flight_settings.vehicle)}
     controllers |= {name: load_model(entry.agent) for name, entry in result.stages.items()}
     if reference:
         settings: dict[str, Any] = {"vec_env": config.vec_env, "env_kwargs": config.flight_settings.in_any_task()}
@@ -134,4 +137,5 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
     for name, entry in result.stages.items():
         print(f"{name}: {entry.agent}")
     print(f"saved in {result.folder}")
+    print_next(open_run(list(result.stages.values())[-1].run))
     return 0

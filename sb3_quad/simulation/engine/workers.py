@@ -1,18 +1,18 @@
-"""The threads that share a batch's work, and the line that says when compiling takes a while.
+"""The threads that share a batch's work, and the line that says that numba compiles.
 
 Numba's own thread pools do not suit small batches: one sleeps and takes tens of microseconds to start, another spins
 between calls, fights torch for the cores and forbids fork. Here a worker looks for blocks for some microseconds after its
 last one, then sleeps; nobody waits for it unless it holds a block.
 """
 
-import contextlib
 import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 
 import numpy as np
+from numba.core import event
 
 from sb3_quad.base.arrays import IntArray
 from sb3_quad.simulation.engine.lowlevel import LANES
@@ -95,14 +95,19 @@ def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
         workers.lock.release()
 
 
-@contextlib.contextmanager
-def compilation_notice(after: float = 1.5) -> Iterator[None]:
-    """Say on stderr that code is being compiled, if the block under it takes longer than ``after`` seconds."""
-    message = "sb3_quad: compiling the simulation, once; it is kept for later runs (about 15 s)\n"
-    timer = threading.Timer(after, lambda: sys.stderr.write(message))
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+def compilation_notice() -> AbstractContextManager[None]:
+    """Say on stderr, once, that numba compiles something meanwhile; what it finds in its cache is not compiled."""
+    notice: AbstractContextManager[None] = event.install_listener("numba:compile", _Notice())
+    return notice
+
+
+class _Notice(event.Listener):
+    told = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self.told:
+            sys.stderr.write("sb3_quad: compiling the simulation, once; it is kept for later runs (about 15 s)\n")
+        self.told = True
+
+    def on_end(self, event: event.Event) -> None:
+        pass

@@ -1,0 +1,35 @@
+"""What to type after a training."""
+
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+from sb3_quad.drawing.window import has_display
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.training.runs import RunFolder
+
+
+def print_next(run: RunFolder) -> None:
+    """Print the commands that show, measure and export a run's agent, if it is of an environment of this package."""
+    if run.name not in ENVIRONMENTS:
+        return
+    algo, number, agent = run.path.parent.name, run.path.name.removeprefix(f"{run.name}_").split("_")[0], str(run.result)
+    label = f"{algo}_{run.path.name}"
+    picture = [] if has_display() else ["--no-render", "--sequence", f"{label}.png"]
+    vehicle = str(FlightSettings.beside(agent)[0].vehicle)
+    print("next:")
+    for command in (
+        ["enjoy", "--algo", algo, "--env", run.name, "-f", str(run.path.parent.parent), "--exp-id", number, *picture],
+        ["evaluate", agent, "--suite", "quick", "--vehicle", vehicle, "-o", f"evaluations/{label}"],
+        ["export", agent, "--format", "torchscript"],
+    ):
+        print("  " + shlex.join([*_program(), *command]))
+
+
+def _program() -> list[str]:
+    """``sb3-quad`` where a shell would find that of this Python, else the module of this Python."""
+    if Path(shutil.which("sb3-quad") or "").parent == Path(sys.executable).parent:
+        return ["sb3-quad"]
+    return [sys.executable, "-m", "sb3_quad.cli"]
