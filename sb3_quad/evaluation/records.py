@@ -107,6 +107,7 @@ class Entry(Frozen):
     seed: int = Field(description="of episode 0; episode k has seed + k")
     backend: str
     seconds: float = Field(description="wall-clock time it took")
+    date: str = Field(default="", description="day on which it was flown, UTC, year-month-day; empty in older results")
     figures: Metrics = Field(description="its metrics, by their name in files")
     hit_limit: HitLimit | None = None
     flights: str = Field(description="path of the .npz, relative to the folder")
