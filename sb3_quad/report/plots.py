@@ -219,8 +219,8 @@ def hits_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
     axes.xaxis.set_major_formatter("{x:g}")
     legend(figure, axes)
     caption = (
-        "Flights that survive when force and torque are scaled by a factor, with 95 % intervals, up to the least factor tried "
-        "that at most half survive. Open circles: greater factors; where one is survived, the flight was lucky in its tumbling."
+        "Flights that survive when force and torque are scaled by a factor, with 95 % intervals, up to the first "
+        "that at most half survive. Open circles: greater factors, of which a few may be survived again."
     )
     return Plot(f"{scenario.name}_limit", caption, figure)
 
