@@ -189,11 +189,12 @@ def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
 
 
 def test_a_sequence_has_its_panels_at_the_same_times_and_explains_its_signs(fall, hit, monkeypatch):
-    ((other,),) = fly_all({"geometric": GeometricExpert()}, scenario_setting("thesis:recovery_s1"), 0, 200)
-    ends = [len(fall.times) - 1, 200]
-    view = sequence._view([fall, other], ends, (300, 400))
-    chosen = sequence._same_times([fall, other], ends, view)
-    for (ours, flight, end), (theirs, _, _) in itertools.permutations(zip(chosen, (fall, other), ends, strict=True)):
+    setting = fixed_setting(FlightSettings(task="target_tracking"), target=(5, 0, 17))
+    (flights,) = fly_all({"pid": PIDExpert(), "geometric": GeometricExpert()}, setting, 0, 300)
+    ends = [300, 200]
+    view = sequence._view(flights, ends, (600, 300))
+    chosen = sequence._same_times(flights, ends, view)
+    for (ours, flight, end), (theirs, _, _) in itertools.permutations(zip(chosen, flights, ends, strict=True), 2):
         places, breadth = view.project(flight.state.position)
         for step in (step for step in theirs if step not in ours and step <= end):
             gap = np.linalg.norm(places[ours] - places[step], axis=1).min() / breadth[step]

@@ -259,7 +259,7 @@ def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, st
 
 
 def _losses(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours: Mapping[str, str]) -> Plot:
-    """What each controller loses, side by side in each cell of the first two keys; a panel for each combination of the others."""
+    """What each controller loses, side by side in each cell of the first two keys; a panel for each value of the others."""
     keys = list(scenarios[0].cell)
     x_values, y_values = (sorted({scenario.cell[key] for scenario in scenarios}) for key in keys[:2])
     columns = list(dict.fromkeys(_rest(scenario) for scenario in scenarios))

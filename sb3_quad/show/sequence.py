@@ -84,7 +84,7 @@ def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
 
 
 def _same_times(recordings: Sequence[Recording], ends: Sequence[int], view: _View) -> list[list[int]]:
-    """Steps to be drawn in each panel: one that a flight has room for is drawn in all, less where it would hide another pose."""
+    """Steps to be drawn in each panel: one that a flight has room for is drawn in all that it does not hide a pose in."""
     seen = [view.project(each.state.position[: end + 1]) for each, end in zip(recordings, ends, strict=True)]
     chosen: list[list[int]] = [[0] for _ in recordings]
     # When a flight was pushed and how it was lost must be seen.
