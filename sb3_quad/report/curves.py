@@ -69,6 +69,6 @@ def plot_curves(groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple
         for number, (line, heights) in enumerate(lines.items()):
             style = ("--", ":", "-.")[number % 3]
             panel.axhline(heights[row] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
-    legend(figure, panels[0, 0], place="lower left")
+    legend(figure, panels[0, 0], side="lower")
     figure.suptitle(title)
     return figure

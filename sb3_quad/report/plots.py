@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -99,13 +99,14 @@ def picture(figure: Figure, kind: str, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def legend(figure: Figure, axes: Any, first: Sequence[str] = (), place: str = "upper left") -> None:
+def legend(figure: Figure, axes: Any, first: Sequence[str] = (), side: Literal["upper", "lower"] = "upper") -> None:
     """Every name once outside of all axes, those of ``first`` before others, in as many columns as the figure is wide."""
     handles, names = axes.get_legend_handles_labels()
     found = dict(zip(names, handles, strict=True))
     order = sorted(found, key=lambda name: name not in first)
+    place: Any = f"outside {side} left"
     for columns in range(len(order), 0, -1):
-        made = figure.legend([found[name] for name in order], order, loc=f"outside {place}", ncols=columns)
+        made = figure.legend([found[name] for name in order], order, loc=place, ncols=columns)
         if columns == 1 or made.get_window_extent().width <= figure.bbox.width:
             break
         made.remove()
