@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 ZOO_VENV ?= .venv-zoo
 ARGS ?=
+MINUTES ?= 10
 
 PY := $(VENV)/bin/python
 INSTALL := $(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
@@ -13,11 +14,12 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-zoo lint format type links commit-checks clean
+.PHONY: help install train test fuzz test-zoo lint format type links commit-checks clean
 
 help:
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests"
+	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3, in an environment of its own"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
@@ -32,6 +34,12 @@ train: $(INSTALLED)
 
 test: $(INSTALLED)
 	$(PY) -m pytest -n auto --maxprocesses 4 $(ARGS)
+
+# A round is a thousand examples for each property; what fails is kept in .hypothesis/ and tried first from then on.
+fuzz: $(INSTALLED)
+	@end=$$(($$(date +%s) + 60 * $(MINUTES))); while [ $$(date +%s) -lt $$end ]; do \
+		$(PY) -m pytest -m hypothesis --hypothesis-profile fuzz -o timeout=0 $(ARGS) || exit 1; \
+	done
 
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py $(ARGS)

@@ -7,6 +7,7 @@ from matplotlib.figure import Figure as Picture
 from stable_baselines3.common.logger import Figure
 
 from sb3_quad.base.arrays import Arrays
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.flightlog import Recorder
@@ -32,7 +33,7 @@ class TrajectoryPlots(EveryTimesteps):
 
     :param every: timesteps between plots.
     :param n_flights: episodes in a plot.
-    :param seed: of the first episode; the next one has the next seed.
+    :param seed: of the flights.
     :param max_steps: control steps after which an episode ends at the latest.
     :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as ``task`` and ``vehicle``.
     :raises ConfigError: ``every`` or ``n_flights`` below 1, an unknown keyword; a policy of other spaces.
@@ -48,7 +49,7 @@ class TrajectoryPlots(EveryTimesteps):
         **environment: Any,
     ) -> None:
         super().__init__(every, verbose, n_flights=n_flights, max_steps=max_steps)
-        self._seeds = range(seed, seed + n_flights)
+        self._seeds = row_seeds(seed, n_flights)
         self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_steps)
 
     def _on_training_start(self) -> None:

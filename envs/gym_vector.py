@@ -11,6 +11,7 @@ from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.tasks import TaskSpec
@@ -21,7 +22,8 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8, vectorization_mode="vector_entry_point")`` makes one. The
     learning problem, the arguments and the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i of
-    ``reset(seed=s)`` flies as that environment does after ``reset(seed=s + i)``.
+    ``reset(seed=s)`` flies as that environment does after ``reset(seed=row_seeds(s, n)[i])``, see
+    :func:`~sb3_quad.base.seeds.row_seeds`.
 
     Autoreset is ``SAME_STEP``: a row that ends returns the first observation of its next episode, and the infos hold the last
     one in ``final_obs[i]`` and ``is_success``, ``distance``, ``collision`` and ``out_of_range`` in ``final_info``, each with
@@ -51,11 +53,11 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Begin new episodes in all rows, or where ``options["reset_mask"]``, bool (n,), says so.
 
-        :param seed: row i begins the stream of ``seed + i``, or of its own number; None: the next episode of its stream.
+        :param seed: one number, from which each row gets its own stream, or a number for each row; None: the next episodes.
         """
         n, options = self.num_envs, dict(options or {})
         seeds = [None] * n if seed is None else seed
-        seeds = [seeds + row for row in range(n)] if isinstance(seeds, (int, np.integer)) else list(seeds)
+        seeds = row_seeds(int(seeds), n) if isinstance(seeds, (int, np.integer)) else list(seeds)
         if len(seeds) != n:
             raise ConfigError(f"seed: {len(seeds)} numbers for {n} environments; give one, or one for each")
         mask = np.asarray(options.pop("reset_mask", np.ones(n, dtype=np.bool_)))

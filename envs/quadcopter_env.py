@@ -34,7 +34,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
 
     The vehicle, the tasks and all numbers are those of the study thesis STUD-512; its equations are cited by number. The
     body is flown by PyBullet; :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` flies many at once by compiled code, and
-    its row `i` agrees with this environment reset with `seed + i` to 1e-9.
+    each of its rows agrees with this environment reset with the row's seed to 1e-9.
 
     The world frame has z up and the ground at z = 0. The body frame has x forward, y left, z up. Units are SI.
 

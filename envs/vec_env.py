@@ -1,5 +1,6 @@
 """``QuadcopterVecEnv``: n quadcopters as one Stable-Baselines3 vectorised environment."""
 
+import secrets
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -12,6 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.state import QuadcopterState
@@ -21,11 +23,25 @@ _ROW_ATTRIBUTES = ("target", "noise", "observation_mean", "observation_std")
 _METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
 
 
-class QuadcopterVecEnv(InFlight, VecEnv):
+class RowSeeds(VecEnv):
+    """A vectorised environment whose rows have nothing in common, whatever the seeds.
+
+    SB3 gives row i ``seed + i``: of 480 rows, those of seeds 0 and 1 share 479 streams of random numbers.
+    """
+
+    def seed(self, seed: int | None = None) -> list[int]:  # type: ignore[override]
+        """Seed all rows from their next reset on; returns :func:`~sb3_quad.base.seeds.row_seeds`. None: by a random number."""
+        first = secrets.randbits(32) if seed is None else seed
+        self._seeds = [*row_seeds(first, self.num_envs)]
+        return [*self._seeds]
+
+
+class QuadcopterVecEnv(InFlight, RowSeeds):
     """n quadcopters stepped together by compiled code; the flight is PyBullet's to 1e-9.
 
     The learning problem, the arguments and the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`;
-    row i flies exactly as that environment does after ``reset(seed=seed + i)``. A row that ends begins its next episode
+    row i flies exactly as that environment does after ``reset(seed=row_seeds(seed, n)[i])``
+    (:func:`~sb3_quad.base.seeds.row_seeds`; ``seed()`` returns them). A row that ends begins its next episode
     within the same step, and its info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``,
     ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``distance``, ``collision`` and ``out_of_range``. The infos of other
     rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are fresh.

@@ -11,10 +11,10 @@ import pytest
 import torch
 from hypothesis import settings
 
-# The first example of a test may compile, so no deadline. In CI, the same examples every time.
-settings.register_profile("default", deadline=None)
-settings.register_profile("ci", deadline=None, derandomize=True, database=None, print_blob=True)
-settings.load_profile("ci" if os.environ.get("CI") else "default")
+# The first example of a test may compile, so no deadline. The same examples every time, except in `make fuzz`.
+settings.register_profile("default", deadline=None, derandomize=True, database=None, print_blob=True)
+settings.register_profile("fuzz", deadline=None, max_examples=1000, print_blob=True)
+settings.load_profile("default")
 
 
 @pytest.fixture(autouse=True)

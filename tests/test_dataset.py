@@ -5,7 +5,7 @@ import os
 import numpy as np
 import pytest
 import torch as th
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
@@ -30,7 +30,6 @@ def contents(dataset):
     return observations.numpy(), actions.numpy()
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.integers(1, 12), st.lists(st.integers(0, 30), max_size=8))
 def test_it_holds_the_last_pairs_in_order(capacity, sizes):
     total = sum(sizes)

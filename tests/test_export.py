@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import A2C, PPO, SAC
 
@@ -179,7 +179,6 @@ def test_an_onnx_model_says_what_it_takes_and_gives(zips):
     assert {each.key: each.value for each in model.metadata_props} == exported.metadata
 
 
-@settings(max_examples=50)
 @given(st.text(max_size=200))
 def test_any_file_name_makes_a_c_name_and_a_comment(text):
     assert re.fullmatch("[A-Za-z][A-Za-z0-9_]*", c_header.c_name(text))

@@ -18,6 +18,7 @@ STEPS = 150
 SCRIPT = """
 import json
 import numpy as np
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterEnv
 from sb3_quad.experts.resolve import resolve_expert
@@ -31,7 +32,7 @@ def batch(**task_kwargs):
 
 def single(row):
     made = QuadcopterEnv("upright_fall", {"speed_cost": 0.01}, vehicle="trainer_quad", noise=0.0)
-    made.reset(seed=5 + row)
+    made.reset(seed=row_seeds(5, 2)[row])
     return made
 
 plain, costly, twins = batch(), batch(speed_cost=0.01), [single(row) for row in range(2)]

@@ -6,6 +6,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
 
 ROOT = Path(__file__).resolve().parent.parent
 FILES = ("Makefile", "setup.cfg", "pyproject.toml", "constraints.txt")
@@ -54,3 +55,8 @@ def test_an_environment_apart_from_all_clones_is_installed_into(clones):
     shutil.move(first / ".venv", apart)
     make(second, f"VENV={apart}")
     assert noted.read_text().split() == [str(second)]
+
+
+def test_the_suite_tries_the_same_examples_every_time_and_fuzz_tries_others():
+    assert settings.get_profile("default").derandomize
+    assert not settings.get_profile("fuzz").derandomize

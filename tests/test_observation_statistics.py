@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from stable_baselines3 import PPO, SAC
@@ -36,7 +36,6 @@ def make(env, algorithm=PPO):
     return algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, seed=0, device="cpu", **size)
 
 
-@settings(max_examples=50)
 @given(
     sizes=st.lists(st.integers(1, 40), min_size=1, max_size=8),
     offset=arrays(np.float64, 3, elements=st.floats(-1e4, 1e4)),

@@ -132,7 +132,7 @@ def vehicles(draw):
     )
 
 
-@settings(max_examples=12, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+@settings(max_examples=settings().max_examples // 8, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
 @given(vehicle=vehicles(), seed=st.integers(0, 2**32 - 1), pushed=st.booleans())
 def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
     rng = np.random.default_rng(seed)

@@ -7,6 +7,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.files import write_arrays
+from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
@@ -75,7 +76,7 @@ def test_both_backends_fly_the_same(entry, controller):
 def test_episodes_are_those_of_the_task():
     recovery = load_suite("thesis").scenario("recovery").model_copy(update={"episodes": 8, "duration": 2.0})
     ours, _ = fly_scenario(PIDExpert(), recovery)
-    plain = fly(PIDExpert(), "state_recovery", 8, recovery.seed, max_steps=200)
+    plain = fly(PIDExpert(), "state_recovery", 8, seed_for("suite", recovery.seed), max_steps=200)
     for name in ("reward", "length", "path_length", "final_error", "start"):
         np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
 

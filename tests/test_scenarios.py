@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
@@ -122,7 +122,6 @@ def test_vehicle_files_lie_beside_the_suite(tmp_path):
     assert load_suite(tmp_path / "mine.yaml").scenarios[0].flown_vehicle().mass == 1.5
 
 
-@settings(max_examples=20)
 @given(high=st.floats(1.0, 29.0), short=st.floats(0.05, 0.95))
 def test_reach_is_what_full_thrust_allows(high, short):
     """Straight up at 1.5 hover thrusts: 0.25 g t²."""
@@ -141,7 +140,6 @@ def test_vary_is_a_grid_of_named_cells():
     assert axis_label("start.attitude.tilt") == "tilt (deg)"
 
 
-@settings(max_examples=20)
 @given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))
 def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"
@@ -154,7 +152,7 @@ def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     np.testing.assert_allclose(np.linalg.norm(sampled["body_rates"], axis=1), rate, atol=1e-9)
     for name, values in sampled.items():
         np.testing.assert_array_equal(values, again[name])
-        if name == "velocity" and speed > 0:
+        if name == "velocity" and speed > 1e-300:  # smaller ones have too few digits to tell directions apart
             assert len(np.unique(values[:, 0])) == 3
 
 
@@ -164,7 +162,6 @@ def test_what_a_task_samples_itself_stays_with_the_environment():
     assert recovery.task.random_attitude and recovery.task.velocity_std == 2.0 and recovery.task.body_rates_std == 4.0
 
 
-@settings(max_examples=30)
 @given(
     st.lists(st.tuples(st.integers(0, 40), st.integers(1, 60), st.sampled_from(["world", "body"])), min_size=1, max_size=4),
     st.floats(0, 3),
@@ -188,7 +185,6 @@ def test_the_wrench_at_any_time_is_the_sum_of_those_that_act(times, factor):
         np.testing.assert_allclose(now, [expected, factor * expected], atol=1e-12)
 
 
-@settings(max_examples=20)
 @given(mass=st.floats(0.7, 1.4), action=st.floats(-1, 1))
 def test_a_heavier_vehicle_keeps_its_motors(mass, action):
     vehicle = load_vehicle("itm")

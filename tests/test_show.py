@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -131,7 +131,6 @@ clouds = st.lists(st.tuples(coordinates, coordinates, st.floats(10, 40)), min_si
 
 
 @given(points=clouds, aspect=st.floats(0.5, 2), course=st.floats(0, 6.28))
-@settings(max_examples=50)
 def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(points, aspect, course):
     ahead = np.array([np.cos(course), np.sin(course), 0.0])
     camera = framing_camera(points, 1.0, ahead, Lens(round(200 * aspect), 200))

@@ -12,7 +12,7 @@ import optuna
 import pytest
 import yaml
 from conftest import legends_cover_nothing
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
@@ -319,7 +319,6 @@ rewards = st.floats(-1e4, 1e4).map(lambda value: round(value, 3))
 
 
 @given(st.integers(1, 1000), st.data())
-@settings(max_examples=200)
 def test_more_success_outweighs_any_reward_and_reward_decides_between_equals(n, data):
     first, second = (data.draw(st.tuples(st.integers(0, n), rewards)) for _ in range(2))
     values = [score(successes / n, reward, n) for successes, reward in (first, second)]

@@ -1,38 +1,48 @@
-"""Every range of seeds, by what it is for: what judges a training is never what it was trained on.
+"""Every stream of random numbers, by what it is for: what judges a training is never what it was trained on.
 
-A seed names an environment's stream of random numbers. Each purpose has ``ROOM`` of them, one for each run; environment i of a
-run takes the i-th after it.
+Streams are told apart by :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row. No two share numbers: seeds
+0 and 1 of a training have as little in common as a training and its evaluation.
 """
 
+import typing
 from typing import Literal
+
+import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 
-Purpose = Literal["training", "evaluation", "trim", "table", "expert", "offset", "card"]
-
-ROOM = 2**17
-SUITE = 2**19  # of scenarios that name no seed: the episodes of closing tables, which judge as well
+Purpose = Literal[
+    "training",
+    "evaluation",  # along the way
+    "trim",  # before and after an agent is trimmed
+    "table",  # at the end of a run
+    "search",  # of tune-expert
+    "expert",  # tune-expert at its end, check-vehicle
+    "offset",  # that adaptive scaling cancels
+    "card",  # of published policies
+    "suite",  # of scenarios
+]
+PURPOSES = typing.get_args(Purpose)
+_PURPOSE, _ROW = range(2)  # what a key tells apart
 SCENARIO_STREAM = 0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
-LARGEST = 2**32 - 2**20
-_FIRST: dict[Purpose, int] = {
-    "training": 0,
-    "evaluation": 2**18,  # along the way
-    "trim": 3 * 2**17,  # before and after an agent is trimmed
-    "table": 2**19,  # at the end of a run
-    "expert": 1_000_000,  # tune-expert, check-vehicle
-    "offset": 2**21,  # that adaptive scaling cancels
-    "card": 20_000_000,  # of published policies
-}
+LARGEST = 2**32  # NumPy's global generator, which SB3 seeds, takes no more
 
 
 def seed_for(purpose: Purpose, seed: int = 0) -> int:
-    """The first seed of the episodes that a run with ``seed`` flies for some purpose.
+    """The seed of what a run with ``seed`` flies for some purpose; its rows fly by :func:`row_seeds` of it."""
+    return _hash(seed, _PURPOSE, PURPOSES.index(purpose))
 
-    Seeds of ``ROOM`` and above would reach into the next purpose's; they get ranges beyond all others.
+
+def row_seeds(seed: int, n: int) -> list[int]:
+    """The seeds of n rows, each for ``reset(seed=…)`` of one environment; row i's does not depend on n.
+
+    They are below 2**53, which any file and any language keeps exactly.
     """
-    if seed < ROOM:
-        return _FIRST[purpose] + seed
-    return (1 + list(_FIRST).index(purpose)) * 2**40 + seed
+    return [_hash(seed, _ROW, row) for row in range(n)]
+
+
+def _hash(seed: int, *key: int) -> int:
+    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0] >> np.uint64(11))
 
 
 def check_seed(seed: int) -> int:

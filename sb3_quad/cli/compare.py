@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.cli.output import console
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
@@ -28,7 +28,7 @@ def task_table(
     :param n: how many episodes.
     :param beside: the columns of the thesis that stand beside them; none but of the vehicle that it flew.
     """
-    seeds = range(seed, seed + n)
+    seeds = row_seeds(seed, n)
     measured = [metric_cells(summarise(fly_settings(each, settings, seeds))) for each in controllers.values()]
     scenario = load_suite("thesis").scenario(SCENARIOS[settings.task])
     shown = [name for name in beside if name in scenario.reference and settings.vehicle == THESIS_VEHICLE]

@@ -13,7 +13,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from sb3_quad import __version__
@@ -178,8 +177,7 @@ def run_job(job: Job) -> Entry | Failure:
         hit_limit=limit,
         flights=flights_path(label, scenario.name),
     )
-    seeds = np.arange(scenario.seed, scenario.seed + scenario.episodes)
-    write_entry(Path(job.folder), entry, {**episode_arrays(flights, seeds), **trajectories})
+    write_entry(Path(job.folder), entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories})
     return entry
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import quadcopter_spaces
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
@@ -85,7 +86,8 @@ def fly(
     hooks: Sequence[Hook] = (),
     **environment: Any,
 ) -> Flights:
-    """Fly ``n_episodes`` episodes; number k is the first one of the environment seeded with ``seed + k``.
+    """Fly ``n_episodes`` episodes; number k is the first one of the environment reset with
+    ``row_seeds(seed, n_episodes)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
 
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
         ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
@@ -102,7 +104,7 @@ def fly(
         raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
     environment |= {"task": task, "vehicle": vehicle, "noise": noise, "max_episode_steps": max_steps}
     settings = FlightSettings().with_changes(**environment)
-    return fly_settings(controller, settings, range(seed, seed + n_episodes), backend, tolerances, hooks)
+    return fly_settings(controller, settings, row_seeds(seed, n_episodes), backend, tolerances, hooks)
 
 
 def fly_settings(

@@ -104,7 +104,7 @@ class Entry(Frozen):
     scenario: str = Field(description="name")
     key: str = Field(description="hash of all that the flights depend on: equal keys, equal flights")
     scenario_key: str = Field(description="hash of the part of it that is not the controller")
-    seed: int = Field(description="of episode 0; episode k has seed + k")
+    seed: int = Field(description="of the scenario; the files tell that of each episode")
     backend: str
     seconds: float = Field(description="wall-clock time it took")
     date: str = Field(default="", description="day on which it was flown, UTC, year-month-day; empty in older results")

@@ -79,6 +79,6 @@ def measure_mean(policy: Any, n_flights: int = N_FLIGHTS, settings: FlightSettin
     """
     mean = np.zeros(3)
     for number in range(ROUNDS):
-        seed = seed_for("offset") + number * N_FLIGHTS
+        seed = seed_for("offset", number)
         mean = mean - hover_offset(AdaptiveScaling(policy, mean), n_flights, seed, settings)
     return mean

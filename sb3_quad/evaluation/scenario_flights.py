@@ -38,7 +38,7 @@ def fly_scenario(
     :raises ConfigError: an unknown backend, or a controller that cannot be asked.
     :raises ControllerError: a controller that fails in flight.
     """
-    chosen = range(scenario.seed, scenario.seed + scenario.episodes) if seeds is None else seeds
+    chosen = scenario.episode_seeds() if seeds is None else seeds
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
     size, settings = PART_SIZES.get(backend, 1), flown_as(scenario)
@@ -70,13 +70,13 @@ def find_limit(controller: Any, scenario: Scenario, backend: str = "batch") -> H
     search = scenario.hit_search
     if search is None:
         return None
-    seeds = range(scenario.seed, scenario.seed + search.episodes)
+    seeds = scenario.episode_seeds()[: search.episodes]
     tried: dict[float, Estimate] = {}
     low, high = 0.0, search.largest
     grid = np.linspace(low, high, FIRST_GRID + 1)
     for _ in range(MAX_ROUNDS):
         factors = np.repeat(grid, search.episodes)
-        flights, _ = fly_scenario(controller, scenario, backend, [*seeds] * grid.size, factors)
+        flights, _ = fly_scenario(controller, scenario, backend, seeds * grid.size, factors)
         survived = flights.success.reshape(grid.size, search.episodes)
         tried |= {factor: share(row) for factor, row in zip(grid.tolist(), survived, strict=True)}
         lost = next((factor for factor in sorted(tried) if tried[factor].value <= 0.5), None)

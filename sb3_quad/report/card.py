@@ -51,12 +51,13 @@ def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Metrics]
     :param n_episodes: at each distance.
     :param settings: ``vehicle``, ``noise`` and ``observation_std``, as :func:`~sb3_quad.evaluation.flights.fly` takes them.
     """
-    first = seed_for("card")
-    parts = [fly(policy, "state_recovery", n_episodes, first + k * n_episodes, **settings) for k in range(N_RECOVERIES)]
+    parts = [fly(policy, "state_recovery", n_episodes, seed_for("card", k), **settings) for k in range(N_RECOVERIES)]
     rows = {RECOVERY: summarise(Flights.concatenate(parts))}
     for distance in DISTANCES:
         task = {"target_distance": distance}
-        flown = fly(policy, "target_tracking", n_episodes, first + int(1000 * distance), task_kwargs=task, **settings)
+        flown = fly(
+            policy, "target_tracking", n_episodes, seed_for("card", int(1000 * distance)), task_kwargs=task, **settings
+        )
         rows[f"targets {distance:.0f} m away"] = summarise(flown)
     return rows
 

@@ -53,7 +53,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
                 tables.append(_success_table(results, cells, colours, corner))
         facts = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
-            f"observation noise {100 * first.noise:g} %; seeds from {first.seed} on"
+            f"observation noise {100 * first.noise:g} %; seed {first.seed}"
         )
         parts.append(Section(first.group or first.name, heading, first.description, tables, plots, facts))
     return parts

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.seeds import SUITE
+from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.tasks import Task
@@ -65,7 +65,7 @@ class Scenario(Frozen):
     vehicle: str = Field(default="itm", description="name, or path of a YAML file (relative to the suite's)")
     vehicle_changes: VehicleChanges = Field(default=VehicleChanges(), description="unknown to the controller")
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(default=240, description="how many are flown")
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=SUITE, description="episode k is sampled from seed + k")
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=0, description="from which every episode gets its own")
     tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m")
     hit_search: HitSearch | None = Field(default=None, description="find how large the wrenches may get")
     reference: dict[str, Reference] = Field(default_factory=dict, description="from a column's title to others' metrics")
@@ -112,6 +112,10 @@ class Scenario(Frozen):
             return self.vehicle_changes.apply(nominal)
         except ValidationError as error:
             raise ValueError(f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})") from None
+
+    def episode_seeds(self) -> list[int]:
+        """The seed of each episode, for ``reset(seed=…)`` of one environment."""
+        return row_seeds(seed_for("suite", self.seed), self.episodes)
 
     @property
     def heading(self) -> str:

@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, whole_number
 from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, StepArrays, step_arrays
@@ -45,7 +46,7 @@ class QuadcopterBatch:
     :param observation_mean: μ of Eq. 3.16, shape (18,) or (n_envs, 18); None: zero.
     :param observation_std: σ of Eq. 3.16, likewise; None: Table A.2.
     :param max_episode_steps: control steps after which an episode is truncated.
-    :param seed: row i uses the stream of ``seed + i``; None: the operating system's entropy.
+    :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the operating system's entropy.
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
     """
@@ -89,7 +90,7 @@ class QuadcopterBatch:
         self.set_observation_scaling(observation_mean, observation_std)
         with compilation_notice():
             self.observe()
-        self.seed([None if seed is None else seed + row for row in range(n)])
+        self.seed([None] * n if seed is None else row_seeds(seed, n))
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""

@@ -10,13 +10,21 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 import sb3_quad  # noqa: F401  (registers the environments, also in a worker process)
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.signals import ignore_interrupts
-from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.settings.config import TrainingConfig
 from sb3_quad.settings.values import import_class
 
 
+class _Dummy(RowSeeds, DummyVecEnv):
+    pass
+
+
+class _Subproc(RowSeeds, SubprocVecEnv):
+    pass
+
+
 def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:
-    """``n_envs`` environments as the settings describe them; number i is seeded with ``seed + i``.
+    """``n_envs`` environments as the settings describe them; their rows fly by ``row_seeds`` of ``seed``.
 
     Each gives ``info["episode"]`` where an episode ends, as SB3's Monitor does.
 
@@ -31,7 +39,7 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int) -> VecEnv:
         else:
             in_worker = config.vec_env == "subproc"
             make = partial(_make_one, config.env_id, config.env_kwargs, config.env_wrapper, in_worker)
-            env = (SubprocVecEnv if in_worker else DummyVecEnv)([make] * n_envs)
+            env = (_Subproc if in_worker else _Dummy)([make] * n_envs)
             env.seed(seed)
     except SB3QuadError:
         raise

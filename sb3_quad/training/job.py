@@ -11,7 +11,7 @@ from sb3_quad.settings.flight import FlightSettings
 
 
 class TrainingJob(Frozen):
-    """One run of the trainer. Environment number i is seeded with ``seed + i``."""
+    """One run of the trainer. All its random numbers follow from ``seed``."""
 
     config: TrainingConfig = Field(description="the settings")
     log_folder: str = Field(default="logs", description="where run folders go")

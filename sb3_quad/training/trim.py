@@ -26,6 +26,7 @@ from stable_baselines3.common.policies import BasePolicy
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 from sb3_quad.settings.flight import FlightSettings
@@ -69,6 +70,7 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not read the 18 features.
     """
     own = settings or FlightSettings()
+    rounds = row_seeds(seed, ROUNDS)
     layer = _first_layer(model)
     original = best = deepcopy(layer.state_dict())
     _, std = _scaling(own)
@@ -78,8 +80,8 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
         layer.load_state_dict(original)
         scale_position(model, scale)
         try:
-            for number in range(1, ROUNDS + 1):
-                shift_position(model, hover_offset(model, seed=seed + number * N_TARGETS, settings=own), std[_POSITION])
+            for each in rounds:
+                shift_position(model, hover_offset(model, seed=each, settings=own), std[_POSITION])
         except ConfigError:
             if scale == 1.0:
                 raise

@@ -17,6 +17,7 @@ from optuna.samplers import CmaEsSampler
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.settings.flight import FlightSettings
@@ -71,10 +72,10 @@ class ExpertObjective:
 
     def __init__(self, vehicle: Vehicle, starts: int = 40_000, targets: int = 300, seed: int = 0) -> None:
         self.vehicle, self.starts = vehicle, starts
-        heights = self._fly(GeometricExpert(vehicle), "state_recovery", range(seed, seed + starts), DESCENT)[1].lowest
-        self.hardest = [seed + int(row) for row in np.sort(np.argsort(heights)[: max(starts // 60, 1)])]
-        self.tracking = range(seed, seed + targets)
-        self.recovery = range(seed + starts, seed + starts + max(targets // 2, 1))
+        begun = row_seeds(seed_for("search", seed), starts + max(targets // 2, 1))
+        heights = self._fly(GeometricExpert(vehicle), "state_recovery", begun[:starts], DESCENT)[1].lowest
+        self.hardest = [begun[row] for row in np.sort(np.argsort(heights)[: max(starts // 60, 1)])]
+        self.tracking, self.recovery = begun[:targets], begun[starts:]
 
     def cost(self, gains: GeometricGains) -> Cost:
         """Fly all episodes with these gains."""

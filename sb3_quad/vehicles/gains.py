@@ -21,7 +21,7 @@ class GeometricMetrics(Frozen):
     time_to_0_1_m: PositiveFloat = Field(description="mean time until 0.1 m from the target, of the tracking episodes, s")
     tracking_reward: float = Field(description="mean reward of the tracking episodes (Eqs. 4.5-4.9)")
     observation_noise: NonNegativeFloat = Field(description="relative, on what the expert sees")
-    seeds: tuple[int, ...] = Field(min_length=1, description="first seed of each set of episodes")
+    seeds: tuple[int, ...] = Field(min_length=1, description="seed of each set of episodes")
 
 
 class GeometricGains(Frozen):

@@ -33,7 +33,7 @@ def add_arguments(parser: Parser) -> None:
     add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
     add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
-    add("--seed", type=whole, metavar="N", help="seed of each scenario's first episode, instead of its own")
+    add("--seed", type=whole, metavar="N", help="seed of each scenario, instead of its own")
     add("--vehicle", metavar="V", help="vehicle for all scenarios, by name or YAML file")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_text
-from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli.output import console, progress_bar
 from sb3_quad.evaluation.expert_metrics import measure_expert
@@ -38,7 +38,7 @@ def run(options: argparse.Namespace) -> int:
         search.run(options.trials, should_continue)
     if signals.received is not None:
         print(f"{signals.name}: writing the best of {search.trials_done} so far")
-    seeds = [seed_for("expert", options.seed) + k * FRESH_EPISODES for k in range(FRESH_SETS)]
+    seeds = row_seeds(seed_for("expert", options.seed), FRESH_SETS)
     measured, recoveries = measure_expert(GeometricExpert(vehicle, search.best), vehicle, seeds, FRESH_EPISODES)
     content = with_gains(text, search.best.model_copy(update={"measured": measured}))
     search.note_output(content.encode("utf-8"))
