@@ -24,3 +24,13 @@ def same_start():
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 - SB3's buffers draw from it
     torch.manual_seed(0)
+
+
+def legends_cover_nothing(figure):
+    """Assert that a figure's legends lie within it and outside of its axes."""
+    figure.draw_without_rendering()
+    assert not any(axes.get_legend() for axes in figure.axes)
+    for legend in figure.legends:
+        box = legend.get_window_extent()
+        assert box.x0 >= -1 and box.x1 <= figure.bbox.width + 1, box
+        assert not any(box.overlaps(axes.get_window_extent()) for axes in figure.axes)

@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from conftest import legends_cover_nothing
 
 from sb3_quad.cli import main
-from sb3_quad.report.curves import plot_curves, read_curve
+from sb3_quad.report.curves import Curve, plot_curves, read_curve
 
 
 @pytest.fixture
@@ -34,6 +35,16 @@ def test_seeds_are_drawn_as_mean_and_range(runs):
     reward = figure.axes[2].lines[0]
     assert reward.get_ydata()[0] == pytest.approx(-4.5) and reward.get_ydata()[-1] == pytest.approx(-1.5)
     np.testing.assert_array_equal(figure.axes[0].lines[1].get_ydata(), [30.0, 30.0])
+
+
+def test_every_evaluation_is_marked_and_the_legend_covers_nothing(runs):
+    long, short = read_curve(runs / "Env_1"), Curve(*(np.array([each]) for each in (150.0, 30.0, 0.5, -2.0)))
+    figure = plot_curves({"agent": [long], "a run with a single evaluation": [short]}, {"expert": (0.3, -5.0)}, "title")
+    for axes, times in zip(figure.axes, ([1e-4, 2e-4], [1.0, 2.0]) * 2, strict=True):
+        several, single, _ = axes.lines
+        np.testing.assert_allclose(several.get_xdata(), times)
+        assert several.get_marker() == single.get_marker() == "o" and len(single.get_xdata()) == 1
+    legends_cover_nothing(figure)
 
 
 def test_the_command_writes_a_picture(runs, capsys):

@@ -1,6 +1,8 @@
 """The report: the metrics of the results, every plot as page, PNG and SVG, and a page that a browser shows without help."""
 
+import datetime
 import io
+import itertools
 import json
 import re
 import shutil
@@ -10,19 +12,26 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
+from conftest import legends_cover_nothing
 from hypothesis import given
 from hypothesis import strategies as st
+from matplotlib.colors import to_rgb
 from rich.console import Console
 
 from sb3_quad.cli import main
+from sb3_quad.drawing.labels import COLOURS
+from sb3_quad.drawing.scene import MARKER
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, time_row
-from sb3_quad.evaluation.records import Failure
+from sb3_quad.evaluation.records import Failure, HitTrial
+from sb3_quad.evaluation.summary import share
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render, write_report
+from sb3_quad.report.paths import TARGET
+from sb3_quad.report.plots import FORCE, HEIGHT, WIDTH, Flown, hits_plot
 from sb3_quad.report.sections import sections
 from sb3_quad.scenarios.load import parse_suite
 
@@ -162,6 +171,61 @@ def test_plots_in_the_page_have_its_colours_and_the_files_their_own(parts):
 def test_plotly_is_only_where_something_can_be_turned(folder, parts):
     text = render(load_results(folder), [parts["noise"], parts["starts"]], with_pictures=False)
     assert "<svg" in text and "<script" not in text and len(text) < 1_000_000
+
+
+def test_the_page_is_small_and_says_what_was_flown_when_and_by_which_version(folder, parts, page):
+    assert page.stat().st_size < 2_600_000  # plotly.js alone has 4.8 million bytes
+    results = load_results(folder)
+    agent = results.controllers[0].model_copy(update={"algorithm": "PPO"})
+    text = render(results.model_copy(update={"controllers": [agent, *results.controllers[1:]]}), [*parts.values()], False)
+    (day,) = {datetime.date.fromisoformat(entry.date) for entry in results.entries}
+    assert f"flown {day} by sb3_quad {results.package_version}" in text
+    assert f'<code title="{agent.content}">{agent.content[:12]}</code>' in text
+
+
+def test_controllers_targets_and_forces_have_colours_of_their_own(parts):
+    rows = [np.array(to_rgb(colour)) * 255 for colour in (*COLOURS, TARGET, FORCE)]
+    assert min(np.linalg.norm(one - other) for one, other in itertools.combinations(rows, 2)) > 60
+    assert min(np.linalg.norm(row - np.array(MARKER[:3]) * 255) for row in rows[: len(COLOURS)]) > 60
+    layout = plot_of(parts, "tracking", "paths").space["layout"]
+    assert layout["legend"]["yanchor"] == "top" and layout["legend"]["y"] <= 0  # Plotly's buttons are at the top
+
+
+def test_plots_are_narrow_enough_for_a_telephone_and_legends_cover_nothing(parts):
+    for plot in (plot for section in parts.values() for plot in section.plots):
+        assert plot.space is not None or plot.figure.get_figwidth() == WIDTH
+        legends_cover_nothing(plot.figure)
+    assert plot_of(parts, "tracking", "times").figure.get_figheight() == HEIGHT
+
+
+def test_isolated_survivals_beyond_the_first_loss_are_not_joined(folder):
+    results = load_results(folder)
+    entry, (scenario,) = results.entry("pid", "hit"), (each for each in results.scenarios if each.name == "hit")
+    trials = [HitTrial(factor=k + 1, survived=share(np.full(4, alive))) for k, alive in enumerate([1, 1, 0, 1, 1, 0])]
+    limit = entry.hit_limit.model_copy(update={"trials": trials})
+    flown = Flown("pid", COLOURS[0], entry.model_copy(update={"hit_limit": limit}), [])
+    joined, beyond = hits_plot(scenario, [flown]).figure.axes[0].lines
+    np.testing.assert_array_equal(joined.get_xydata(), [(1, 100), (2, 100), (3, 0)])
+    np.testing.assert_array_equal(beyond.get_xydata(), [(4, 100), (5, 100), (6, 0)])
+    assert beyond.get_linestyle() == "None" and beyond.get_markerfacecolor() != joined.get_markerfacecolor()
+
+
+def test_controllers_stand_side_by_side_in_each_cell(folder, parts):
+    panels, results = plot_of(parts, "starts", "success").figure.axes, load_results(folder)
+    assert [panel.get_title("left") for panel in panels] == ["velocity 0 m/s", "velocity 3 m/s"]
+    for label in ("pid", LABEL):
+        (bars,) = (each for each in panels[1].containers if each.get_label() == label)
+        for bar in bars:
+            tilt, rate = 90 * round(bar.get_center()[0]), 4 * round(bar.get_y())
+            (entry,) = (
+                results.entry(label, scenario.name)
+                for scenario in results.scenarios
+                if [*scenario.cell.values()] == [tilt, rate, 3]
+            )
+            assert (bar.get_height() / 0.7) ** 2 == pytest.approx(1 - entry.metrics.success.value)
+        assert len(bars) == 4
+    one, other = (sorted(bar.get_x() for bar in bars) for bars in panels[1].containers)
+    assert all(0 < right - left < 0.5 for left, right in zip(one, other, strict=True))
 
 
 def test_axes_say_what_and_in_which_unit(parts):
@@ -336,6 +400,18 @@ def test_a_browser_shows_it_without_errors_or_requests(page):
             box = drawn.bounding_box()
             assert box is not None and box["width"] > 200 and box["height"] > 100, name
         width = tab.evaluate("document.documentElement.scrollWidth - window.innerWidth")
+        tab.set_viewport_size({"width": 420, "height": 800})
+        tab.wait_for_timeout(300)
+        for number, name in enumerate(names):
+            plots.nth(number).scroll_into_view_if_needed()
+            room = plots.nth(number).bounding_box()
+            if plots.nth(number).get_attribute("class") == "plot":
+                box = plots.nth(number).locator("svg").bounding_box()
+                assert box["x"] >= room["x"] and box["width"] <= room["width"] <= 420, name
+            else:
+                plots.nth(number).locator(".legend").wait_for(state="attached", timeout=60_000)
+                buttons, legend = (plots.nth(number).locator(each).bounding_box() for each in (".modebar", ".legend"))
+                assert buttons["y"] + buttons["height"] < legend["y"], name
         colours = "[document.body, ...document.querySelectorAll('.plot text')].map((each) => getComputedStyle(each)).map("
         colours += "(style, number) => number ? style.fill : style.backgroundColor).slice(0, 2)"
         light = tab.evaluate(colours)

@@ -1,7 +1,9 @@
 """Flights to look at: recordings are the flights, cameras see what they must, files are whole and never lost."""
 
 import importlib.util
+import itertools
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +21,7 @@ from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, 
 from sb3_quad.drawing.labels import side_by_side, with_header
 from sb3_quad.drawing.picture import Overlay, draw_overlays
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.settings.config import load_config
 from sb3_quad.settings.flight import FlightSettings
@@ -174,14 +177,36 @@ def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
 
 def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
     view = sequence._view([fall, hit], [len(fall.times) - 1, 60], (300, 400))
-    poses = sequence._apart(fall, len(fall.times) - 1, view)
+    poses, others = sequence._same_times([fall, hit], [len(fall.times) - 1, 60], view)
     assert poses[0] == 0 and poses[-1] == len(fall.times) - 1 and len(poses) > 4
     places, breadth = view.project(fall.state.position[poses])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(len(poses), 1)]
     assert gaps.min() > 0.7 * breadth.min()
-    assert hit.pushes[0] in sequence._apart(hit, 60, view)
+    assert hit.pushes[0] in others
     picture = sequence.sequence([fall, hit], times=[0.0, 0.5], size=(120, 100))
     assert picture.shape[0] > 100 and picture.shape[1] >= 240 and picture.std() > 20
+
+
+def test_a_sequence_has_its_panels_at_the_same_times_and_explains_its_signs(fall, hit, monkeypatch):
+    setting = fixed_setting(FlightSettings(task="target_tracking"), target=(5, 0, 17))
+    (flights,) = fly_all({"pid": PIDExpert(), "geometric": GeometricExpert()}, setting, 0, 300)
+    ends = [300, 200]
+    view = sequence._view(flights, ends, (600, 300))
+    chosen = sequence._same_times(flights, ends, view)
+    for (ours, flight, end), (theirs, _, _) in itertools.permutations(zip(chosen, flights, ends, strict=True), 2):
+        places, breadth = view.project(flight.state.position)
+        for step in (step for step in theirs if step not in ours and step <= end):
+            gap = np.linalg.norm(places[ours] - places[step], axis=1).min() / breadth[step]
+            assert gap <= sequence.NEAR  # it would hide another pose
+    assert len(set(chosen[0]) & set(chosen[1])) > 2
+
+    headers = []
+    monkeypatch.setattr(sequence, "with_header", lambda pixels, name, lines, *look: headers.append(lines) or pixels)
+    sequence.sequence([fall, hit], size=(60, 60))
+    assert [header[-1] for header in headers] == [
+        "green hoops: target",
+        "green hoops: target; arrows: force (red), torque (violet)",
+    ]
 
 
 @pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
@@ -219,9 +244,12 @@ def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
 def test_the_command_draws_and_tells(tmp_path, capsys):
     picture, film = tmp_path / "s.png", tmp_path / "f.gif"
     size = ["--size", "64x64", "-n", "12", "--seed", "3"]
-    asked = ["enjoy", "pid", "still=geometric", "--task", "state_recovery", *size, "--sequence", str(picture)]
+    asked = ["enjoy", "pid", "still=geometric", "--task", "state_recovery", *size, "--sequence", str(picture), "-P"]
     assert main([*asked, *(["--record", str(film)] if VIDEO else [])]) == 0
-    output = capsys.readouterr().out
+    output, progress = capsys.readouterr()
+    assert not VIDEO or (
+        "100%" in progress and re.search(r"\d:\d\d:\d\d", progress)
+    )  # how much is done, and how long it takes
     assert "pid: " in output and "still: " in output and "0.12 s" in output and str(picture) in output
     with Image.open(picture) as image:
         assert image.width >= 128

@@ -11,6 +11,7 @@ import numpy as np
 import optuna
 import pytest
 import yaml
+from conftest import legends_cover_nothing
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
@@ -19,6 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.settings.config import build_config, load_config
+from sb3_quad.tuning import results as results_module
 from sb3_quad.tuning import search as search_module
 from sb3_quad.tuning import study as study_module
 from sb3_quad.tuning.search import score
@@ -115,6 +117,16 @@ def test_the_first_trial_has_the_settings_as_they_are(command):
     Path("small.yml").write_text(yaml.safe_dump({ENV: settings}))
     assert main([*command, "--n-trials", "1"]) == 0
     assert varied(trials()[0]) == ("lin_0.001", "huber", "-1.5")
+
+
+def test_the_axis_of_trials_has_whole_numbers_even_of_one_trial(command, monkeypatch):
+    figures = []
+    monkeypatch.setattr(results_module, "picture", lambda figure, *how, **options: figures.append(figure) or b"")
+    assert main([*command, "--n-trials", "1"]) == 0
+    axes = figures[0].axes[0]
+    low, high = axes.get_xlim()
+    assert axes.get_xlabel() == "trial" and [tick for tick in axes.get_xticks() if low <= tick <= high] == [0]
+    legends_cover_nothing(figures[0])
 
 
 def test_two_processes_share_a_study(command):

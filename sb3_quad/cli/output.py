@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 FILE_WIDTH = 140  # columns where the output is no terminal: a table there need not wrap
 Show = Callable[[int, "int | None", str], None]
@@ -33,11 +33,12 @@ def output_file(given: str | Path | None, name: str) -> Path:
 def progress_bar(wanted: bool | None) -> Iterator[Show]:
     """A progress bar on stderr, moved by what it yields: how much is done, of how much (None: not known), what is under way.
 
-    :param wanted: None: in a terminal.
+    :param wanted: None: in a terminal; True: also where stderr is none.
     """
-    columns = (BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True))
+    columns = (BarColumn(), TaskProgressColumn(), MofNCompleteColumn(), TimeRemainingColumn(elapsed_when_finished=True))
     description = TextColumn("{task.description}", markup=False)
-    options: dict[str, Any] = {"console": Console(file=sys.stderr), "disable": not shows_progress(wanted)}
+    where = Console(file=sys.stderr, force_terminal=wanted or None)
+    options: dict[str, Any] = {"console": where, "disable": not shows_progress(wanted)}
     # Lines printed meanwhile appear above the bar, or go where stdout leads.
     with Progress(*columns, description, transient=True, redirect_stdout=sys.stdout.isatty(), **options) as bar:
         task = bar.add_task("", total=None)

@@ -12,8 +12,8 @@ from PIL import ImageDraw, ImageFont
 from sb3_quad.base.arrays import Image
 
 # Okabe and Ito's palette, which the colour-blind can read, less its black and its yellow, which drown on dark and on light
-# paper; a few moved.
-COLOURS = ("#1B7EC2", "#D55E00", "#009E73", "#B8548A", "#C88A00", "#3E9BD6", "#7A5BC0", "#7F7F7F")
+# paper, and less its green, which is the targets'; a few moved.
+COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
 INK = (24, 32, 44)
 PLATE = (255, 255, 255, 205)
 STEP = 1.3  # between lines of text, in font sizes

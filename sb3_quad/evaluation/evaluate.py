@@ -204,6 +204,7 @@ def run_job(job: Job) -> Entry | Failure:
         seed=scenario.seed,
         backend=job.backend,
         seconds=round(time.perf_counter() - start, 3),
+        date=time.strftime("%Y-%m-%d", time.gmtime()),
         figures=summarise(flights),
         hit_limit=limit,
         flights=flights_path(label, scenario.name),

@@ -116,6 +116,7 @@ class Entry(Frozen):
     seed: int = Field(description="of the scenario; the files tell that of each episode")
     backend: str
     seconds: float = Field(description="wall-clock time it took")
+    date: str = Field(default="", description="day on which it was flown, UTC, year-month-day; empty in older results")
     figures: Metrics = Field(description="its metrics, by their name in files")
     hit_limit: HitLimit | None = None
     flights: str = Field(description="path of the .npz, relative to the folder")

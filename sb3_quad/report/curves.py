@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays
-from sb3_quad.report.plots import band, styled
+from sb3_quad.drawing.labels import colours_of
+from sb3_quad.report.plots import POINTS, band, legend, styled
 
 NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file
 
@@ -44,7 +45,7 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
 
 @styled
 def plot_curves(groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple[float, float]], title: str = "") -> Figure:
-    """Four panels: success and reward, each over timesteps and over wall-clock time.
+    """Four panels: success and reward, each over timesteps and over wall-clock time; a marker at each evaluation.
 
     :param groups: from the name of an agent to the curves of its seeds; their mean is drawn, with their range around it.
     :param lines: from a name to (success share, mean reward): drawn as horizontal lines, such as the expert's.
@@ -52,21 +53,22 @@ def plot_curves(groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple
     figure = Figure(figsize=(11, 6.5), layout="constrained")
     panels = figure.subplots(2, 2, sharex="col", sharey="row")
     axes = (("timesteps", 1e6, "timesteps in millions"), ("seconds", 60.0, "wall-clock time in minutes"))
+    colours = colours_of([*groups])
     values = (("success", 100.0, "success in %"), ("reward", 1.0, "mean reward"))
     for (row, (value, factor, name)), (column, (axis, scale, label)) in itertools.product(enumerate(values), enumerate(axes)):
         panel = panels[row, column]
         panel.set(xlabel=label, ylabel=name)
         panel.label_outer()
-        for number, (group, curves) in enumerate(groups.items()):
+        for group, curves in groups.items():
             times = [getattr(curve, axis) for curve in curves]
-            grid = np.linspace(max(each[0] for each in times), min(each[-1] for each in times), 200)  # that all runs have
+            grid = np.clip(times[0], max(each[0] for each in times), min(each[-1] for each in times))  # that all runs have
             rows = [factor * np.interp(grid, getattr(curve, axis), getattr(curve, value)) for curve in curves]
             ends = np.stack([np.mean(rows, axis=0), np.min(rows, axis=0), np.max(rows, axis=0)])
             seeds = f" ({len(curves)} seeds)" if len(curves) > 1 else ""
-            band(panel, f"C{number}", group + seeds, grid / scale, ends)
+            band(panel, colours[group], group + seeds, grid / scale, ends, **POINTS)
         for number, (line, heights) in enumerate(lines.items()):
             style = ("--", ":", "-.")[number % 3]
             panel.axhline(heights[row] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
-    panels[0, 0].legend(loc="lower right")
+    legend(figure, panels[0, 0], side="lower")
     figure.suptitle(title)
     return figure

@@ -15,7 +15,7 @@ from sb3_quad.scenarios.scenario import Scenario
 TARGET, START = "#1a9a45", "#8a8f98"
 MARKS: dict[str, Any] = {"diamond": {"marker": "D"}, "circle-open": {"marker": "o", "markerfacecolor": "none"}}
 SHOWN_FLIGHTS = 4  # of a controller, of random episodes
-PATH_POINTS = 300  # that a flight is drawn with, at most
+PATH_POINTS = 150  # that a flight is drawn with, at most
 ARROW, CROSS = 0.16, 0.012  # longest force arrow, half a cross: of the longest side of all flights
 ARROWS = 5  # along a path on which a force lasts throughout
 BRIEF = 10  # samples; a shorter push has one arrow
@@ -142,8 +142,8 @@ def _space(traces: Sequence[Trace], box: FloatArray) -> dict[str, Any]:
     camera = {"eye": {"x": 1.45, "y": -1.95, "z": 0.68}, "center": {"x": 0, "y": 0, "z": -0.17}}
     ratio = dict(zip("xyz", (1.3 * size / size.max()).tolist(), strict=True))
     scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": camera, "dragmode": "turntable"}
-    above = {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom"}
-    return {"data": data, "layout": {"scene": scene, "margin": {"l": 0, "r": 0, "t": 36, "b": 0}, "legend": above}}
+    below = {"orientation": "h", "x": 0, "y": 0, "xanchor": "left", "yanchor": "top"}  # above are Plotly's buttons
+    return {"data": data, "layout": {"scene": scene, "margin": {"l": 0, "r": 0, "t": 30, "b": 0}, "legend": below}}
 
 
 def _number(value: float) -> float | None:

@@ -6,7 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -21,8 +21,8 @@ from sb3_quad.scenarios.scenario import Scenario
 
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
 FORCE = "#db1a24"
-WIDE, HALF = 7.7, 5.0  # inches: over the whole page, and so that two stand side by side
-DPI, LINE_POINTS = 150, 400  # points that a flight is drawn with, at most
+WIDTH, HEIGHT = 5.0, 3.3  # inches: two stand side by side in the page, and one can be read on a telephone
+DPI, LINE_POINTS = 150, 200  # points that a flight is drawn with, at most
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
 STYLE: Any = {
     "font.size": 9,
@@ -70,11 +70,6 @@ class Plot:
     figure: Figure
     space: dict[str, Any] | None = None
 
-    @property
-    def narrow(self) -> bool:
-        """Whether two of its width stand side by side."""
-        return float(self.figure.get_figwidth()) <= HALF
-
     @cached_property
     def svg(self) -> bytes:
         """The plot as an SVG file."""
@@ -92,7 +87,8 @@ class Plot:
         text = text[text.index("<svg") :]
         for colour, name in ((INK, "ink"), (QUIET, "quiet"), (GRID, "grid"), (PAPER, "paper")):
             text = text.replace(colour, f"var(--{name})")
-        return re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", text)  # names of groups, which others have, too
+        text = re.sub(r' id="[a-zA-Z0-9]+_\d+"', "", text)  # names of groups, which others have, too
+        return re.sub(r' d="[^"]*"', lambda path: re.sub(r"(\.\d\d)\d+", r"\1", path[0]), text)  # to 0.01 of a point
 
 
 @styled
@@ -103,17 +99,21 @@ def picture(figure: Figure, kind: str, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def legend(figure: Figure, axes: Any, first: Sequence[str] = ()) -> None:
-    """Every name once above the axes, those of ``first`` before others."""
+def legend(figure: Figure, axes: Any, first: Sequence[str] = (), side: Literal["upper", "lower"] = "upper") -> None:
+    """Every name once outside of all axes, those of ``first`` before others, in as many columns as the figure is wide."""
     handles, names = axes.get_legend_handles_labels()
     found = dict(zip(names, handles, strict=True))
     order = sorted(found, key=lambda name: name not in first)
-    columns = min(len(order), 5 if sum(map(len, order)) < 60 else 3)
-    figure.legend([found[name] for name in order], order, loc="outside upper left", ncols=columns)
+    place: Any = f"outside {side} left"
+    for columns in range(len(order), 0, -1):
+        made = figure.legend([found[name] for name in order], order, loc=place, ncols=columns)
+        if columns == 1 or made.get_window_extent().width <= figure.bbox.width:
+            break
+        made.remove()
 
 
-def _axes(width: float, x_label: str, y_label: str) -> tuple[Figure, Axes]:
-    figure = Figure(figsize=(width, 3.3), layout="constrained")
+def _axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
+    figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axes = figure.subplots()
     axes.set(xlabel=x_label, ylabel=y_label)
     return figure, axes
@@ -137,7 +137,7 @@ def arrivals_plot(scenario: Scenario, flown: Sequence[Flown], source: str) -> Pl
 
     :param source: where the reference metrics come from.
     """
-    figure, axes = _axes(WIDE, "tolerance (m)", "time (s)")
+    figure, axes = _axes("tolerance (m)", "time (s)")
     places, width = np.arange(len(scenario.tolerances)), 0.75 / len(flown)
     for number, each in enumerate(flown):
         arrivals = each.entry.metrics.arrivals
@@ -168,7 +168,7 @@ def arrivals_plot(scenario: Scenario, flown: Sequence[Flown], source: str) -> Pl
 @styled
 def errors_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
     """Distances from the target over time, of controllers with sampled flights."""
-    figure, axes = _axes(WIDE, "time (s)", "distance from target (m)")
+    figure, axes = _axes("time (s)", "distance from target (m)")
     for each in flown:
         x, ends = _quantiles(each.tracks)
         if scenario.is_fixed:
@@ -206,23 +206,29 @@ def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
 @styled
 def hits_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
     """Shares of flights that survive, over the size of force and torque."""
-    figure, axes = _axes(WIDE, "factor of force and torque", "survived (%)")
+    figure, axes = _axes("factor of force and torque", "survived (%)")
     for each in flown:
         if each.entry.hit_limit is not None:
             trials = sorted(each.entry.hit_limit.trials, key=lambda trial: trial.factor)
             factors = np.array([trial.factor for trial in trials])
-            band(axes, each.colour, each.label, factors, _ends([trial.survived for trial in trials], 100.0), **POINTS)
+            ends = _ends([trial.survived for trial in trials], 100.0)
+            first = 1 + next((k for k, share in enumerate(ends[0]) if share <= 50.0), len(factors))
+            band(axes, each.colour, each.label, factors[:first], ends[:, :first], **POINTS)
+            axes.plot(factors[first:], ends[0, first:], color=each.colour, **POINTS, linestyle="none", markerfacecolor=PAPER)
     axes.set_xscale("log", base=2)
     axes.set_ylim(-3.0, 103.0)
     axes.xaxis.set_major_formatter("{x:g}")
     legend(figure, axes)
-    caption = "Flights that survive when force and torque are scaled by a factor, with 95 % intervals."
+    caption = (
+        "Flights that survive when force and torque are scaled by a factor, with 95 % intervals, up to the first "
+        "that at most half survive. Open circles: greater factors, of which a few may be survived again."
+    )
     return Plot(f"{scenario.name}_limit", caption, figure)
 
 
 @styled
 def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mapping[str, str]) -> list[Plot]:
-    """The plots of the cells that ``vary`` makes of a scenario: curves over one quantity, or a heat map over several.
+    """The plots of the cells that ``vary`` makes of a scenario: curves over one quantity, or bars in each cell of several.
 
     :param colours: by the labels of the controllers.
     """
@@ -233,23 +239,17 @@ def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mappin
             flown.setdefault(label, []).append((scenario, entry.metrics))
     if not flown:
         return []
-    return _sweep(scenarios[0], flown, colours) if len(scenarios[0].cell) == 1 else [_heat_map(scenarios, flown, colours)]
+    return _sweep(scenarios[0], flown, colours) if len(scenarios[0].cell) == 1 else [_losses(scenarios, flown, colours)]
 
 
 def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, str]) -> list[Plot]:
     (key,) = first.cell
-    success, shares = _axes(HALF, axis_label(key, first), "success (%)")
-    error, distances = _axes(HALF, axis_label(key, first), "final distance (m)")
+    success, shares = _axes(axis_label(key, first), "success (%)")
+    error, distances = _axes(axis_label(key, first), "final distance (m)")
     for label, cells in flown.items():
         x = np.array([scenario.cell[key] for scenario, _ in cells])
-        band(
-            shares,
-            colours[label],
-            label,
-            x,
-            _ends([metrics.success or metrics.survival for _, metrics in cells], 100.0),
-            **POINTS,
-        )
+        successes = [metrics.success or metrics.survival for _, metrics in cells]
+        band(shares, colours[label], label, x, _ends(successes, 100.0), **POINTS)
         medians = np.array([metrics.final_error_median for _, metrics in cells], dtype=np.float64)
         distances.plot(x, medians, color=colours[label], label=label, **POINTS)
     shares.set_ylim(-3.0, 103.0)
@@ -260,32 +260,41 @@ def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, st
     return [success_plot, Plot(f"{first.group}_error", "Median of the final error of flights that were not lost.", error)]
 
 
-def _heat_map(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours: Mapping[str, str]) -> Plot:
-    """Success over the first two keys: a row of panels for each controller, a column for each combination of the others."""
+def _losses(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours: Mapping[str, str]) -> Plot:
+    """What each controller loses, side by side in each cell of the first two keys; a panel for each value of the others."""
     keys = list(scenarios[0].cell)
     x_values, y_values = (sorted({scenario.cell[key] for scenario in scenarios}) for key in keys[:2])
     columns = list(dict.fromkeys(_rest(scenario) for scenario in scenarios))
-    figure = Figure(figsize=(1.2 + 2.2 * len(columns), 0.5 + 1.7 * len(flown)), layout="constrained")
-    panels = figure.subplots(len(flown), len(columns), sharex=True, sharey=True, squeeze=False)
-    for row, (label, cells) in zip(panels, flown.items(), strict=True):
-        for axes, column in zip(row, columns, strict=True):
-            grid = np.full((len(y_values), len(x_values)), np.nan)
-            for scenario, metrics in cells:
-                if _rest(scenario) == column:
-                    x, y = x_values.index(scenario.cell[keys[0]]), y_values.index(scenario.cell[keys[1]])
-                    grid[y, x] = success = 100.0 * (metrics.success or metrics.survival).value
-                    style = {"ha": "center", "va": "center", "fontsize": 7, "color": "#101010" if success > 60 else "#fefefe"}
-                    axes.text(x + 0.5, y + 0.5, f"{success:.0f}", **style)
-            image = axes.pcolormesh(grid, vmin=0, vmax=100, cmap="viridis", edgecolors=PAPER, linewidth=0.8)
-            axes.set_title(f"{label}, {column}".rstrip(", "), loc="left", color=colours[label])
-            axes.set_xticks(np.arange(len(x_values)) + 0.5, [f"{value:g}" for value in x_values])
-            axes.set_yticks(np.arange(len(y_values)) + 0.5, [f"{value:g}" for value in y_values])
-            axes.grid(visible=False)
-            axes.set(**{f"{axis}label": axis_label(key, scenarios[0]) for axis, key in zip("xy", keys, strict=False)})
-            axes.label_outer()
-    figure.colorbar(image, ax=panels.ravel().tolist(), label="success (%)", shrink=0.9)
+    size = WIDTH, 0.7 + len(columns) * (0.3 + 0.36 * len(y_values))
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(len(columns), sharex=True, squeeze=False)[:, 0]
+    width = 0.84 / len(flown)
+    for axes, column in zip(panels, columns, strict=True):
+        for number, (label, cells) in enumerate(flown.items()):
+            lost = {
+                (x_values.index(scenario.cell[keys[0]]), y_values.index(scenario.cell[keys[1]])): 1.0 - metrics.survival.value
+                for scenario, metrics in cells
+                if _rest(scenario) == column
+            }
+            x, y = np.array([*lost]).T
+            middle, heights = x + (number - 0.5 * (len(flown) - 1)) * width, 0.7 * np.sqrt([*lost.values()])
+            axes.bar(middle, heights, 0.92 * width, bottom=y, color=colours[label], label=label)
+            for at, top, share in zip(middle, y + heights, lost.values(), strict=True):
+                if share > 0.0:
+                    axes.text(at, top + 0.02, f"{100 * share:.0f}", ha="center", va="bottom", fontsize=6)
+        axes.set_title(column, loc="left")
+        axes.set(xlim=(-0.5, len(x_values) - 0.5), ylim=(0.0, len(y_values)), ylabel=axis_label(keys[1], scenarios[0]))
+        axes.set_xticks(np.arange(len(x_values) - 1) + 0.5, minor=True)
+        axes.set_xticks(np.arange(len(x_values)), [f"{value:g}" for value in x_values])
+        axes.set_yticks(np.arange(len(y_values)), [f"{value:g}" for value in y_values], va="bottom")
+        axes.tick_params(which="both", length=0)
+        axes.grid(axis="x", visible=False)
+        axes.grid(axis="x", which="minor")
+    panels[-1].set_xlabel(axis_label(keys[0], scenarios[0]))
+    legend(figure, panels[0])
     names = ", ".join(axis_name(key).replace("_", " ") for key in keys)
-    return Plot(f"{scenarios[0].group}_success", f"Success in % over {names}.", figure)
+    caption = f"Flights lost, in %, over {names}; no bar: none. The bars' heights grow with the square root."
+    return Plot(f"{scenarios[0].group}_success", caption, figure)
 
 
 def _rest(scenario: Scenario) -> str:

@@ -78,12 +78,12 @@ def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, 
         for label, entry in entries.items()
         if entry is not None
     ]
-    plots = []
+    tracked = [each for each in flown if each.tracks]
+    plots = [paths_plot(scenario, tracked)] if tracked else []
     if flown and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
         plots.append(arrivals_plot(scenario, flown, results.source))
-    tracked = [each for each in flown if each.tracks]
     if tracked:
-        plots += [paths_plot(scenario, tracked), errors_plot(scenario, tracked)]
+        plots.append(errors_plot(scenario, tracked))
     if any(each.entry.hit_limit is not None for each in flown):
         plots.append(hits_plot(scenario, flown))
     return plots

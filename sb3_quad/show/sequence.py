@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import BoolArray, FloatArray, Image
+from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.drawing.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_tags
 from sb3_quad.drawing.models import span
@@ -18,7 +18,8 @@ SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near it
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
 AREA, RATIOS = 290_000, (0.7, 1.6)  # of a panel: pixels, width by height
 LARGEST = 6.0  # how much larger than life it is drawn at most
-APART = 0.8  # least distance between poses in the picture, in the vehicle's drawn breadth
+APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth: so far away, a flight asks for one more
+NEAR = 0.6  # and with it come those of the other flights at this time that are at least so far from their neighbours
 
 
 class _View(NamedTuple):
@@ -39,16 +40,17 @@ def sequence(
 ) -> Image:
     """One panel for each recording, all seen by the same camera.
 
-    :param times: s, at which poses are drawn; None: as many as do not hide one another.
+    :param times: s, at which poses are drawn; None: as many as do not hide one another, at the same times in all panels.
     :param size: width and height of a panel, its header not counted, pixels; None: in the proportions of the flights.
     :return: uint8 (height, about panels * width, 3).
     """
     ends = [_end(recording) if times is None else recording.at(max(times)) for recording in recordings]
     view = _view(recordings, ends, size)
-    panels = []
-    for recording, end in zip(recordings, ends, strict=True):
-        steps = _apart(recording, end, view) if times is None else sorted({recording.at(seconds) for seconds in times})
-        panels.append(_panel(recording, steps, end, view))
+    if times is None:
+        chosen = _same_times(recordings, ends, view)
+    else:
+        chosen = [sorted({recording.at(seconds) for seconds in times}) for recording in recordings]
+    panels = [_panel(*each, view) for each in zip(recordings, chosen, ends, strict=True)]
     return side_by_side(panels, columns=len(panels))
 
 
@@ -81,20 +83,25 @@ def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
     return width, 2 * round(AREA / width / 2)
 
 
-def _apart(recording: Recording, end: int, view: _View) -> list[int]:
-    """Steps whose poses do not hide one another: each is the first that is clear of those before it."""
-    places, breadth = view.project(recording.state.position[: end + 1])
-
-    def clear_of(steps: Sequence[int], step: int) -> BoolArray:
-        return np.asarray(np.linalg.norm(places[steps] - places[step], axis=1) > APART * breadth[step])
-
-    chosen = [0]
-    for step in range(1, end + 1):
-        if clear_of(chosen, step).all():
-            chosen.append(step)
-    # When it was pushed and how it was lost must be seen: poses that would hide that are left out.
-    for step in (*(push for push in recording.pushes if push <= end), *([end] if recording.lost else [])):
-        chosen = sorted({step, *(each for each in chosen if each == 0 or clear_of([each], step)[0])})
+def _same_times(recordings: Sequence[Recording], ends: Sequence[int], view: _View) -> list[list[int]]:
+    """Steps to be drawn in each panel: one that a flight has room for is drawn in all that it does not hide a pose in."""
+    seen = [view.project(each.state.position[: end + 1]) for each, end in zip(recordings, ends, strict=True)]
+    chosen: list[list[int]] = [[0] for _ in recordings]
+    # When a flight was pushed and how it was lost must be seen.
+    shown = [
+        {*(push for push in each.pushes if push <= end), *([end] if each.lost else [])}
+        for each, end in zip(recordings, ends, strict=True)
+    ]
+    for step in [*sorted(set().union(*shown)), *range(1, max(ends) + 1)]:
+        gaps = {
+            k: float(np.linalg.norm(places[chosen[k]] - places[step], axis=1).min() / breadth[step])
+            for k, (places, breadth) in enumerate(seen)
+            if step <= ends[k]
+        }
+        asked = any(step in steps for steps in shown) or max(gaps.values()) > APART
+        for k, gap in gaps.items():
+            if step in shown[k] or (asked and gap > NEAR):
+                chosen[k] = sorted({*chosen[k], step})
     return chosen
 
 
@@ -114,6 +121,8 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) ->
         lines = [f"{recording.state.distance[end]:.2f} m from its target after {recording.times[end]:.2f} s"]
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
+    arrows = "; arrows: force (red), torque (violet)" if any(recording.wrench[step].any() for step in steps) else ""
+    lines.append(f"green hoops: target{arrows}")
     return with_header(pixels, recording.name, lines, recording.colour, size)
 
 

@@ -60,7 +60,7 @@ class Cost(NamedTuple):
 
 def fresh_cost(metrics: GeometricMetrics) -> float:
     """What gains cost on fresh episodes, with the weights of :class:`Cost`, in seconds."""
-    lost = LOST * (1.0 - metrics.recovery_success)
+    lost = LOST * (1.0 - metrics.recovery_survival)
     return lost + metrics.time_to_0_1_m - TRACKING_REWARD * metrics.tracking_reward
 
 

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from optuna.trial import FrozenTrial
 
 from sb3_quad.base.files import write_bytes, write_text
-from sb3_quad.report.plots import picture, styled
+from sb3_quad.report.plots import legend, picture, styled
 from sb3_quad.tuning.search import ERROR, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import Choice, Interval, current
 
@@ -117,12 +117,15 @@ def write_plot(search: Search) -> None:
             panel.set_xticks(ticks, [f"{float(f'{tick:.2g}'):g}" for tick in ticks])
             panel.minorticks_off()
         elif not isinstance(dimension, Choice):
-            panel.locator_params(axis="x", integer=dimension is None or dimension.whole)
+            whole, (low, high) = dimension is None or dimension.whole, panel.get_xlim()
+            if whole:
+                panel.set_xlim(min(low, high - 1.0), max(high, low + 1.0))  # so that there are whole numbers to be ticks
+            panel.locator_params(axis="x", integer=whole, min_n_ticks=1)
         panel.set_xlabel(name)
     first = panels[0, 0]
     numbers = [trial.number for trial in groups["finished"]]
     first.step(numbers, np.maximum.accumulate(heights["finished"]), where="post", color="C0", alpha=0.5)
-    first.legend(fontsize="small")
+    legend(figure, first)
     for panel in panels[:, 0]:
         panel.set_ylabel(label)
     write_bytes(Path(search.job.log_folder, PLOT), picture(figure, "png", dpi=110))

@@ -13,9 +13,11 @@ The first agent says which vehicle, task and observation all fly with, unless --
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
 
+import argparse
+
 from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, whole
 
-LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects -P --progress"
+LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects"
 DEFAULT_ENV = "QuadTargetTracking-v0"
 
 
@@ -65,3 +67,4 @@ def add_flight_arguments(parser: Parser) -> None:
     add("--size", default="", metavar="WxH", help="size of one controller's panel, pixels")
     add("--speed", type=float, default=1.0, metavar="X", help="playback speed of film and window; 0.5 is slow motion (1)")
     add("--overwrite", action="store_true", help="replace existing files")
+    add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar of a film (in a terminal: yes)")

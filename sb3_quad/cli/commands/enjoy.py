@@ -3,17 +3,18 @@
 import argparse
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from PIL import Image
+from PIL import Image as Pillow
 from rich.console import Console
-from rich.progress import track
 
+from sb3_quad.base.arrays import Image
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.arguments.enjoy import DEFAULT_ENV
+from sb3_quad.cli.output import progress_bar
 from sb3_quad.cli.parser import given
 from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
@@ -44,7 +45,7 @@ def run(options: argparse.Namespace) -> int:
     if options.sequence:
         _write_sequence(options, episodes[0], size)
     if options.record:
-        _write_film(Path(options.record), episodes, size or (PANEL if len(episodes[0]) > 1 else SINGLE), options.speed)
+        _write_film(options, episodes, size or (PANEL if len(episodes[0]) > 1 else SINGLE))
     if window:
         show_in_window(episodes, *(size or SINGLE), options.speed)
     return 0
@@ -145,17 +146,25 @@ def _write_sequence(options: argparse.Namespace, episode: Sequence[Recording], s
     with Console(file=sys.stderr).status("drawing"):
         picture = sequence(episode, options.times, size)
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, format="png", optimize=True)
+    Pillow.fromarray(picture).save(buffer, format="png", optimize=True)
     write_bytes(options.sequence, buffer.getvalue())
     print(f"saved {options.sequence}")
 
 
-def _write_film(path: Path, episodes: Sequence[Sequence[Recording]], size: tuple[int, int], speed: float) -> None:
+def _write_film(options: argparse.Namespace, episodes: Sequence[Sequence[Recording]], size: tuple[int, int]) -> None:
     """Draw flights and write them as a film, with a progress bar; ``size`` of a panel, pixels."""
-    total = sum(len(frame_times(episode, speed)) for episode in episodes)
-    frames = (frame for episode in episodes for frame in film_frames(episode, *size, speed))
-    write_film(path, track(frames, "drawing", total, console=Console(file=sys.stderr), transient=True))
-    print(f"saved {path}, {total / FPS:.1f} s")
+    total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
+
+    def frames() -> Iterator[Image]:
+        show(0, total, "frames")
+        drawn = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
+        for number, frame in enumerate(drawn, 1):
+            yield frame
+            show(number, total, "frames")
+
+    with progress_bar(options.progress) as show:
+        write_film(Path(options.record), frames())
+    print(f"saved {options.record}, {total / FPS:.1f} s")
 
 
 def _print_outcomes(episodes: Sequence[Sequence[Recording]]) -> None:

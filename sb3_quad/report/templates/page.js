@@ -1,6 +1,17 @@
 "use strict";
-(() => {
+(async () => {
   const spaces = JSON.parse(document.getElementById("spaces").textContent);
+  const plots = document.querySelectorAll(".space");
+  try {
+    const packed = Uint8Array.from(atob(document.getElementById("plotly").textContent), (letter) => letter.charCodeAt(0));
+    const stream = new Blob([packed]).stream().pipeThrough(new DecompressionStream("gzip"));
+    const script = document.createElement("script");
+    script.textContent = await new Response(stream).text();
+    document.head.append(script);
+  } catch (error) {
+    plots.forEach((plot) => { plot.textContent = `Flights in space need a newer browser (${error.message}).`; });
+    return;
+  }
   const settings = {
     responsive: true, displaylogo: false, displayModeBar: "hover", scrollZoom: false,
     modeBarButtons: [["toImage"], ["orbitRotation", "pan3d", "zoom3d", "resetCameraDefault3d"]],
@@ -41,7 +52,6 @@
     for (const entry of entries) (entry.isIntersecting ? show : putAway)(entry.target);
   }, { rootMargin: "600px 0px" });
 
-  const plots = document.querySelectorAll(".space");
   plots.forEach((plot) => watcher.observe(plot));
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => plots.forEach((plot) => {
     if (plot.dataset.drawn) { putAway(plot); show(plot); }
