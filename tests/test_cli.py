@@ -16,6 +16,7 @@ import yaml
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
+import sb3_quad
 from sb3_quad.cli import compare, main
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
@@ -148,6 +149,11 @@ def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, set
     assert main(arguments) == 2
     assert message in one_line_of_error(capsys)
     assert not (tmp_path / "logs").exists()
+
+
+def test_the_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"sb3_quad {sb3_quad.__version__}\n"
 
 
 def test_help_has_examples_and_needs_no_torch():

@@ -6,7 +6,7 @@ examples:
   sb3-quad tune-expert -n 2000                           continues the first search, up to 2000 gains in all
   sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
-Ctrl-C writes the best gains so far; the same command continues. Needs pip install 'sb3_quad[tune]'.
+Ctrl-C writes the best gains so far; the same command continues. Needs pip install '.[tune]' from a clone.
 """
 
 import argparse
