@@ -144,6 +144,7 @@ def test_the_extra_for_developers_holds_all_but_rl_zoo3(options):
     extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
     assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", "zoo"))) - {"torch"}
     assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
+    assert all(f"`pip install '.[{name}]'`" in (ROOT / "README.md").read_text(encoding="utf-8") for name in extras)
 
 
 def test_extras_are_installed_from_a_clone(options):
