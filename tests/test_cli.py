@@ -19,6 +19,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.results_plotter import load_results
 
+import sb3_quad
 from sb3_quad.cli import compare, main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.pretrained_policies import agent_path
@@ -165,6 +166,11 @@ def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, set
     assert main(arguments) == 2
     assert message in one_line_of_error(capsys)
     assert not (tmp_path / "logs").exists()
+
+
+def test_the_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"sb3_quad {sb3_quad.__version__}\n"
 
 
 def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():

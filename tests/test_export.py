@@ -224,7 +224,7 @@ def test_a_policy_that_cannot_fly_so_is_refused(make, message):
         (["agent.zip", "--format", "c", "--overwrite", "-o", "agent.zip"], "the model itself"),
         (["agent.zip", "--format", "c", "-o", "b.h", "--name", "1st"], "C identifier"),
         (["agent.zip", "--format", "c", "-o", "b.h", "--output", "speed"], "did you mean 'speeds'"),
-        (["agent.zip", "--format", "onnx"], r"pip install 'sb3_quad\[export\]'"),
+        (["agent.zip", "--format", "onnx"], r"pip install '\.\[export\]'"),
     ],
 )
 def test_bad_input_is_one_line(zips, tmp_path, capsys, monkeypatch, arguments, message):

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+import sb3_quad
+
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
 DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
@@ -136,6 +138,29 @@ def test_each_dependency_is_pinned(options, file):
     pins = [line.split("==")[0] for line in (ROOT / file).read_text().splitlines() if "==" in line]
     assert requirements(wanted) <= set(pins)
     assert len(pins) == len(set(pins))
+
+
+def test_the_extra_for_developers_holds_all_but_rl_zoo3(options):
+    extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
+    assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", "zoo"))) - {"torch"}
+    assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
+    assert all(f"`pip install '.[{name}]'`" in (ROOT / "README.md").read_text(encoding="utf-8") for name in extras)
+
+
+def test_extras_are_installed_from_a_clone(options):
+    """The package is on no index, and zsh wants the brackets quoted."""
+    code = [path for name in CODE for path in (ROOT / name).rglob("*.py")]
+    for path in [ROOT / "README.md", *ROOT.glob("docs/*.md"), *code]:
+        for written in re.findall(r"pip install [^`\n]*\[[^`\n]*", path.read_text(encoding="utf-8")):
+            named = re.match(r"pip install '\.\[(\w+|\{extra\})\]'", written)
+            assert named, f"{path}: {written}"
+            assert named[1] in (*options["options.extras_require"], "{extra}"), f"{path}: {written}"
+
+
+def test_the_version_stands_in_one_place(options, wheel):
+    assert options["metadata"]["version"] == "attr: sb3_quad.__version__"
+    assert wheel.name.split("-")[1] == sb3_quad.__version__
+    assert f"\nversion: {sb3_quad.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 
 def test_what_the_code_imports_is_declared(options):

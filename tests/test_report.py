@@ -347,7 +347,7 @@ def test_without_the_extra_there_is_all_but_the_page(module, folder, tmp_path, m
     assert main(["evaluate", "pid", "--suite", str(suite), "-o", str(output)]) == 0
     printed = capsys.readouterr()
     assert "100.0 (" in printed.out and "results in" in printed.out
-    assert printed.err.count("pip install 'sb3_quad[report]'") == 1 and printed.err.count("\n") == 1
+    assert printed.err.count("pip install '.[report]'") == 1 and printed.err.count("\n") == 1
     assert (output / "results.json").is_file() and (output / "report.md").is_file()
     assert list((output / "figures").glob("*.png")) and not (output / "report.html").exists()
     assert main(["report", str(output)]) == 2

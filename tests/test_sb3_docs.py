@@ -182,6 +182,19 @@ def test_custom_callback(env_id, batched, tmp_path):
 
 
 @one
+def test_record_video(env_id, tmp_path):
+    """By Gymnasium's own wrapper; what it needs comes with the extra [video]."""
+    pytest.importorskip("moviepy")
+    made = gym.make(env_id, render_mode="rgb_array", max_episode_steps=5)
+    env = gym.wrappers.RecordVideo(made, str(tmp_path / "films"), name_prefix="flight")
+    env.reset(seed=0)
+    while not any(env.step(env.action_space.sample())[2:4]):
+        pass
+    env.close()
+    assert (tmp_path / "films" / "flight-episode-0.mp4").stat().st_size > 1000
+
+
+@one
 def test_monitor_files_and_plots(env_id, tmp_path):
     """Monitor writes, the results plotter reads and draws."""
     pytest.importorskip("pandas")

@@ -238,7 +238,7 @@ def test_an_interrupted_video_leaves_what_was_there(tmp_path):
 def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["enjoy", "pid", "--record", str(tmp_path / "film.mp4")]) == 2
-    assert "sb3_quad[video]" in capsys.readouterr().err
+    assert "pip install '.[video]'" in capsys.readouterr().err
 
 
 def test_the_command_draws_and_tells(tmp_path, capsys):
@@ -411,4 +411,4 @@ def test_record_video_names_what_is_wrong(arguments, message, capsys, monkeypatc
 def test_record_video_names_the_packages_it_misses(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     assert main(["record-video", "-i", "agent.zip"]) == 2
-    assert "sb3_quad[video]" in capsys.readouterr().err
+    assert "pip install '.[video]'" in capsys.readouterr().err

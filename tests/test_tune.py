@@ -290,7 +290,7 @@ def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert main(command) == 2
-    assert "pip install 'sb3_quad[tune]'" in one_line_of_error(capsys)
+    assert "pip install '.[tune]'" in one_line_of_error(capsys)
 
 
 @pytest.mark.parametrize(

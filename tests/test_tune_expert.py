@@ -184,7 +184,7 @@ def test_mistakes_are_named(arguments, message, tmp_path, monkeypatch, capsys):
 def test_without_optuna_it_says_what_to_install(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "cmaes", None)
     assert main(["tune-expert", "-o", str(tmp_path / "tuned.yaml"), *SMALL]) == 2
-    assert "pip install 'sb3_quad[tune]'" in capsys.readouterr().err
+    assert "pip install '.[tune]'" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 

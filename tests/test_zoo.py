@@ -257,4 +257,4 @@ def test_without_rl_zoo3_the_bridge_says_what_is_missing(tmp_path):
     given = {**os.environ, "PYTHONPATH": str(ROOT)}
     command = [sys.executable, "-c", code.replace("'sb3_quad.zoo')", "'sb3_quad.zoo', run_name='__main__')")]
     result = subprocess.run(command, cwd=tmp_path, env=given, capture_output=True, text=True, check=False)
-    assert result.returncode != 0 and "pip install 'sb3_quad[zoo]'" in result.stderr
+    assert result.returncode != 0 and "pip install '.[zoo]'" in result.stderr

@@ -36,4 +36,4 @@ def require(module: str, extra: str, what: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise MissingExtra(f"{what} needs {module} ({error}): pip install 'sb3_quad[{extra}]'") from None
+        raise MissingExtra(f"{what} needs {module} ({error}): pip install '.[{extra}]' from a clone of sb3_quad") from None

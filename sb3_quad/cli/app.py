@@ -7,6 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.cli import arguments
 from sb3_quad.cli.parser import Parser
@@ -37,6 +38,7 @@ COMMANDS = {
 def make_parser() -> Parser:
     """The parser of all commands."""
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
+    parser.add_argument("--version", action="version", version=f"sb3_quad {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
     for name, command in COMMANDS.items():
         summary, _, rest = (command.__doc__ or "").partition("\n\n")

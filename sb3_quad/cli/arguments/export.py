@@ -10,7 +10,7 @@ examples:
   sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
 
-ONNX needs onnx and onnxruntime: pip install 'sb3_quad[export]'. A C header needs a C compiler to check it.
+ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. A C header needs a C compiler to check it.
 """
 
 from sb3_quad.cli.parser import Parser

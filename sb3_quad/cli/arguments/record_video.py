@@ -7,7 +7,7 @@ examples:
   sb3-quad record-video --env QuadStateRecovery-v0 -i path/to/agent.zip --stochastic --size 320x240
 
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
-Films need: pip install 'sb3_quad[video]'. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
+Films need: pip install '.[video]' from a clone. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
 """
 
 from sb3_quad.cli.arguments.enjoy import add_flight_arguments

@@ -5,7 +5,7 @@ examples:
   sb3-quad report evaluations/thesis --overwrite      again, after adding controllers
   sb3-quad report evaluations/thesis --no-pictures    only the page, and its tables as report.md
 
-Needs: pip install 'sb3_quad[report]'.
+Needs: pip install '.[report]' from a clone.
 """
 
 import argparse

@@ -9,7 +9,7 @@ examples:
   sb3-quad tune --algo dagger --search-space my_space.yml --hyperparams n_epochs:4
   sb3-quad train --algo dagger --env QuadTargetTracking-v0 --conf-file logs/tune/dagger/QuadTargetTracking-v0_1/best.yml
 
-The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. Needs: pip install 'sb3_quad[tune]'.
+The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. Needs: pip install '.[tune]' from a clone.
 """
 
 from sb3_quad.cli.arguments.train import add_settings

@@ -7,7 +7,7 @@ examples:
   sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
 The first gains stay where those found are no better on fresh episodes.
-Ctrl-C writes the best so far; the same command continues. Needs pip install 'sb3_quad[tune]'.
+Ctrl-C writes the best gains so far; the same command continues. Needs pip install '.[tune]' from a clone.
 """
 
 import argparse
