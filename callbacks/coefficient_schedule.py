@@ -24,7 +24,7 @@ class CoefficientSchedule(BaseCallback):
 
     >>> from sb3_quad import DAgger, PIDExpert
     >>> from sb3_quad.envs import QuadcopterVecEnv
-    >>> env = QuadcopterVecEnv(8, max_episode_steps=50, seed=0)
+    >>> env = QuadcopterVecEnv(8, task_kwargs={"target_distance": 0.05}, max_episode_steps=50, seed=0)
     >>> model = DAgger("MlpPolicy", env, PIDExpert(), n_steps=50, batch_size=100, n_epochs=1, seed=0, device="cpu")
     >>> schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95))
     >>> _ = model.learn(1200, callback=schedule)

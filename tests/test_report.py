@@ -222,7 +222,7 @@ def test_controllers_stand_side_by_side_in_each_cell(folder, parts):
                 for scenario in results.scenarios
                 if [*scenario.cell.values()] == [tilt, rate, 3]
             )
-            assert (bar.get_height() / 0.7) ** 2 == pytest.approx(1 - entry.metrics.success.value)
+            assert (bar.get_height() / 0.7) ** 2 == pytest.approx(1 - entry.metrics.survival.value)
         assert len(bars) == 4
     one, other = (sorted(bar.get_x() for bar in bars) for bars in panels[1].containers)
     assert all(0 < right - left < 0.5 for left, right in zip(one, other, strict=True))

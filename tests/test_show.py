@@ -390,14 +390,14 @@ def test_episodes_side_by_side_have_one_seed_after_the_other():
     ("arguments", "message"),
     [
         ([], "whose flight"),
-        (["--algo", "ppo", "-i", "agent.zip"], "one of both"),
+        (["--algo", "ppo", "-i", "itm-recovery"], "one of both"),
         (["-i", "nowhere.zip"], "nowhere.zip"),
         (["--algo", "ppo", "-f", "nowhere"], "no run"),
         (["--algo", "ppoo"], "did you mean 'ppo'"),
-        (["-i", "agent.zip", "--env", "Pendulum-v1"], "rl_zoo3"),
-        (["-i", "agent.zip", "--speed", "0"], "--speed"),
-        (["-i", "agent.zip", "--env-kwargs", "nois:0"], "nois"),
-        (["-i", "agent.zip", "--size", "big"], "640x480"),
+        (["-i", "itm-recovery", "--env", "Pendulum-v1"], "rl_zoo3"),
+        (["-i", "itm-recovery", "--speed", "0"], "--speed"),
+        (["-i", "itm-recovery", "--env-kwargs", "nois:0"], "nois"),
+        (["-i", "itm-recovery", "--size", "big"], "640x480"),
     ],
 )
 def test_record_video_names_what_is_wrong(arguments, message, capsys, monkeypatch, tmp_path):
@@ -410,5 +410,5 @@ def test_record_video_names_what_is_wrong(arguments, message, capsys, monkeypatc
 
 def test_record_video_names_the_packages_it_misses(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert main(["record-video", "-i", "agent.zip"]) == 2
+    assert main(["record-video", "-i", "itm-recovery"]) == 2
     assert "pip install '.[video]'" in capsys.readouterr().err

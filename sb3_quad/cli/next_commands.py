@@ -7,7 +7,6 @@ from pathlib import Path
 
 from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.runs import RunFolder
 
 
@@ -17,12 +16,11 @@ def print_next(run: RunFolder) -> None:
         return
     algo, number, agent = run.path.parent.name, run.path.name.removeprefix(f"{run.name}_").split("_")[0], str(run.result)
     label = f"{algo}_{run.path.name}"
-    picture = [] if has_display() else ["--no-render", "--sequence", f"{label}.png"]
-    vehicle = str(FlightSettings.beside(agent)[0].vehicle)
+    picture = [] if has_display() else ["-o", f"{label}.png"]
     print("next:")
     for command in (
         ["enjoy", "--algo", algo, "--env", run.name, "-f", str(run.path.parent.parent), "--exp-id", number, *picture],
-        ["evaluate", agent, "--suite", "quick", "--vehicle", vehicle, "-o", f"evaluations/{label}"],
+        ["evaluate", agent, "--suite", "quick", "-o", f"evaluations/{label}"],
         ["export", agent, "--format", "torchscript"],
     ):
         print("  " + shlex.join([*_program(), *command]))
