@@ -44,6 +44,7 @@ class YamlFolder:
     :param suffix: of the files.
     :param in_name: whether the suffix is part of the name, as in ``thesis/dagger.yml``.
     :param folders: further ones inside the package, in the order in which their names are listed.
+    :param former: a folder whose files now lie in the package itself; their former names still find them.
     """
 
     kind: str
@@ -51,6 +52,7 @@ class YamlFolder:
     suffix: str = ".yaml"
     in_name: bool = False
     folders: tuple[str, ...] = ()
+    former: str = ""
 
     def names(self) -> list[str]:
         """The names of the files in the package."""
@@ -72,7 +74,7 @@ class YamlFolder:
         """
         if self.is_path(source):
             return read_text(source), str(source)
-        name, files = str(source), self._files()
+        name, files = str(source).removeprefix(self.former), self._files()
         if name not in files:
             raise ConfigError(f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file")
         return files[name].read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"

@@ -23,7 +23,9 @@ from sb3_quad.settings.values import as_list, check, convert, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
-SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("pid", "thesis"))
+SETTINGS = YamlFolder(
+    "settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("pid", "thesis"), former="geometric/"
+)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
 
