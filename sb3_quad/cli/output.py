@@ -9,7 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-FILE_WIDTH = 140  # columns where the output is no terminal: a table there need not wrap
+FILE_WIDTH = 180  # columns where the output is no terminal: a table there need not wrap
 Show = Callable[[int, "int | None", str], None]
 
 

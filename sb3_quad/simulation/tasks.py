@@ -64,9 +64,8 @@ class Task(Frozen):
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
-SCORED = [
-    name for name in TASK if name.startswith(("max_", "success_")) or name.endswith("_cost")
-]  # what a control step needs
+# What a control step needs:
+SCORED = [name for name in TASK if name.startswith(("max_", "success_")) or name.endswith("_cost")]
 S = first_rows(dict.fromkeys(SCORED, 1))
 
 RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}  # of tasks whose target is their start
