@@ -6,7 +6,7 @@ from typing import Any, Literal
 import pytest
 import torch.nn as nn
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
@@ -81,6 +81,7 @@ def test_nothing_is_evaluated(text):
 
 
 @given(st.text(max_size=30))
+@example("0_")
 def test_any_text_on_the_command_line_is_a_value(text):
     value = parse_value(text)
     assert value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))

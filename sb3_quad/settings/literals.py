@@ -11,7 +11,7 @@ import yaml
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
 
-_NUMBER = re.compile(r"[+-]?(\d[\d_]*\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+(_\d+)*\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _ACTIVATIONS = ("ELU", "GELU", "Hardtanh", "LeakyReLU", "Mish", "ReLU", "ReLU6", "SELU", "Sigmoid", "SiLU", "Softplus", "Tanh")
 _OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
 CLASSES = (*(f"nn.{name}" for name in _ACTIVATIONS), *(f"optim.{name}" for name in _OPTIMIZERS))
