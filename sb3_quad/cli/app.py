@@ -9,6 +9,7 @@ from pathlib import Path
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.trust import trusting
 from sb3_quad.cli import arguments
 from sb3_quad.cli.parser import Parser
 
@@ -64,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if agent is not None and not any(Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds it
             raise ConfigError(f"-i {agent}: no such file")  # at once: what the command imports takes seconds
         command = importlib.import_module(f"sb3_quad.cli.commands.{options.command.replace('-', '_')}")
-        return int(command.run(options))
+        with trusting(getattr(options, "trust", False)):
+            return int(command.run(options))
     except SB3QuadError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 2

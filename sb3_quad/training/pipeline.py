@@ -26,6 +26,7 @@ from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import save_model, write_text
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.experts.models import load_zip
 from sb3_quad.report.curves import read_curve
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
@@ -223,7 +224,7 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[
     agent = run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
     if stage.trim is None:
         return agent
-    model = get_algorithm(job.config.algo).load(agent, device=job.device)
+    model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
     trimmed, words = TRIMS[stage.trim]
     did = trimmed(model, seed_for("trim", job.seed), job.flight_settings)
     save_model(model, run.trimmed_model)

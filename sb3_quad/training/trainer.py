@@ -28,6 +28,7 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import ENVIRONMENT, LastGoodModel, Snapshot, set_random_state
+from sb3_quad.experts.models import load_zip
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
@@ -277,7 +278,7 @@ def _load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attrib
     state = read_arrays(run.resume_state)
     environment = {name.removeprefix(ENVIRONMENT): array for name, array in state.items() if name.startswith(ENVIRONMENT)}
     try:
-        model = get_algorithm(algo).load(run.model, env=env, device=device, force_reset=not environment, **attributes)
+        model = load_zip(get_algorithm(algo), run.model, env=env, device=device, force_reset=not environment, **attributes)
     except ConfigError:
         raise
     except Exception as error:  # what a damaged archive raises depends on where the damage is

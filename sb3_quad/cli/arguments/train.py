@@ -17,7 +17,7 @@ examples:
 
 import argparse
 
-from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, seed, whole
+from sb3_quad.cli.parser import BRIDGE, TRUST, Pairs, Parser, pointers, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
 DEFAULT_PIPELINE = "two_stage.yml"
@@ -55,6 +55,7 @@ def add_settings(parser: Parser) -> None:
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
     add("--n-eval-envs", type=whole, metavar="N", help="environments of an evaluation (batch: one per episode; else 1)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
+    add("--trust", action="store_true", help=TRUST)
     add("--device", help="cpu (default), cuda or auto")
     add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
 
