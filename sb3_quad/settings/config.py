@@ -19,7 +19,7 @@ from sb3_quad.experts.resolve import DEFAULT_EXPERT
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping, parse_number
-from sb3_quad.settings.values import as_list, check, convert, qualified_classes
+from sb3_quad.settings.values import BASES, as_list, check, convert, import_class, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -104,6 +104,13 @@ class TrainingConfig(Frozen):
         for key in value:
             if info.data["env_id"] in ENVIRONMENTS and key not in FlightSettings.model_fields:
                 raise ConfigError(unknown(f"keyword of {info.data['env_id']}", key, FlightSettings.model_fields))
+        return value
+
+    @field_validator(*BASES)
+    @classmethod
+    def _known_classes(cls, value: list[tuple[str, dict[str, Any]]], info: ValidationInfo) -> list[tuple[str, dict[str, Any]]]:
+        for path, _ in value:
+            import_class(path, str(info.field_name))
         return value
 
     @field_validator("eval_tasks")

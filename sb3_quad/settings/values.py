@@ -6,11 +6,17 @@ import pkgutil
 from contextlib import suppress
 from typing import Any
 
+import gymnasium
 from pydantic import ConfigDict, PydanticUserError, TypeAdapter, ValidationError
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
+
+BASES: dict[str, type] = {"callback": BaseCallback, "env_wrapper": gymnasium.Wrapper, "vec_env_wrapper": VecEnvWrapper}
+"""By the key of the settings that names classes, what these must be subclasses of."""
 
 
 def check(kind: Any, value: Any, where: str) -> Any:
@@ -81,12 +87,17 @@ def qualified_classes(value: Any, where: str) -> list[tuple[str, dict[str, Any]]
 def import_class(path: str, where: str) -> Any:
     """The class at ``package.module.Class``.
 
-    :raises ConfigError: a module or a name that is not there.
+    :param where: the key that names it, one of ``BASES``.
+    :raises ConfigError: a module or a name that is not there, or anything but a class of the kind that the key is for.
     """
     try:
-        return pkgutil.resolve_name(path)
+        found = pkgutil.resolve_name(path)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"{where}: {path} cannot be imported ({error})") from None
+    base = BASES[where]
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise ConfigError(f"{where}: {path} is no {base.__name__}; name a subclass of {base.__module__}.{base.__name__}")
+    return found
 
 
 def _takes(kind: Any, value: Any) -> bool:

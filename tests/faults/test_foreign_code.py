@@ -169,3 +169,33 @@ def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
     model.learning_rate = model.lr_schedule = LinearSchedule(1e-3, 0.0, 1.0)
     model.save("agent.zip")
     assert load_zip(algorithm, "agent.zip", device="cpu").lr_schedule(0.5) == 5e-4  # all of it, as for going on
+
+
+@pytest.mark.parametrize(
+    ("key", "entry"),
+    [
+        ("callback", {"os.makedirs": {"name": str(MARK)}}),
+        ("callback", {"gymnasium.Wrapper": {"env": 1}}),
+        ("callback", [{"stable_baselines3.common.callbacks.EventCallback": None}, {"pathlib.Path": {}}]),
+        ("vec_env_wrapper", {"os.makedirs": {"exist_ok": True}}),
+        ("vec_env_wrapper", "builtins.print"),
+        ("env_wrapper", "os.mkdir"),
+    ],
+)
+@pytest.mark.parametrize("way", ["a settings file", "a run folder"])
+def test_settings_call_only_classes_of_the_right_kind(key, entry, way, capsys):
+    environment = "QuadTargetTracking-v0"
+    settings = {"n_timesteps": 400, "n_envs": 2, "n_steps": 100, "vec_env": "dummy", key: entry}
+    if way == "a run folder":
+        shutil.copytree(RUN, "run")
+        file, content = Path(f"run/{environment}/config.yml"), settings
+    else:
+        file, content = Path("foreign.yml"), {environment: settings}
+    file.write_text(json.dumps(content))  # which is YAML, too
+    how = ["--resume", "run"] if way == "a run folder" else ["--conf-file", "foreign.yml", "--algo", "dagger"]
+    assert main(["train", *how]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {file}: {key}: ")
+    assert "name a subclass of" in line
+    assert not MARK.exists()
+    assert not Path("logs").exists()
