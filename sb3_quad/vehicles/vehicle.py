@@ -23,6 +23,7 @@ PARAMETER_NAMES = (
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
 )
+NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 OTHER_LIMITS = {
     "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
     "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
@@ -42,7 +43,9 @@ class Vehicle(Frozen):
 
     other_keys = tuple(OTHER_LIMITS)
 
-    name: str = Field(min_length=1, description="what the vehicle is called")
+    name: str = Field(
+        pattern=NAME, description="what the vehicle is called; up to 100 characters, none of / \\ < > or control"
+    )
     mass: PositiveFloat = Field(description="m, kg")
     inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2"

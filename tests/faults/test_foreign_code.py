@@ -22,6 +22,8 @@ from sb3_quad.cli import main
 from sb3_quad.experts.models import load_model, load_zip
 from sb3_quad.experts.unpickle import unpickle
 from sb3_quad.pretrained_policies import pretrained
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 MARK = Path("foreign_code_ran")
 AGENT = pretrained("itm-imitation")
@@ -199,3 +201,24 @@ def test_settings_call_only_classes_of_the_right_kind(key, entry, way, capsys):
     assert "name a subclass of" in line
     assert not MARK.exists()
     assert not Path("logs").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside", "a/b", "a\\b", "*/ int x; /*", "<script>", "two\nlines", "\x1b[2J", "", "a" * 101]
+)
+def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
+    own = here / "own"
+    own.mkdir()
+    monkeypatch.chdir(own)
+    parameters = load_vehicle("itm").model_dump(mode="json") | {"name": name}
+    Path("foreign.yaml").write_text(json.dumps(parameters))
+    assert main(["tune-expert", "--vehicle", "foreign.yaml", "--trials", "1", "--starts", "60", "--targets", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: foreign.yaml: name: ")
+    with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:
+        data = json.loads(archive.read("data"))
+        data["flight_settings"]["vehicle"]["name"] = name
+        copy.writestr("data", json.dumps(data))
+    with pytest.raises(ConfigError, match=r"foreign\.zip: flight_settings: name: "):
+        FlightSettings.of("foreign.zip")
+    assert sorted(path.name for path in here.rglob("*")) == ["foreign.yaml", "foreign.zip", "own"]
