@@ -1,0 +1,33 @@
+"""Processes that end, or cannot be waited for: no command hangs, none is left behind, and the others go on."""
+
+import os
+import signal
+
+import pytest
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_quad.cli import main
+
+
+class KillLastWorker(BaseCallback):
+    """Kills the last process of the environments, as the kernel does where memory ends, and notes all of them."""
+
+    processes = ()
+
+    def _on_step(self) -> bool:
+        if self.num_timesteps == 42:
+            KillLastWorker.processes = self.training_env.unwrapped.processes
+            os.kill(self.processes[-1].pid, signal.SIGKILL)
+        return True
+
+
+@pytest.mark.timeout(100)
+def test_a_training_whose_worker_dies_ends_saves_and_leaves_none_behind(tmp_path, capsys):
+    (tmp_path / "settings.yml").write_text(
+        "Pendulum-v1: {n_steps: 10, batch_size: 30, n_envs: 3, callback: test_workers.KillLastWorker}"
+    )
+    command = ["train", "--algo", "ppo", "--env", "Pendulum-v1", "--vec-env", "subproc", "-n", "6000", "-f", str(tmp_path)]
+    assert main([*command, "--conf-file", str(tmp_path / "settings.yml"), "--eval-episodes", "0", "--no-progress"]) == 2
+    assert "worker process of the environments ended" in capsys.readouterr().err.splitlines()[-1]
+    assert (tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
+    assert len(KillLastWorker.processes) == 3 and not any(process.is_alive() for process in KillLastWorker.processes)
