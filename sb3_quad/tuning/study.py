@@ -1,5 +1,6 @@
 """Optuna's studies: where they are remembered, what proposes their trials, what cuts them short."""
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -12,7 +13,7 @@ from optuna.exceptions import DuplicatedStudyError
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line
@@ -28,6 +29,7 @@ PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {  # from n_startup_tr
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
+LINE = b'{"op_code":'  # begins every line of a journal
 PATIENCE = 10.0  # s to wait for the process that begins a study to say what it began with
 
 
@@ -50,7 +52,7 @@ def open_study(
     try:
         if storage is not None and "://" not in str(storage):
             Path(storage).parent.mkdir(parents=True, exist_ok=True)
-            opened = JournalStorage(JournalFileBackend(str(opened)))
+            opened = JournalStorage(_Journal(str(opened)))
         try:
             study, new = optuna.create_study(study_name=name, storage=opened, direction=direction), True
         except DuplicatedStudyError:
@@ -67,6 +69,33 @@ def open_study(
         if first is not None:
             study.enqueue_trial(dict(first))
     return study, study.user_attrs.get(attribute)
+
+
+class _Journal(JournalFileBackend):
+    """A journal file whose last line, where a full disk has cut it, is dropped before the next one is appended to it."""
+
+    def __init__(self, path: str) -> None:
+        self._path, self._own_lock = Path(path), JournalFileSymlinkLock(path)
+        super().__init__(path, self._own_lock)
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """As Optuna's.
+
+        :raises ValueError: a file that ends as no journal does.
+        """
+        with self._path.open("rb+") as file:
+            if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_CUR), file.read())[1] != b"\n":
+                self._own_lock.acquire()  # another process may be in the middle of a line
+                try:
+                    file.seek(0)
+                    content = file.read()
+                    whole = content.rfind(b"\n") + 1
+                    if content[whole : whole + len(LINE)] != LINE[: len(content) - whole]:
+                        raise ValueError("its last line is not a journal's")
+                    file.truncate(whole)
+                finally:
+                    self._own_lock.release()
+        super().append_logs(logs)
 
 
 def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:

@@ -1,0 +1,33 @@
+"""Files of a search, an evaluation and a published policy: full disks, interrupts and two processes at once cost nothing."""
+
+import pytest
+from optuna.trial import TrialState
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.tuning.study import open_study
+
+
+def study_in(path):
+    return open_study("search", path, "maximize", ("begun_with", "these"), None)[0]
+
+
+@pytest.mark.parametrize("left", [1, 5, 20, -1])
+def test_a_journal_cut_by_a_full_disk_loses_its_last_line_alone(tmp_path, left):
+    path = tmp_path / "study.log"
+    study = study_in(path)
+    for value in (1.0, 2.0):
+        study.tell(study.ask(), value)
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:-1]) + lines[-1][:left])  # the end of the second trial
+    study_in(path).tell(1, 3.0)
+    study_in(path).tell(study_in(path).ask(), 4.0)
+    assert [trial.value for trial in study_in(path).trials] == [1.0, 3.0, 4.0]
+    assert all(trial.state == TrialState.COMPLETE for trial in study_in(path).trials)
+
+
+def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("remember the milk")
+    with pytest.raises(ConfigError, match="cannot be used"):
+        study_in(path)
+    assert path.read_text() == "remember the milk"
