@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +18,7 @@ import torch
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.files import locked
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
 from sb3_quad.evaluation.fleets import FLEETS
@@ -93,17 +95,13 @@ def evaluate(
     :param report: told in one line of each agent that flies another vehicle than it was trained on, or does not say on which.
     :return: all results in the folder, those of earlier calls included; where nothing has been flown, it is not written.
     :raises ConfigError: an unknown backend; results in the folder of the same names that were flown otherwise; a folder that
-        cannot be written.
+        cannot be written, or that another process is writing to.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
-    place = Path(folder)
-    before = load_results(place) if (place / RESULTS).is_file() else None
-    asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
-    earlier = [] if before is None else before.failures
-    failures = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
+    failures: list[Failure] = []
     loaded: list[tuple[ControllerSpec, ControllerRecord]] = []
     vehicles: dict[str, str] = {}  # by label, where a scenario names none
     for spec in controllers:
@@ -124,20 +122,46 @@ def evaluate(
         each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
         report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
     jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
-    missing = _missing(place, jobs, overwrite)
-    done = len(jobs) - len(missing)
-    try:
-        progress(done, len(jobs), "")
-        for job, outcome in run_jobs(missing, workers):
-            done += 1
-            if isinstance(outcome, Failure):
-                failures.append(outcome)
-            progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
-    finally:  # an interrupt, too, leaves what is done in order
-        results = _collect(place, before, suite, [record for _, record in loaded], failures)
-        if results.entries or before is not None:
-            write_results(place, results)
+    asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
+    with _claimed(Path(folder), bool(jobs)) as place:
+        before = load_results(place) if (place / RESULTS).is_file() else None
+        earlier = [] if before is None else before.failures
+        failures[:0] = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
+        missing = _missing(place, jobs, overwrite)
+        done = len(jobs) - len(missing)
+        try:
+            progress(done, len(jobs), "")
+            for job, outcome in run_jobs(missing, workers):
+                done += 1
+                if isinstance(outcome, Failure):
+                    failures.append(outcome)
+                progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+        finally:  # an interrupt, too, leaves what is done in order
+            results = _collect(place, before, suite, [record for _, record in loaded], failures)
+            if results.entries or before is not None:
+                write_results(place, results)
     return results
+
+
+@contextmanager
+def _claimed(folder: Path, make: bool) -> Iterator[Path]:
+    """A folder for this process alone, made if it is to be written to; one that stays empty is removed again.
+
+    :raises ConfigError: another process has it; it cannot be made.
+    """
+    new = make and not folder.exists()
+    if new:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    try:
+        with locked(folder, "folder") if folder.is_dir() else nullcontext():
+            yield folder
+    finally:
+        if new:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def _missing(folder: Path, jobs: Sequence[Job], overwrite: bool) -> list[Job]:

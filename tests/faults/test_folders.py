@@ -1,9 +1,12 @@
 """Files of a search, an evaluation and a published policy: full disks, interrupts and two processes at once cost nothing."""
 
+import numpy as np
 import pytest
 from optuna.trial import TrialState
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.cli import main
+from sb3_quad.evaluation.folder import load_results
 from sb3_quad.tuning.study import open_study
 
 
@@ -31,3 +34,32 @@ def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
     with pytest.raises(ConfigError, match="cannot be used"):
         study_in(path)
     assert path.read_text() == "remember the milk"
+
+
+SUITE = "name: one\nsource: paper\nscenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]\n"
+codes = []
+
+
+def hover(vehicle):
+    return lambda observation: np.zeros((len(observation), 4))
+
+
+def meanwhile(vehicle):
+    """Another evaluation into the same folder, while this one is under way."""
+    if not codes:
+        codes.append(main(["evaluate", "other=test_folders:hover", "--suite", "suite.yaml", "-o", "out", "--no-report"]))
+    return hover(vehicle)
+
+
+def test_of_two_evaluations_into_a_folder_at_once_neither_loses_its_results(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "suite.yaml").write_text(SUITE)
+    codes.clear()
+    command = ["evaluate", "first=test_folders:meanwhile", "--suite", "suite.yaml", "-o", "out", "--no-report"]
+    codes.append(main(command))
+    there = {entry.controller for entry in load_results("out").entries}
+    assert there == {name for name, code in zip(("other", "first"), codes, strict=True) if code == 0}
+    refused = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(refused) == codes.count(2) and all("another process" in line for line in refused)
+    codes[0] = main(["evaluate", "other=test_folders:hover", *command[2:]])
+    assert codes == [0, 0] and {entry.controller for entry in load_results("out").entries} == {"other", "first"}
