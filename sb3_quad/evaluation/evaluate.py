@@ -4,20 +4,24 @@ import hashlib
 import itertools
 import json
 import multiprocessing
+import os
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from sb3_quad import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
 from sb3_quad.base.files import locked
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
@@ -220,6 +224,8 @@ def run_job(job: Job) -> Entry | Failure:
         limit = find_limit(controller, scenario, job.backend, own)
     except SB3QuadError as error:
         return _failure(label, scenario.name, error)
+    except SystemExit as leaving:
+        return _failure(label, scenario.name, ControllerError(f"ends the program, by sys.exit({leaving.code!r})"))
     entry = Entry(
         controller=label,
         scenario=scenario.name,
@@ -240,25 +246,51 @@ def run_job(job: Job) -> Entry | Failure:
 def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | Failure]]:
     """Do jobs, one after another or by worker processes, and hand out each as it is done.
 
+    A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.
+
     :raises SB3QuadError: a folder that cannot be written.
     """
     if workers <= 1 or len(jobs) <= 1:
         yield from ((job, run_job(job)) for job in jobs)
         return
-    pool = ProcessPoolExecutor(min(workers, len(jobs)), multiprocessing.get_context("spawn"), _begin_worker)
+    context = multiprocessing.get_context("spawn")
+    watched, held = context.Pipe(duplex=False)  # what holds it open is closed below, or ends with this process
+    waiting, idle, at_work = deque(jobs), list[ProcessPoolExecutor](), dict[Future[Any], tuple[Job, ProcessPoolExecutor]]()
     try:
-        waiting = {pool.submit(run_job, job): job for job in jobs}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-    except BrokenProcessPool:
-        raise SB3QuadError("a worker process ended unexpectedly (out of memory?); try --workers 1") from None
+        while waiting or at_work:
+            while waiting and len(at_work) < workers:
+                pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin_worker, (watched,))
+                job = waiting.popleft()
+                at_work[pool.submit(run_job, job)] = job, pool
+            future = wait(at_work, return_when=FIRST_COMPLETED).done.pop()
+            job, pool = at_work.pop(future)
+            try:
+                outcome = future.result()
+                idle.append(pool)
+            except BrokenProcessPool:  # one process a pool, so that the job is known, and no other is lost
+                pool.shutdown()
+                ended = ControllerError("its worker process ended unexpectedly (out of memory?)")
+                outcome = _failure(job.record.label, job.scenario.name, ended)
+            yield job, outcome
     finally:
-        pool.shutdown(cancel_futures=True)
+        for pool in idle:
+            pool.shutdown()
+        held.close()
+        for _, pool in at_work.values():
+            pool.shutdown(cancel_futures=True)
+        watched.close()
 
 
-def _begin_worker() -> None:
+def _begin_worker(watched: Connection) -> None:
     ignore_interrupts()  # the process that started the workers ends them
+    threading.Thread(target=_end_with_evaluation, args=(watched,), daemon=True).start()
     torch.set_num_threads(1)
+
+
+def _end_with_evaluation(watched: Connection) -> None:
+    """End this worker as soon as the evaluation that it works for is left, also by being killed."""
+    watched.poll(None)
+    os._exit(1)
 
 
 def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:
