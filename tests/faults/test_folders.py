@@ -1,11 +1,14 @@
 """Files of a search, an evaluation and a published policy: full disks, interrupts and two processes at once cost nothing."""
 
+import errno
+
 import numpy as np
 import pytest
 from optuna.trial import TrialState
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
+from sb3_quad.cli.commands import publish
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.tuning.study import open_study
 
@@ -63,3 +66,22 @@ def test_of_two_evaluations_into_a_folder_at_once_neither_loses_its_results(tmp_
     assert len(refused) == codes.count(2) and all("another process" in line for line in refused)
     codes[0] = main(["evaluate", "other=test_folders:hover", *command[2:]])
     assert codes == [0, 0] and {entry.controller for entry in load_results("out").entries} == {"other", "first"}
+
+
+def interrupted(*arguments, **settings):
+    raise KeyboardInterrupt
+
+
+def disk_full(*arguments, **settings):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(("fault", "code"), [(interrupted, 130), (disk_full, 2)])
+def test_publish_replaces_both_the_zip_and_its_card_or_neither(tmp_path, monkeypatch, fault, code):
+    command = ["--name", "mine", "-o", str(tmp_path), "--episodes", "1"]
+    assert main(["publish", "itm-imitation", *command]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(before) == 2
+    monkeypatch.setattr(publish, "measure" if code == 130 else "write_card", fault)
+    assert main(["publish", "itm-recovery", *command, "--overwrite"]) == code
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
