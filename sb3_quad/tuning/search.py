@@ -5,11 +5,12 @@ import json
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from optuna import Trial
-from optuna.exceptions import OptunaError
+from optuna.exceptions import OptunaError, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
@@ -19,7 +20,7 @@ from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace, current
-from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, open_study
+from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, dead_trials, open_study, owned
 
 BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
@@ -86,6 +87,7 @@ class Search:
         failures = 0
         try:
             for number in range(n_trials):
+                self._free_dead_trials()
                 if signals.received is not None or len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                     break
                 trial = ask(self.study, self.sampler, self.job.seed, self.n_startup_trials)
@@ -109,13 +111,24 @@ class Search:
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
     def _train(self, trial: Trial) -> None:
-        """Train as a trial says, and tell the study how it ended. One that is interrupted will be tried again."""
+        """Train as a trial says, and tell the study how it ended."""
         state, value, error = "FAIL", None, INTERRUPTED
         try:
-            state, value = self._outcome(trial)
+            with owned(trial):
+                state, value = self._outcome(trial)
         except Exception as failure:  # whatever a choice of settings leads to, the next one may fare better
             error = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
         finally:
+            self._tell(trial, state, value, error)
+
+    def _free_dead_trials(self) -> None:
+        """Have the trials of processes that were killed tried again."""
+        for dead in dead_trials(self.study):
+            self._tell(Trial(self.study, dead._trial_id), "FAIL", None, INTERRUPTED)
+
+    def _tell(self, trial: Trial, state: str, value: float | None, error: str) -> None:
+        """Tell the study how a trial ended, unless one that took this process for dead did; if interrupted, try it again."""
+        with suppress(UpdateFinishedTrialError):
             if state == "FAIL":
                 trial.set_user_attr(ERROR, error)
             self.study.tell(trial, value, state=TrialState[state])

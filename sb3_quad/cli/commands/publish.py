@@ -1,10 +1,12 @@
 """``publish``: a trained policy as a small zip for stock PPO, with a card that says what it can and where it comes from."""
 
 import argparse
+from contextlib import ExitStack
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_text, refuse_existing, write_bytes, write_text
+from sb3_quad.base.files import read_text, refuse_existing, replacing
+from sb3_quad.base.signals import StopSignals
 from sb3_quad.experts.models import load_model, saved_algorithm, saved_data
 from sb3_quad.export.policy import slim_bytes
 from sb3_quad.report.card import measure, write_card
@@ -29,14 +31,17 @@ def run(options: argparse.Namespace) -> int:
         facts["vehicle"] = f"{UNKNOWN}; measured on `{settings.vehicle}`"
     if settings.observation_mean is not None or settings.observation_std is not None:
         facts["observation"] = "scaled by a mean and std of its own, in the zip's `flight_settings`"
-    write_bytes(zip_file, content)
     how = {"noise": settings.noise, **settings.in_any_task(), "vehicle": load_vehicle(settings.vehicle)}
-    rows = measure(load_model(zip_file), options.episodes, **how)
-    card = write_card(options.name, rows, options.made_by or command, facts, {**how, "vehicle": how["vehicle"].name})
-    write_text(card_file, card)
+    with ExitStack() as last, replacing(zip_file) as zip_stream, replacing(card_file) as card_stream:
+        zip_stream.write(content)
+        zip_stream.flush()
+        rows = measure(load_model(zip_stream.name), options.episodes, **how)
+        card = write_card(options.name, rows, options.made_by or command, facts, {**how, "vehicle": how["vehicle"].name})
+        card_stream.write(card.encode("utf-8"))
+        signals = last.enter_context(StopSignals())  # nothing comes between replacing the one and the other
     print(card)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
-    return 0
+    return signals.exit_code
 
 
 def _origin(model: Path) -> tuple[str, dict[str, str]]:
