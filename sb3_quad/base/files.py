@@ -1,17 +1,21 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
+import fcntl
 import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 
 
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write beside ``path`` and move the finished file there, so that a reader never meets half of it.
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A stream to a file beside ``path`` that is moved there when it is finished, so that a reader never meets half of it.
 
     :raises ConfigError: a folder that cannot be written, a full disk; whatever ``path`` held is still there.
     """
@@ -21,7 +25,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         file.parent.mkdir(parents=True, exist_ok=True)
         try:
             with beside.open("wb") as stream:
-                stream.write(content)
+                yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(beside, file)
@@ -31,6 +35,36 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file by :func:`replacing`."""
+    with replacing(path) as stream:
+        stream.write(content)
+
+
+@contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """Keep a folder to this process, and remove what a killed one has left half-written in it.
+
+    The lock ends with the process, however that ends, and leaves no file. A file system without locks grants every one.
+
+    :param what: the folder in an error message.
+    :raises ConfigError: another process has it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{what} {folder}: another process is training it; wait until that ends") from None
+        except OSError:  # no locks here
+            pass
+        for half in folder.glob(".*.tmp"):
+            half.unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """As :func:`write_bytes`, of text in UTF-8."""
     write_bytes(path, text.encode("utf-8"))
@@ -38,9 +72,8 @@ def write_text(path: str | Path, text: str) -> None:
 
 def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> None:
     """As :func:`write_bytes`, of NumPy arrays as ``.npz``."""
-    buffer = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
-    write_bytes(path, buffer.getvalue())
+    with replacing(path) as stream:
+        (np.savez_compressed if compressed else np.savez)(stream, **arrays)
 
 
 def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:

@@ -145,7 +145,9 @@ class Search:
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
                 # Never due with the last timestep: that evaluation follows the last update.
-                self.job.model_copy(update={"config": config, "eval_freq": total // count + 1 if count > 1 else -1}),
+                self.job.model_copy(
+                    update={"config": config, "eval_freq": total // count + 1 if count > 1 else -1, "snapshot_every": 0}
+                ),
                 report=lambda line: None,
                 on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 should_continue=should_continue,
