@@ -9,7 +9,7 @@ import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.experts.controller import Controller
@@ -55,7 +55,8 @@ class BestModel(EveryTimesteps):
     :param expert: as DAgger takes it; it flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
         is then the model's mean reward minus the expert's.
     :param should_continue: is asked after each evaluation, with its success rate and mean reward; False ends the training.
-    :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read.
+    :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read or
+        flew another number of episodes.
     :raises ExpertError: at the first evaluation, an expert that does not fit the environment.
     :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's Monitor.
     """
@@ -93,6 +94,9 @@ class BestModel(EveryTimesteps):
             if path.is_file():
                 arrays = read_arrays(path)
                 self._rows[group] = {key: list(arrays[key]) for key in KEYS}
+                flown = arrays["results"].shape[-1]
+                if flown != self._n_episodes:
+                    raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")
         rows = self._rows["eval"]
         self._start = time.perf_counter() - (rows["seconds"] or [0.0])[-1]
         self.best = max(map(_score, rows["successes"], rows["results"]), default=self.best)

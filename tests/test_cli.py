@@ -362,7 +362,7 @@ def test_only_interrupted_runs_resume(tmp_path, capsys):
     assert f"-i {result.run.model}" in one_line_of_error(capsys)
 
 
-@pytest.mark.parametrize("name", ["model", "resume_state", "dataset", "config"])
+@pytest.mark.parametrize("name", ["resume_state", "config"])
 def test_damaged_run_folders_are_refused(tmp_path, capsys, name):
     Interrupt.sent = False
     run = train(job(tmp_path, callback={"test_cli.Interrupt": {"after": 500}}), report=lambda line: None).run

@@ -26,6 +26,7 @@ exit codes:
   0    done
   1    some controllers of an evaluation failed (one line each on stderr), or a vehicle cannot hover
   2    bad input, or a training that cannot continue: one line on stderr says what
+  129  the terminal was closed (SIGHUP), after saving
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """

@@ -1,5 +1,6 @@
 """Loading a saved SB3 model without being told which algorithm made it."""
 
+import io
 import json
 import zipfile
 from pathlib import Path
@@ -27,13 +28,13 @@ _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}  # for those others that cannot be None
 
 
-def saved_data(path: str | Path) -> dict[str, Any]:
+def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
     """The attributes of the model in an SB3 ``.zip`` as its JSON has them; those that are pickled there stay so.
 
     :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
     """
-    file = Path(path)
-    if not file.is_file():
+    file = path if isinstance(path, io.BytesIO) else Path(path)
+    if isinstance(file, Path) and not file.is_file():
         raise ConfigError(f"model {file}: " + ("no run with an agent in this folder" if file.is_dir() else "no such file"))
     try:
         with zipfile.ZipFile(file) as archive:
@@ -62,7 +63,7 @@ def saved_algorithm(path: str | Path) -> str:
     return "DDPG" if _FAMILIES[module] == "TD3" and data.get("policy_delay") == 1 else _FAMILIES[module]
 
 
-def load_zip(algorithm: type[Algorithm], path: str | Path, to_fly: bool = False, **kwargs: Any) -> Algorithm:
+def load_zip(algorithm: type[Algorithm], path: str | Path | io.BytesIO, to_fly: bool = False, **kwargs: Any) -> Algorithm:
     """``algorithm.load(path, **kwargs)``, in which no code of the file's own runs, unless :func:`trusted`.
 
     PyTorch reads the weights with ``weights_only``; what is pickled beside them is read by :func:`unpickle`.

@@ -143,6 +143,7 @@ class Search:
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
         rollout = int(current(config.algo, config.hyperparams, "n_steps")) * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
+        every = total // count + 1 if count > 1 else -1  # never due with the last timestep: that one follows the last update
         evaluations: list[tuple[float, float]] = []
 
         def value() -> float:
@@ -157,8 +158,7 @@ class Search:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
-                # Never due with the last timestep: that evaluation follows the last update.
-                self.job.model_copy(update={"config": config, "eval_freq": total // count + 1 if count > 1 else -1}),
+                self.job.model_copy(update={"config": config, "eval_freq": every, "snapshot_every": 0}),
                 report=lambda line: None,
                 on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 should_continue=should_continue,
