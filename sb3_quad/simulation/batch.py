@@ -11,7 +11,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, whole_number
 from sb3_quad.simulation.engine.random import new_streams
-from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, StepArrays, step_arrays
+from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, compilation_notice, run
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.state import STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
@@ -19,8 +19,8 @@ from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-_MODE = (JOB.names or ()).index("mode")
 _MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns", "limits")  # all that future flight depends on
+_NOT_COPIED = ("_bound", "_jobs")  # addresses
 
 
 class BatchKeywords(TypedDict, total=False):
@@ -122,7 +122,7 @@ class QuadcopterBatch:
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
         arrays = step_arrays(self.n, array)
-        if not run(self._job_numbers, self.threads, arrays):
+        if not run(self._jobs[FLY], self.threads, arrays):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
         return arrays.observations, arrays.rewards, arrays.dones
@@ -143,9 +143,7 @@ class QuadcopterBatch:
         arrays = step_arrays(self.n)
         if resetting is not None:
             arrays.dones[resetting] = True
-        self._job_numbers[_MODE] = mode
-        run(self._job_numbers, self.threads, arrays)
-        self._job_numbers[_MODE] = FLY
+        run(self._jobs[mode], self.threads, arrays)
         return arrays
 
     def rows(self, rows: Rows) -> IntArray:
@@ -171,13 +169,17 @@ class QuadcopterBatch:
 
         :raises ConfigError: the snapshot is of other environments.
         """
+        other = sorted(set(snapshot) - set(_MEMORY))
+        try:
+            if other:
+                raise ConfigError(f"{other[0]}: not part of it")
+            check_arrays({**self._bound, **snapshot}, self._sizes)
+        except ConfigError as error:
+            raise ConfigError(
+                f"the saved state of the environments does not fit these ({error}); use the run's own settings"
+            ) from None
         for name, array in snapshot.items():
-            current = getattr(self, name, None)
-            if name not in _MEMORY or current is None or current.shape != array.shape:
-                raise ConfigError(
-                    f"the saved state of the environments does not fit these ({name}); use the run's own settings"
-                )
-            current[...] = array
+            getattr(self, name)[...] = array
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
         """Move targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
@@ -225,9 +227,8 @@ class QuadcopterBatch:
 
     def set_max_episode_steps(self, steps: int) -> None:
         """Control steps after which an episode is truncated, for all rows from the next step on."""
-        self.max_episode_steps = whole_number("max_episode_steps", steps)
-        self.limits[:] = self.max_episode_steps
-        self._bind()
+        most = whole_number("max_episode_steps", steps)
+        self._bind(max_episode_steps=most, limits=np.full(self.n, most, dtype=np.int64))
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
         """Set the task of all episodes that begin from now on; episodes under way end as they began.
@@ -239,46 +240,49 @@ class QuadcopterBatch:
                 "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
             )
         new = resolve_tasks(task, task_kwargs)
-        self.task, self.task_kwargs = task, dict(task_kwargs or {})
         used, index = np.unique(self.task_index, return_inverse=True)
         parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
         # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
         weights = np.concatenate([np.zeros(used.size), new.weights])
-        self.task_index[:] = index
-        self.tasks = TaskTable(parameters, weights)
-        self._bind()
+        table = TaskTable(parameters, weights)
+        self._bind(task=task, task_kwargs=dict(task_kwargs or {}), tasks=table, task_index=index.astype(np.int64))
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
         """The columns of noise level and scaling to write for some rows, which are set apart unless one serves all."""
         if self.mean.shape[1] < self.n:
             if rows is None and one_for_all:
                 return np.zeros(1, dtype=np.int64)
-            self.noise_level = np.repeat(self.noise_level, self.n)
-            self.mean, self.std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-            self._bind()
+            mean, std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
+            self._bind(noise_level=np.repeat(self.noise_level, self.n), mean=mean, std=std)
         return self.rows(rows)
 
-    def _bind(self) -> None:
-        """Write down for the compiled step where all arrays are; again whenever one is replaced."""
-        first = self.vehicle_list[0]
-        table = {"task_parameters": self.tasks.parameters, "task_weights": self.tasks.weights}
-        self._bound = {name: table[name] if name in table else getattr(self, name) for name in ARRAYS}
+    def _bind(self, **replaced: Any) -> None:
+        """Replace attributes, and write down for the compiled step where all arrays are: all of it at once, or nothing."""
+        values = {**vars(self), **replaced}
+        first, table = values["vehicle_list"][0], values["tasks"]
+        bound = {"task_parameters": table.parameters, "task_weights": table.weights}
+        bound = {name: bound[name] if name in bound else values[name] for name in ARRAYS}
         sizes = {
             "n": self.n,
             "delay": first.delay,
             "substeps": first.substeps,
             "physics_step": first.physics_step,
-            "max_steps": self.max_episode_steps,
-            "tasks": self.tasks.weights.size,
-            "vehicle_columns": self.vehicles.shape[1],
-            "scaling_columns": self.mean.shape[1],
-            "mode": FLY,
+            "max_steps": values["max_episode_steps"],
+            "tasks": table.weights.size,
+            "vehicle_columns": values["vehicles"].shape[1],
+            "scaling_columns": values["mean"].shape[1],
             "autoreset": self.autoreset,
         }
-        self.job = np.zeros(1, dtype=JOB)
-        self._job_numbers = self.job.view(np.int64)
-        for name, value in {**sizes, **{f"{name}_at": array.ctypes.data for name, array in self._bound.items()}}.items():
-            self.job[name] = value
+        vars(self).update(replaced, _bound=bound, _sizes=sizes, _jobs=new_jobs(bound, sizes))
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle is made of: arrays of its own."""
+        values = {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
+        return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._bind()
 
 
 def _vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
