@@ -216,13 +216,14 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         batch, wrenches = self.batch, self._wrenches
         step = self.vehicle.physics_step
-        kind = rotor_wrenches(batch.state, batch.queue, array, batch.wrench, batch.vehicles, step, wrenches)
-        if kind == NOT_FINITE:
-            raise ValueError(f"action {array.tolist()}: every number must be finite")
-        world = np.stack([self.wrench[FORCE_WORLD], self.wrench[TORQUE_WORLD]]) if kind == WORLD_FRAME_TOO else None
-        self._body.fly(wrenches, world)
-        self._body.read(batch.state)
-        observations, _, _ = batch.score()
+        with batch.lock:
+            kind = rotor_wrenches(batch.state, batch.queue, array, batch.wrench, batch.vehicles, step, wrenches)
+            if kind == NOT_FINITE:
+                raise ValueError(f"action {array.tolist()}: every number must be finite")
+            world = np.stack([self.wrench[FORCE_WORLD], self.wrench[TORQUE_WORLD]]) if kind == WORLD_FRAME_TOO else None
+            self._body.fly(wrenches, world)
+            self._body.read(batch.state)
+            observations, _, _ = batch.score()
         if self.render_mode == "human":
             self._draw()
         info = self._info()

@@ -74,7 +74,7 @@ def test_a_copy_outlives_the_original():
     assert_same(expected, fly(other))
 
 
-@pytest.mark.parametrize("duplicate", [copy.deepcopy, copy.copy, unpickled, elsewhere])
+@pytest.mark.parametrize("duplicate", [copy.deepcopy, unpickled, elsewhere])
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 def test_a_copy_of_a_pybullet_environment_has_a_simulation_of_its_own(duplicate, render_mode):
     """The original and its copy agree to the bit, which poses that PyBullet gives and takes would not."""
@@ -108,7 +108,7 @@ def test_copies_draw_the_same_picture():
 def test_a_closed_environment_is_copied():
     env = QuadcopterEnv()
     env.close()
-    other = copy.deepcopy(env)
+    other = copy.copy(env)
     assert other.reset(seed=0)[0] in other.observation_space
     other.close()
 

@@ -5,6 +5,7 @@ each distance between two rows, needs no test for overlap, and vectorises the lo
 """
 
 import contextlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -72,3 +73,7 @@ def atomic_get(typing_context: Any, array: Any, index: Any) -> Any:
         return builder.load_atomic(builder.gep(data, [args[1]]), "seq_cst", 8, typ=ir.IntType(64))
 
     return types.int64(array, types.int64), codegen
+
+
+give_way = types.ExternalFunction("SwitchToThread" if sys.platform == "win32" else "sched_yield", types.int32())
+"""Let another thread have this core; the operating system's, found by its name wherever the code was compiled."""

@@ -24,7 +24,7 @@ from sb3_quad.simulation.engine.block import (
     store_observations,
     store_state,
 )
-from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, pointer
+from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
 from sb3_quad.simulation.engine.physics import fly_block
 from sb3_quad.simulation.engine.random import STEP
 from sb3_quad.simulation.episodes import start_episode
@@ -79,9 +79,14 @@ STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
 _ADDRESSES = tuple(f"{name}_at" for name in (*ARRAYS, *STEP_ARRAYS))
 JOB = np.dtype([("physics_step", "f8"), *((name, "i8") for name in SIZES + _ADDRESSES)])
 
-# The control array, each number on a cache line of its own; from AWAKE on: whether worker k is looking for blocks.
+# The control array, each number on a cache line of its own. Taken: whether a job is under way. From AWAKE on: whether worker k
+# is looking for blocks.
 LINE = 16
-LEFT, DONE, NOW, SERIAL, AWAKE = (LINE * k for k in first_rows(dict.fromkeys(("left", "done", "job", "serial", "awake"), 1)))
+_CONTROL = first_rows(dict.fromkeys(("left", "done", "job", "serial", "taken", "awake"), 1))
+LEFT, DONE, NOW, SERIAL, TAKEN, AWAKE = (LINE * k for k in _CONTROL)
+NOT_FINITE, BUSY, LATE, IN_TIME = range(4)
+"""What came of a job: nothing, since an action is not finite, or since another job is under way; or all is done, late if the
+last block kept the thread that brought the job waiting."""
 
 
 class StepArrays(NamedTuple):
@@ -227,16 +232,21 @@ def work(control, worker, patience, job, actions, observations, rewards, dones):
 
     :param control: int64, see this module's constants; shared by all threads.
     :param worker: number of a worker thread, which returns after ``patience`` looks without a block; -1 for the thread that
-        brings the job, which returns when the job is done or after ``patience`` looks at a block that a worker still has.
+        brings the job, which returns when the job is done: no interrupt, which Python sees to between two calls, leaves a
+        worker with a block. After ``patience`` looks at a block that a worker still has, it lets that have the core.
     :param job: of the dtype ``JOB``, (1,), viewed as int64, which numba tells apart sooner; unused by workers, as are the
         :class:`StepArrays`.
-    :return: whether all is done; -1 if an action is not finite, and then nothing has been done.
+    :return: ``NOT_FINITE``, ``BUSY``, ``LATE`` or ``IN_TIME``.
     """
     memory = np.empty(MEMORY, np.uint8)
     blocks = int64(0)
-    if worker < 0:
+    if worker >= 0:
+        atomic_set(control, AWAKE + LINE * worker, 1)
+    else:
         if not _finite(actions):
-            return -1
+            return NOT_FINITE
+        if atomic_set(control, TAKEN, 1) == 1:
+            return BUSY
         own = carray(pointer(job.ctypes.data), 1, JOB)[0]
         own.actions_at, own.observations_at = actions.ctypes.data, observations.ctypes.data
         own.rewards_at, own.dones_at = rewards.ctypes.data, dones.ctypes.data
@@ -259,12 +269,15 @@ def work(control, worker, patience, job, actions, observations, rewards, dones):
                 atomic_add(control, DONE, 1)
                 idle = 0
         elif worker < 0 and atomic_get(control, DONE) == blocks:
-            return 1
+            atomic_set(control, TAKEN, 0)
+            return LATE if idle > patience else IN_TIME
         idle += 1
         if idle > patience:
-            if worker >= 0:
-                atomic_set(control, AWAKE + LINE * worker, 0)
-                if atomic_get(control, LEFT) > 0 and atomic_set(control, AWAKE + LINE * worker, 1) == 0:
-                    idle = 0
-                    continue
-            return 0
+            if worker < 0:
+                give_way()
+                continue
+            atomic_set(control, AWAKE + LINE * worker, 0)
+            if atomic_get(control, LEFT) <= 0:
+                return IN_TIME
+            atomic_set(control, AWAKE + LINE * worker, 1)
+            idle = 0
