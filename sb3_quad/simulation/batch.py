@@ -19,7 +19,6 @@ from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 _MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns", "limits")  # all that future flight depends on
-_NOT_COPIED = ("lock", "_bound", "_jobs")  # locks and addresses are a batch's own
 
 
 class BatchKeywords(TypedDict, total=False):
@@ -50,6 +49,10 @@ class QuadcopterBatch:
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
     """
+
+    _bound: Arrays
+    _sizes: dict[str, float]
+    _jobs: list[IntArray]
 
     def __init__(
         self,
@@ -288,7 +291,7 @@ class QuadcopterBatch:
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle is made of: arrays of its own."""
         with self.lock:
-            values = {name: value for name, value in vars(self).items() if name not in _NOT_COPIED}
+            values = {name: value for name, value in vars(self).items() if name not in ("lock", "_bound", "_jobs")}
             return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

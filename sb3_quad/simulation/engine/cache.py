@@ -52,11 +52,11 @@ class _TemporaryLocator(UserProvidedCacheLocator):
         return found
 
 
-class _Implementation(CompileResultCacheImpl):  # type: ignore[misc]
+class _Implementation(CompileResultCacheImpl):
     _locator_classes = (*CompileResultCacheImpl._locator_classes, _TemporaryLocator)
 
 
-class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]
+class _CheckedFile(IndexDataCacheFile):
     """Index and code, each with a digest at its end; what is damaged counts as missing, and is made and written anew."""
 
     def _dump(self, obj: Any) -> bytes:
@@ -79,7 +79,7 @@ class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]
         return None
 
 
-class Cache(FunctionCache):  # type: ignore[misc]
+class Cache(FunctionCache):
     """Numba's cache of a function, which is new whenever ``stamp`` is.
 
     :raises RuntimeError: no folder can be written.
