@@ -9,6 +9,8 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 
+MAX_TEXT = 2**26  # characters of a text that is read whole
+
 
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write beside ``path`` and move the finished file there, so that a reader never meets half of it.
@@ -58,14 +60,18 @@ def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
 def read_text(path: str | Path) -> str:
     """The text of a file.
 
-    :raises ConfigError: it is missing or cannot be read.
+    :raises ConfigError: it is missing, cannot be read, or has no end in sight, as ``/dev/zero``.
     """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(MAX_TEXT + 1)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # ValueError: no UTF-8, or no path
         raise ConfigError(f"{path}: cannot be read ({error})") from None
+    if len(text) > MAX_TEXT:
+        raise ConfigError(f"{path}: has more than {MAX_TEXT:,} characters")
+    return text
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:

@@ -100,6 +100,8 @@ def evaluate(
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
     place = Path(folder)
+    if place.is_file():
+        raise ConfigError(f"{place}: is a file; the results need a folder, give another with -o")
     before = load_results(place) if (place / RESULTS).is_file() else None
     asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
     earlier = [] if before is None else before.failures

@@ -53,6 +53,9 @@ class Task(Frozen):
     def _nearest_first(self) -> "Task":
         if self.nearest_target is not None and self.nearest_target > self.target_distance:
             raise ValueError(f"nearest_target {self.nearest_target} exceeds target_distance {self.target_distance}")
+        if self.target_distance > self.max_distance:
+            beyond = f"target_distance {self.target_distance:g} exceeds max_distance {self.max_distance:g}"
+            raise ValueError(f"{beyond}: every episode would end at once")
         return self
 
     def parameters(self) -> FloatArray:

@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import one_line, read_arrays, save_model, write_arrays, write_bytes
+from sb3_quad.base.memory import check_memory
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
@@ -28,16 +30,18 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import ENVIRONMENT, LastGoodModel, Snapshot, set_random_state
+from sb3_quad.experts.controller import Controller
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
-from sb3_quad.settings.values import import_class
+from sb3_quad.settings.values import instance
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 
+ROLLOUT_COLUMNS = 6  # of a rollout buffer, float32 each, beside observations and actions
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 EvalEnvs = dict[str | None, VecEnv]
@@ -79,10 +83,11 @@ def train(
         model = build_model(job, env)
         if job.trained_agent is not None:
             transfer_policy(job.trained_agent, model)
+        callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
         run.write_yaml(config.settings, job.arguments() | made_with())
         on_start(run)
-        return _learn(job, run, model, eval_envs, signals, report, should_continue)
+        return _learn(job, run, model, eval_envs, callbacks, signals, report, should_continue)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -104,7 +109,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
         model = _load_snapshot(run, config.algo, env, job.device, **attributes)
         env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
-        return _learn(job, run, model, eval_envs, signals, report)
+        return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
 
 
 def check_tensorboard(job: TrainingJob) -> None:
@@ -150,12 +155,21 @@ def _expert(config: TrainingConfig) -> dict[str, Any]:
     return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
 
 
+def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
+    """Those that the settings name."""
+    return [instance(path, "callback", **kwargs) for path, kwargs in config.callback]
+
+
 def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
     """The algorithm of a job, new.
 
-    :raises ConfigError: settings that it refuses.
+    :raises ConfigError: settings that it refuses, or for which this machine has too little memory.
+    :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
+    numbers = sum(int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space)) + ROLLOUT_COLUMNS
+    n_steps = config.keyword("n_steps")
+    check_memory(f"n_steps {n_steps:,} by n_envs {env.num_envs:,}", 4.0 * numbers * n_steps * env.num_envs)
     keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
@@ -166,6 +180,8 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
+    if keywords.get("expert") is not None:
+        Controller.for_env(model.expert, env).labels(env.reset())  # type: ignore[attr-defined]  # says now what it cannot
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
         rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
@@ -178,6 +194,7 @@ def _learn(
     run: RunFolder,
     model: OnPolicyAlgorithm,
     eval_envs: EvalEnvs,
+    own_callbacks: list[BaseCallback],
     signals: StopSignals,
     report: Report,
     should_continue: ShouldContinue = lambda success, reward: True,
@@ -202,7 +219,7 @@ def _learn(
         callbacks.append(best)
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
-    callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
+    callbacks += own_callbacks
     if job.progress:
         callbacks.append(ProgressBar())
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
