@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.memory import check_memory
 
 MAX_TEXT = 2**26  # characters of a text that is read whole
 
@@ -48,11 +49,14 @@ def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> N
 def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
     """The arrays of an ``.npz`` file whose names begin with ``prefix``; the others are not even read.
 
-    :raises ConfigError: a missing or damaged file.
+    :raises ConfigError: a missing or damaged file, or one that unpacks to more than the memory.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
+            check_memory(str(path), sum(entry.file_size for entry in file.zip.infolist()))
             return {name: file[name] for name in file.files if name.startswith(prefix)}
+    except ConfigError:
+        raise
     except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
 

@@ -180,8 +180,10 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
-    if keywords.get("expert") is not None:
-        Controller.for_env(model.expert, env).labels(env.reset())  # type: ignore[attr-defined]  # says now what it cannot
+    asked: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
+    if asked():  # an expert that fails does so before there is a run folder
+        observation: Any = env.reset()
+        Controller.for_env(keywords["expert"], env).labels(observation)
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
         rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
@@ -260,7 +262,10 @@ def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, 
     snapshot = last_good.snapshot
     if snapshot is None:
         return
-    write_bytes(run.model, snapshot.model)
+    try:
+        write_bytes(run.model, snapshot.model)
+    except ConfigError as second:  # the disk is full for both; what failed first is what counts
+        raise type(error)(f"{error}; nor could the model be saved: {second}") from error
     where = f"the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
         raise type(error)(f"{error}; {where}") from error
