@@ -26,7 +26,7 @@ EPILOG = """examples:
 exit codes:
   0    done
   1    some controllers of an evaluation failed (one line each on stderr), or a vehicle cannot hover
-  2    bad input, or a training that cannot continue: one line on stderr says what
+  2    bad input, a training that cannot continue, or any other error: one line on stderr says what
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """
