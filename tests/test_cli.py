@@ -98,7 +98,7 @@ def one_line_of_error(capsys) -> str:
         (["train", "--algo", "dagger", "-n", "many"], "no whole number"),
         (["train", "--algo", "dagger", "--hyperparams", "n_setps:3"], "did you mean 'n_steps'"),
         (["train", "--algo", "dagger", "--hyperparams", "n_steps"], "key:value"),
-        (["train", "--algo", "dagger", "--hyperparams", "batch_size:0"], "batch_size 0"),
+        (["train", "--algo", "dagger", "--hyperparams", "batch_size:0"], "batch_size is 0"),
         (["train", "--algo", "dagger", "--env-kwargs", "noise:-1"], "noise -1"),
         (["train", "--algo", "dagger", "--env-kwargs", "vehicle:itn"], "did you mean 'itm'"),
         (["train", "--algo", "dagger", "--env-kwargs", "task_kwargs:{'target_distanse':3}"], "did you mean 'target_distance'"),

@@ -1,7 +1,10 @@
 """Ctrl-C, SIGTERM and SIGHUP as a request to stop, answered where the training can be left cleanly."""
 
+import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -55,6 +58,26 @@ class StopSignals:
         self._patience -= 1
         if self._patience == -1:
             raise KeyboardInterrupt
+
+
+@contextmanager
+def interrupts_leave() -> Iterator[None]:
+    """Within the block, Ctrl-C ends the program at once, with exit code 130: for imports.
+
+    A KeyboardInterrupt there comes out of some compiled modules as an ImportError, or not at all.
+    """
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        os.write(2, b"interrupted\n")
+        os._exit(130)
+
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGINT, leave) if main else None
+    try:
+        yield
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, before)
 
 
 def ignore_interrupts() -> None:

@@ -47,8 +47,8 @@ def pointers(flags: str, where: str) -> dict[str, str]:
 def whole(text: str) -> int:
     """A whole number, also as ``1e6``."""
     number = parse_number(text)
-    if isinstance(number, str) or number != int(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number")
+    if isinstance(number, str) or not abs(number) < 2**63 or number != int(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number below 2**63")
     return int(number)
 
 

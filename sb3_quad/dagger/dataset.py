@@ -10,6 +10,7 @@ import torch as th
 from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays
+from sb3_quad.base.memory import check_memory
 
 
 class AggregatedDataset:
@@ -19,12 +20,15 @@ class AggregatedDataset:
     :param observation_shape: shape of one observation
     :param action_dim: length of one action
     :param dtype: of the observations; actions are float32
+    :raises ConfigError: more than this machine's memory holds
     """
 
     def __init__(
         self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike = np.float32
     ) -> None:
         self.capacity = capacity
+        size = int(np.prod(observation_shape)) * np.dtype(dtype).itemsize + action_dim * 4
+        check_memory(f"dataset_capacity {capacity:,}", capacity * size)
         # np.empty takes no memory before it is written to, so a large capacity costs what is in use.
         self._observations = th.from_numpy(np.empty((capacity, *observation_shape), dtype=dtype))
         self._actions = th.from_numpy(np.empty((capacity, action_dim), dtype=np.float32))

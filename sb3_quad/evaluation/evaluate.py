@@ -105,6 +105,8 @@ def evaluate(
         raise ConfigError(unknown("backend", backend, FLEETS))
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
+    if Path(folder).is_file():
+        raise ConfigError(f"{folder}: is a file; the results need a folder, give another with -o")
     failures: list[Failure] = []
     loaded: list[tuple[ControllerSpec, ControllerRecord]] = []
     vehicles: dict[str, str] = {}  # by label, where a scenario names none

@@ -7,9 +7,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import stable_baselines3
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.memory import check_unpacked
 from sb3_quad.base.trust import trusted
 from sb3_quad.experts.unpickle import unpickle
 
@@ -31,15 +33,18 @@ _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}  # for t
 def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
     """The attributes of the model in an SB3 ``.zip`` as its JSON has them; those that are pickled there stay so.
 
-    :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a zip bomb.
     """
     file = path if isinstance(path, io.BytesIO) else Path(path)
     if isinstance(file, Path) and not file.is_file():
         raise ConfigError(f"model {file}: " + ("no run with an agent in this folder" if file.is_dir() else "no such file"))
     try:
+        check_unpacked(file)
         with zipfile.ZipFile(file) as archive:
             return dict(json.loads(archive.read("data")))
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except ConfigError:
+        raise
+    except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
 
 
@@ -82,14 +87,18 @@ def load_zip(algorithm: type[Algorithm], path: str | Path | io.BytesIO, to_fly: 
 def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     """The model in an SB3 ``.zip``, of any algorithm of Stable-Baselines3 (and of this package), ready for ``predict``.
 
-    :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown family, or a file that may
-        run code of its own.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown family, or with parameters
+        that are not finite; a file that may run code of its own.
     """
     algorithm = saved_algorithm(path)
     stock: type[BaseAlgorithm] = getattr(stable_baselines3, "PPO" if algorithm in _OURS.values() else algorithm)
     try:
-        return load_zip(stock, path, to_fly=True, device=device)
+        model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
     except ConfigError:
         raise
     except Exception as error:  # a zip whose parts do not fit raises whatever its unpickling raises
         raise ConfigError(f"model {path}: cannot be loaded ({type(error).__name__}: {error})") from None
+    broken = [name for name, tensor in model.policy.state_dict().items() if not th.isfinite(tensor).all()]
+    if broken:
+        raise ConfigError(f"model {path}: {broken[0]} is not finite; no policy flies by that")
+    return model

@@ -18,6 +18,7 @@ from sb3_quad.simulation.state import STATE_SIZE, TARGET, WRENCH_SIZE, Quadcopte
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
+MAX_ROWS = 2**20
 _MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns", "limits")  # all that future flight depends on
 
 
@@ -36,7 +37,7 @@ class BatchKeywords(TypedDict, total=False):
 class QuadcopterBatch:
     """n quadcopters, each in an episode of its own; arrays in, arrays out.
 
-    :param n_envs: number of rows, at least 1.
+    :param n_envs: number of rows, from 1 to 2^20.
     :param task: name, :class:`~sb3_quad.simulation.tasks.Task`, or mixture ``{name: weight}`` sampled from at each reset.
     :param task_kwargs: fields of the task to override.
     :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of ``n_envs`` of them whose time
@@ -68,8 +69,8 @@ class QuadcopterBatch:
         n_threads: int | None = None,
         autoreset: bool = True,
     ) -> None:
-        n = self.n = whole_number("n_envs", n_envs)
-        self.max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
+        n = self.n = whole_number("n_envs", n_envs, most=MAX_ROWS)
+        self.max_episode_steps = whole_number("max_episode_steps", max_episode_steps, most=2**62)
         self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads)
         self.autoreset = autoreset
         one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)

@@ -16,7 +16,7 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.settings.config import TrainingConfig
-from sb3_quad.settings.values import import_class
+from sb3_quad.settings.values import instance
 
 
 class _Dummy(RowSeeds, DummyVecEnv):
@@ -90,7 +90,7 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
     except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(f"{config.env_id}: cannot be made with env_kwargs {config.env_kwargs} ({error})") from error
     for path, kwargs in config.vec_env_wrapper:
-        env = import_class(path, "vec_env_wrapper")(env, **kwargs)
+        env = instance(path, "vec_env_wrapper", env, **kwargs)
     return env
 
 
@@ -103,7 +103,7 @@ def _make_one(
     limit = (made.spec and made.spec.max_episode_steps) or 0
     env: gymnasium.Env[Any, Any] = Monitor(_FirstEpisode(made, limit - row * limit // n_envs) if row and limit else made)
     for path, wrapper_kwargs in wrappers:
-        env = import_class(path, "env_wrapper")(env, **wrapper_kwargs)
+        env = instance(path, "env_wrapper", env, **wrapper_kwargs)
     return env
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, one_line, save_model, write_bytes
+from sb3_quad.base.memory import check_memory
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
@@ -28,10 +30,11 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import LastGoodModel
+from sb3_quad.experts.controller import Controller
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
-from sb3_quad.settings.values import import_class
+from sb3_quad.settings.values import instance
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
@@ -39,6 +42,7 @@ from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
 
+ROLLOUT_COLUMNS = 6  # of a rollout buffer, float32 each, beside observations and actions
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 EvalEnvs = dict[str | None, VecEnv]
@@ -78,11 +82,12 @@ def train(
     check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
+        callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
         with locked(run.path, "run folder"):
             run.write_yaml(config.settings, job.arguments() | made_with())
             on_start(run)
-            return _learn(job, run, model, eval_envs, signals, report, should_continue)
+            return _learn(job, run, model, eval_envs, callbacks, signals, report, should_continue)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -110,7 +115,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             model = load_snapshot(run, config.algo, env, job.device, **attributes)
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
-        return _learn(job, run, model, eval_envs, signals, report)
+        return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
 
 
 def check_tensorboard(job: TrainingJob) -> None:
@@ -156,12 +161,21 @@ def _expert(config: TrainingConfig) -> dict[str, Any]:
     return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
 
 
+def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
+    """Those that the settings name."""
+    return [instance(path, "callback", **kwargs) for path, kwargs in config.callback]
+
+
 def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
     """The algorithm of a job, new, with the policy that it starts from.
 
-    :raises ConfigError: settings that it refuses, or an agent that does not fit.
+    :raises ConfigError: settings that it refuses, or for which this machine has too little memory; an agent that does not fit.
+    :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
+    numbers = sum(int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space)) + ROLLOUT_COLUMNS
+    n_steps = config.keyword("n_steps")
+    check_memory(f"n_steps {n_steps:,} by n_envs {env.num_envs:,}", 4.0 * numbers * n_steps * env.num_envs)
     keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
@@ -172,6 +186,10 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
+    asked: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
+    if asked():  # an expert that fails does so before there is a run folder
+        observation: Any = env.reset()
+        Controller.for_env(keywords["expert"], env).labels(observation)
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
         rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
@@ -186,6 +204,7 @@ def _learn(
     run: RunFolder,
     model: OnPolicyAlgorithm,
     eval_envs: EvalEnvs,
+    own_callbacks: list[BaseCallback],
     signals: StopSignals,
     report: Report,
     should_continue: ShouldContinue = lambda success, reward: True,
@@ -210,7 +229,7 @@ def _learn(
         callbacks.append(best)
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
-    callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
+    callbacks += own_callbacks
     if job.progress:
         callbacks.append(ProgressBar())
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
@@ -255,7 +274,10 @@ def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, 
     snapshot = last_good.snapshot
     if snapshot is None:
         return
-    write_bytes(run.model, snapshot.model)
+    try:
+        write_bytes(run.model, snapshot.model)
+    except ConfigError as second:  # the disk is full for both; what failed first is what counts
+        raise type(error)(f"{error}; nor could the model be saved: {second}") from error
     where = f"the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
         raise type(error)(f"{error}; {where}") from error
