@@ -56,6 +56,7 @@ def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
         ("elsewhere", 2**30, LEASE - 10.0, False),
         ("elsewhere", os.getpid(), LEASE + 1.0, True),
     ],
+    ids=("this process", "no process", "elsewhere, heard of", "elsewhere, silent"),  # the same in every worker
 )
 def test_trials_are_dead_without_a_process_or_a_sign_of_life(tmp_path, machine, process, silent, dead):
     study = study_in(tmp_path / "study.log")
