@@ -175,6 +175,14 @@ def test_a_hit_is_bracketed():
     assert find_limit(PIDExpert(), none).factor is None
 
 
+def test_a_search_may_fly_more_than_the_scenario():
+    side_hit = load_suite("thesis").scenario("side_hit").model_copy(update={"episodes": 2, "duration": 4.0})
+    search = side_hit.hit_search.model_copy(update={"episodes": 5, "largest": 1.0, "resolution": 0.5})
+    limit = find_limit(PIDExpert(), side_hit.model_copy(update={"hit_search": search}))
+    assert {trial.survived.n for trial in limit.trials} == {5}
+    assert side_hit.episode_seeds(5)[:2] == side_hit.episode_seeds()
+
+
 @pytest.mark.parametrize(
     ("controller", "message"),
     [

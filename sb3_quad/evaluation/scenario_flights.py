@@ -75,7 +75,7 @@ def find_limit(
     search = scenario.hit_search
     if search is None:
         return None
-    seeds = scenario.episode_seeds()[: search.episodes]
+    seeds = scenario.episode_seeds(search.episodes)
     tried: dict[float, Estimate] = {}
     low, high = 0.0, search.largest
     grid = np.linspace(low, high, FIRST_GRID + 1)

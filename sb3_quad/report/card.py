@@ -55,9 +55,8 @@ def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Metrics]
     rows = {RECOVERY: summarise(Flights.concatenate(parts))}
     for distance in DISTANCES:
         task = {"target_distance": distance}
-        flown = fly(
-            policy, "target_tracking", n_episodes, seed_for("card", int(1000 * distance)), task_kwargs=task, **settings
-        )
+        seed = seed_for("card", int(1000 * distance))
+        flown = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
         rows[f"targets {distance:.0f} m away"] = summarise(flown)
     return rows
 

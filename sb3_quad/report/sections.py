@@ -47,7 +47,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     """
     colours = colours_of([record.label for record in results.controllers])
     groups = scenario_groups(results)
-    shares = [_share_table(row, results, groups, colours, f"{row.heading}") for row in (SUCCESS, SURVIVAL)]
+    shares = [_share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)]
     parts = [Section("overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows])]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""

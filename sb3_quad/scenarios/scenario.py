@@ -138,9 +138,9 @@ class Scenario(Frozen):
         except ValidationError as error:
             raise ValueError(f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})") from None
 
-    def episode_seeds(self) -> list[int]:
-        """The seed of each episode, for ``reset(seed=…)`` of one environment."""
-        return row_seeds(seed_for("suite", self.seed), self.episodes)
+    def episode_seeds(self, n: int | None = None) -> list[int]:
+        """The seeds of the first n episodes, for ``reset(seed=…)`` of one environment; None: of those that are judged."""
+        return row_seeds(seed_for("suite", self.seed), self.episodes if n is None else n)
 
     @property
     def heading(self) -> str:

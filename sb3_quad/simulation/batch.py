@@ -142,7 +142,7 @@ class QuadcopterBatch:
         chosen = self.rows(rows)
         self.outcome[chosen] = 0
         self.outcome["truncated"][chosen] = True
-        self.outcome["distance"][chosen] = self.true_state().distance[chosen]
+        self.outcome["distance"][chosen] = QuadcopterState(self.state[:, chosen]).distance
 
     def _run(self, mode: int, resetting: IntArray | None = None) -> StepArrays:
         arrays = step_arrays(self.n)
