@@ -226,8 +226,6 @@ def run_job(job: Job) -> Entry | Failure:
         limit = find_limit(controller, scenario, job.backend, own)
     except SB3QuadError as error:
         return _failure(label, scenario.name, error)
-    except SystemExit as leaving:
-        return _failure(label, scenario.name, ControllerError(f"ends the program, by sys.exit({leaving.code!r})"))
     entry = Entry(
         controller=label,
         scenario=scenario.name,

@@ -82,7 +82,7 @@ def test_evaluations_that_would_never_end_say_why(tmp_path, capsys):
 def test_a_controller_that_ends_its_process_is_a_failure_and_the_others_fly(tmp_path, monkeypatch, capsys, workers):
     monkeypatch.chdir(tmp_path)
     Path("suite.yaml").write_text(SUITE)
-    bad = {"exits": "by sys.exit(0)"} | ({"crashes": "worker process ended"} if workers > 1 else {})
+    bad = {"exits": "failed with SystemExit: 0"} | ({"crashes": "worker process ended"} if workers > 1 else {})
     names = [f"{name}=test_workers:{name}" for name in (*bad, "hover")]
     command = ["evaluate", *names, "also=test_workers:hover", "--suite", "suite.yaml", "-o", "out", "--no-report"]
     assert main([*command, "--workers", str(workers)]) == 1
