@@ -15,9 +15,11 @@ def trusted() -> bool:
 @contextmanager
 def trusting(asked: bool) -> Iterator[None]:
     """Within the block all files are trusted, if that is ``asked`` for or was so before."""
-    before = os.environ.get(VARIABLE, "0")
-    os.environ[VARIABLE] = "1" if asked else before
+    before = os.environ.get(VARIABLE, "")
+    if asked:
+        os.environ[VARIABLE] = "1"
     try:
         yield
     finally:
-        os.environ[VARIABLE] = before
+        if asked:
+            os.environ[VARIABLE] = before

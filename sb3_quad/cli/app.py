@@ -56,8 +56,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # lines appear at once, also in a pipe
-    parser = make_parser()
     try:
+        parser = make_parser()
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise ConfigError(unknown("command", given[0], COMMANDS))
         try:

@@ -1,6 +1,7 @@
 """Argument parsing with one-line errors, and the kinds of arguments rl-zoo has."""
 
 import argparse
+import math
 import random
 from collections.abc import Mapping
 from typing import Any, NoReturn
@@ -68,6 +69,14 @@ def seed(text: str) -> int:
     """A whole number; a negative one asks for a random one."""
     number = whole(text)
     return number if number >= 0 else random.SystemRandom().randrange(2**31)
+
+
+def above_zero(text: str) -> float:
+    """A finite number above 0."""
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0, and finite")
+    return number
 
 
 class Pairs(argparse.Action):

@@ -1,8 +1,10 @@
 """``publish``: a trained policy as a small zip for stock PPO, with a card that says what it can and where it comes from."""
 
 import argparse
+import html
 from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
@@ -44,6 +46,11 @@ def run(options: argparse.Namespace) -> int:
     return signals.exit_code
 
 
+def _plain(text: Any) -> str:
+    """One line that ends no code span or fence of the card, whatever a run folder says."""
+    return " ".join(str(text).split()).replace("`", "'")
+
+
 def _origin(model: Path) -> tuple[str, dict[str, str]]:
     """The command that trained an agent, and further facts; what neither its zip nor its run folder says is UNKNOWN."""
     timesteps = saved_data(model)["num_timesteps"]
@@ -54,12 +61,12 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
     run = open_run(folder)
     settings, arguments = run.read_yaml()
     if run.command.is_file():
-        command = read_text(run.command).strip()
+        command = _plain(read_text(run.command))
     start = arguments.get("trained_agent")
-    facts["algorithm"] = f"`{arguments.get('algo', saved_algorithm(model))}`, {timesteps:,} timesteps"
+    facts["algorithm"] = f"`{_plain(arguments.get('algo', saved_algorithm(model)))}`, {timesteps:,} timesteps"
     if start:
-        facts["algorithm"] += f" from `{Path(start).name}`"
-    facts["environment"] = f"`{arguments.get('env', run.name)}`"
+        facts["algorithm"] += f" from `{_plain(Path(start).name)}`"
+    facts["environment"] = f"`{_plain(arguments.get('env', run.name))}`"
     if settings.get("expert"):
-        facts["expert"] = f"`{settings['expert']}`"
-    return command, facts | {name: str(arguments.get(name, UNKNOWN)) for name in ("seed", *MADE_WITH)}
+        facts["expert"] = f"`{_plain(settings['expert'])}`"
+    return command, facts | {name: html.escape(_plain(arguments.get(name, UNKNOWN))) for name in ("seed", *MADE_WITH)}
