@@ -20,9 +20,11 @@ MAX_TEXT = 2**26  # characters of a text that is read whole
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
     """A stream to a file beside ``path`` that is moved there when it is finished, so that a reader never meets half of it.
 
-    :raises ConfigError: a folder that cannot be written, a full disk; whatever ``path`` held is still there.
+    :raises ConfigError: no name of a file, a folder that cannot be written, a full disk; what ``path`` held is still there.
     """
     file = Path(path)
+    if not file.name:
+        raise ConfigError(f"{str(path)!r}: names no file")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
