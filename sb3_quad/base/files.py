@@ -23,8 +23,8 @@ def replacing(path: str | Path) -> Iterator[BinaryIO]:
     :raises ConfigError: no name of a file, a folder that cannot be written, a full disk; what ``path`` held is still there.
     """
     file = Path(path)
-    if not file.name:
-        raise ConfigError(f"{str(path)!r}: names no file")
+    if not file.name or (file.exists() and not file.is_file()):  # a device, as /dev/null, would be replaced, too
+        raise ConfigError(f"{str(path)!r}: names no file that can be written")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)

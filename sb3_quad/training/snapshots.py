@@ -84,14 +84,14 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         raise ConfigError(f"{path}: not a snapshot")
     in_one_file = "model" in state  # version 0.1 wrote three
     environment, dataset = _part(state, ENVIRONMENT), _part(state, DATASET)
-    source = io.BytesIO(state["model"].tobytes()) if in_one_file else run.model
+    source, place = (io.BytesIO(state["model"].tobytes()), path) if in_one_file else (run.model, run.model)
     try:
         keywords = {"env": env, "device": device, "force_reset": not environment, **attributes}
         model: Any = load_zip(get_algorithm(algo), source, **keywords)
     except ConfigError as error:
-        raise ConfigError(str(error).replace(str(source), str(path))) from None
+        raise ConfigError(str(error).replace(str(source), str(place))) from None
     except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(f"{path if in_one_file else run.model}: not a complete SB3 zip ({one_line(error)})") from None
+        raise ConfigError(f"{place}: not a complete SB3 zip ({one_line(error)})") from None
     if model.num_timesteps != int(state["timesteps"]):
         raise ConfigError(
             f"run folder {run.path}: {run.model.name} is after {model.num_timesteps:,} timesteps, "

@@ -36,7 +36,7 @@ SECONDS, MEMORY = 60.0, 3 * 2**30  # bytes; the imports take half a GB
 OUTSIDE = "../escaped"
 TEXTS = [  # as arguments; values that are only large are those of the corpus
     *("", " ", "-1", "0", "nan", "inf", "1e400", "1e-400", "0x10", "1,2", "a:b", "a:b:c", "[[", "{a: b}", "(1, 2)", "lin_x"),
-    *("/dev/zero", "/dev/null", ".", "no/such/file", "x" * 5000, "\udcff", "ü<b>", "None", "os.system", "os:system"),
+    *(".", "no/such/file", "x" * 5000, "\udcff", "ü<b>", "None", "os.system", "os:system"),
     *("!!python/object/apply:os.system ['touch escaped']", "__import__('os').system('touch escaped')", "-", "--", "a=b=c"),
 ]
 VALUES: list[Any] = [  # in YAML
