@@ -58,6 +58,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(line_buffering=True)  # lines appear at once, also in a pipe
     try:
         parser = make_parser()
+        if any("\ud800" <= letter <= "\udfff" for letter in "".join(given)):  # how Python shows bytes that are no text
+            raise ConfigError(f"arguments {' '.join(given)!r}: not valid UTF-8")
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise ConfigError(unknown("command", given[0], COMMANDS))
         try:
