@@ -13,6 +13,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import MlpExtractor
 from torch.nn import functional as F
 
+from sb3_quad import networks
+
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
@@ -74,15 +76,13 @@ def l2_loss(policy: ActorCriticPolicy) -> th.Tensor:
 def actor_mean(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
     """Mean of the policy's Gaussian, (b, a), by the actor alone; ``evaluate_actions`` would run the critic too."""
     features = BasePolicy.extract_features(policy, observations, policy.pi_features_extractor)
-    mean: th.Tensor = policy.action_net(_latent(policy, "actor", features))
-    return mean
+    return _through(policy, "actor", features)
 
 
 def critic_values(policy: ActorCriticPolicy, observations: th.Tensor) -> th.Tensor:
     """``policy.predict_values``, (b,)."""
     features = BasePolicy.extract_features(policy, observations, policy.vf_features_extractor)
-    values: th.Tensor = policy.value_net(_latent(policy, "critic", features))
-    return values.flatten()
+    return _through(policy, "critic", features).flatten()
 
 
 def evaluate_actions(
@@ -95,36 +95,32 @@ def evaluate_actions(
     """
     features: Any = policy.extract_features(observations)
     for_actor, for_critic = (features, features) if policy.share_features_extractor else features
-    latent_pi, latent_vf = _latent(policy, "actor", for_actor), _latent(policy, "critic", for_critic)
-    values = policy.value_net(latent_vf).flatten()
+    values = _through(policy, "critic", for_critic).flatten()
     if type(policy.action_dist) is DiagGaussianDistribution:
-        mean, log_std = policy.action_net(latent_pi), policy.log_std
+        mean, log_std = _through(policy, "actor", for_actor), policy.log_std
         return values, -gaussian_nll(mean, log_std, actions), gaussian_entropy(log_std), mean
-    distribution = policy._get_action_dist_from_latent(latent_pi)
+    distribution = policy._get_action_dist_from_latent(policy.mlp_extractor.forward_actor(for_actor))
     return values, distribution.log_prob(actions), distribution.entropy(), distribution.mode()
 
 
-def _latent(policy: ActorCriticPolicy, part: str, features: th.Tensor) -> th.Tensor:
-    """Input of the last layer of the ``actor`` or the ``critic``, (b, latent_dim)."""
+def is_compiled(policy: ActorCriticPolicy) -> bool:
+    """Whether actor and critic are perceptrons that :mod:`sb3_quad.networks` computes."""
+    return all(networks.fits(_modules(policy, part)) for part in ("actor", "critic"))
+
+
+def _modules(policy: ActorCriticPolicy, part: str) -> list[th.nn.Module]:
+    """The layers of the ``actor`` or the ``critic`` behind the features; none where they are not a sequence."""
     extractor: Any = policy.mlp_extractor
     if type(extractor) is not MlpExtractor:
-        return extractor.forward_actor(features) if part == "actor" else extractor.forward_critic(features)  # type: ignore[no-any-return]
-    for layer in extractor.policy_net if part == "actor" else extractor.value_net:
-        features = _Tanh.apply(features) if type(layer) is th.nn.Tanh else layer(features)  # type: ignore[no-untyped-call]
-    return features
+        return []
+    return [*extractor.policy_net, policy.action_net] if part == "actor" else [*extractor.value_net, policy.value_net]
 
 
-class _Tanh(th.autograd.Function):
-    """tanh(x) = 2 σ(2x) - 1. PyTorch's CPU code computes σ three to four times as fast as tanh; they agree to 1e-7."""
-
-    @staticmethod
-    def forward(ctx: Any, x: th.Tensor) -> th.Tensor:
-        y = th.sigmoid(x + x).mul_(2.0).sub_(1.0)
-        ctx.save_for_backward(y)
-        return y
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: th.Tensor) -> th.Tensor:
-        (y,) = ctx.saved_tensors
-        result: th.Tensor = th.ops.aten.tanh_backward(gradients[0], y)
-        return result
+def _through(policy: ActorCriticPolicy, part: str, features: th.Tensor) -> th.Tensor:
+    """The output of the ``actor`` or the ``critic``, (b, outputs)."""
+    modules, extractor = _modules(policy, part), policy.mlp_extractor
+    if networks.fits(modules) and features.dtype == th.float32 and not features.requires_grad:
+        return networks.apply(modules, features)
+    if part == "actor":
+        return policy.action_net(extractor.forward_actor(features))  # type: ignore[no-any-return]
+    return policy.value_net(extractor.forward_critic(features))  # type: ignore[no-any-return]

@@ -20,7 +20,7 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_quad import common
+from sb3_quad import common, networks
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
@@ -374,9 +374,10 @@ class DAgger(OnPolicyAlgorithm):
         self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
-        )
+        with networks.shared_out(common.is_compiled(self.policy)):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+            )
 
     def save_dataset(self, path: str | Path) -> None:
         """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad import common
+from sb3_quad import common, networks
 from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
@@ -306,9 +306,10 @@ class PPOBC(PPO):
         """As ``PPO.learn``; see the class for what it raises."""
         if self.will_clone():
             self._check_cloning()
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
-        )
+        with networks.shared_out(common.is_compiled(self.policy)):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+            )
 
 
 class ExpertRolloutBuffer(RolloutBuffer):

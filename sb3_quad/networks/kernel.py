@@ -1,0 +1,203 @@
+"""Multilayer perceptrons, forward and backward, compiled: blocks of rows go through all layers while they are in the cache.
+
+A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop; widths
+are padded to multiples of 4 with zeros. The parameters of a layer lie behind one another: weights (outputs, inputs), biases.
+"""
+
+import numpy as np
+from numba import carray, float32
+
+from sb3_quad.simulation.engine.lowlevel import atomic_add, atomic_get, compiled, give_way, pointer
+
+ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
+TILE = 16  # inputs at once: their rows stay in the first cache
+LINEAR, TANH, RELU = range(3)
+LEFT, DONE, CONTROL = 0, 16, 32  # places, each on a cache line of its own, and size of the control array
+PATIENCE = 20_000  # looks at a block that another thread still has, before that is let have the core
+_FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
+_END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
+
+
+@compiled(fastmath=_FAST)
+def _multiply(w, x, h):
+    """h = w x; w (rows, columns), x (columns, ROWS), h (rows, ROWS)."""
+    for tile in range(0, w.shape[1], TILE):
+        for j in range(0, w.shape[0], 2):
+            for k in range(tile, min(w.shape[1], tile + TILE), 4):
+                a0, a1, a2, a3 = w[j, k], w[j, k + 1], w[j, k + 2], w[j, k + 3]
+                b0, b1, b2, b3 = w[j + 1, k], w[j + 1, k + 1], w[j + 1, k + 2], w[j + 1, k + 3]
+                if k == 0:
+                    for i in range(ROWS):
+                        x0, x1, x2, x3 = x[k, i], x[k + 1, i], x[k + 2, i], x[k + 3, i]
+                        h[j, i] = a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                        h[j + 1, i] = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                else:
+                    for i in range(ROWS):
+                        x0, x1, x2, x3 = x[k, i], x[k + 1, i], x[k + 2, i], x[k + 3, i]
+                        h[j, i] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
+                        h[j + 1, i] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+
+
+@compiled(fastmath=_FAST)
+def _add_products(g, x, dw):
+    """dw += g xᵀ; g (rows, ROWS), x (columns, ROWS), dw (rows, columns)."""
+    for tile in range(0, dw.shape[1], TILE):
+        for j in range(0, dw.shape[0], 2):
+            for k in range(tile, min(dw.shape[1], tile + TILE), 4):
+                a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = float32(0.0)
+                for i in range(ROWS):
+                    x0, x1, x2, x3, g0, g1 = x[k, i], x[k + 1, i], x[k + 2, i], x[k + 3, i], g[j, i], g[j + 1, i]
+                    a0 += g0 * x0
+                    a1 += g0 * x1
+                    a2 += g0 * x2
+                    a3 += g0 * x3
+                    b0 += g1 * x0
+                    b1 += g1 * x1
+                    b2 += g1 * x2
+                    b3 += g1 * x3
+                for row, sums in ((j, (a0, a1, a2, a3)), (j + 1, (b0, b1, b2, b3))):
+                    dw[row, k] += sums[0]
+                    dw[row, k + 1] += sums[1]
+                    dw[row, k + 2] += sums[2]
+                    dw[row, k + 3] += sums[3]
+
+
+@compiled(fastmath=_FAST)
+def _activate(h, bias, kind):
+    """h = f(h + bias), (rows, ROWS). tanh is the quotient of polynomials that Eigen uses, exact to 4e-7."""
+    for j in range(h.shape[0]):
+        b = bias[j]
+        if kind == TANH:
+            for i in range(ROWS):
+                x = h[j, i] + b
+                u = min(max(x, -_END), _END)
+                s = u * u
+                p = float32(-2.76076847742355e-16) * s + float32(2.00018790482477e-13)
+                p = p * s + float32(-8.60467152213735e-11)
+                p = p * s + float32(5.12229709037114e-08)
+                p = p * s + float32(1.48572235717979e-05)
+                p = p * s + float32(6.37261928875436e-04)
+                p = p * s + float32(4.89352455891786e-03)
+                q = float32(1.19825839466702e-06) * s + float32(1.18534705686654e-04)
+                q = q * s + float32(2.26843463243900e-03)
+                q = q * s + float32(4.89352518554385e-03)
+                h[j, i] = u * p / q + float32(0.0) * x  # what is not finite goes on as NaN
+        elif kind == RELU:
+            for i in range(ROWS):
+                x = h[j, i] + b
+                h[j, i] = x if not x < float32(0.0) else float32(0.0)
+        else:
+            for i in range(ROWS):
+                h[j, i] += b
+
+
+@compiled(fastmath=_FAST)
+def _undo_activation(g, h, kind, db):
+    """g = g f'(x), by h = f(x), both (rows, ROWS); db (rows,) += its sums over the rows of the mini-batch."""
+    for j in range(g.shape[0]):
+        total = float32(0.0)
+        for i in range(ROWS):
+            if kind == TANH:
+                g[j, i] *= float32(1.0) - h[j, i] * h[j, i]
+            elif kind == RELU:
+                g[j, i] = g[j, i] if h[j, i] > float32(0.0) else float32(0.0)
+            total += g[j, i]
+        db[j] += total
+
+
+@compiled
+def _load(rows, first, count, h):
+    """Rows ``first`` to ``first + count`` of (n, size) into a block, (width, ROWS), zeros around them."""
+    for k in range(h.shape[0]):
+        filled = count if k < rows.shape[1] else 0
+        for i in range(filled):
+            h[k, i] = rows[first + i, k]
+        for i in range(filled, ROWS):
+            h[k, i] = 0.0
+
+
+@compiled
+def _finish(control, chunks, patience):
+    """Wait for the chunks that other threads still have; whether that took more than ``patience`` looks."""
+    looks = 0
+    while atomic_get(control, DONE) < chunks:
+        looks += 1
+        if looks > patience:
+            give_way()
+    return looks > patience
+
+
+@compiled
+def forward(control, main, chunks, x, widths, kinds, parameters, kept, out):
+    """Take chunks of blocks as long as there are any; ``main`` then waits until all are done.
+
+    :param control: int64 (CONTROL,): chunks left and done, shared by all threads.
+    :param x: (n, inputs).
+    :param widths: of all layers, the inputs first, padded; :param kinds: the activation of each but the first.
+    :param kept: (blocks, sum of widths, ROWS), where :func:`backward` finds all layers; of size 0 if it is not to come.
+    :param out: (n, outputs).
+    :return: whether ``main`` had to wait.
+    """
+    n, total = len(x), widths.sum()
+    blocks = (n + ROWS - 1) // ROWS
+    scratch = np.empty(0 if kept.size else total * ROWS, np.float32)
+    while True:
+        number = chunks - atomic_add(control, LEFT, -1)
+        if number >= chunks:
+            return main and _finish(control, chunks, PATIENCE)
+        for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
+            at = kept[block].ctypes.data if kept.size else scratch.ctypes.data
+            first = block * ROWS
+            h = carray(pointer(at), (widths[0], ROWS), np.float32)
+            _load(x, first, min(ROWS, n - first), h)
+            place = parameters.ctypes.data
+            for layer in range(1, len(widths)):
+                rows, columns = widths[layer], widths[layer - 1]
+                at += 4 * columns * ROWS
+                y = carray(pointer(at), (rows, ROWS), np.float32)
+                _multiply(carray(pointer(place), (rows, columns), np.float32), h, y)
+                _activate(y, carray(pointer(place + 4 * rows * columns), (rows,), np.float32), kinds[layer - 1])
+                place += 4 * rows * (columns + 1)
+                h = y
+            for i in range(min(ROWS, n - first)):
+                for j in range(out.shape[1]):
+                    out[first + i, j] = h[j, i]
+        atomic_add(control, DONE, 1)
+
+
+@compiled
+def backward(control, main, chunks, grad, widths, kinds, transposed, kept, sums):
+    """As :func:`forward`, for the gradient by the parameters.
+
+    :param grad: (n, outputs), by the outputs.
+    :param transposed: the parameters with each layer's weights as (inputs, outputs).
+    :param sums: (chunks, parameters): the gradient's part of each chunk, so that threads do not change what their sum is.
+    """
+    n, total, last = len(grad), widths.sum(), len(widths) - 1
+    blocks = (n + ROWS - 1) // ROWS
+    scratch = np.empty((2, widths.max() * ROWS), np.float32)
+    while True:
+        number = chunks - atomic_add(control, LEFT, -1)
+        if number >= chunks:
+            return main and _finish(control, chunks, PATIENCE)
+        sums[number, :] = 0.0
+        for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
+            first = block * ROWS
+            at = kept[block].ctypes.data + 4 * (total - widths[last]) * ROWS
+            g = carray(pointer(scratch[0].ctypes.data), (widths[last], ROWS), np.float32)
+            _load(grad, first, min(ROWS, n - first), g)
+            place = 4 * sums.shape[1]
+            for layer in range(last, 0, -1):
+                rows, columns = widths[layer], widths[layer - 1]
+                h = carray(pointer(at), (rows, ROWS), np.float32)
+                at -= 4 * columns * ROWS
+                place -= 4 * rows * (columns + 1)
+                here = sums[number].ctypes.data + place
+                _undo_activation(g, h, kinds[layer - 1], carray(pointer(here + 4 * rows * columns), (rows,), np.float32))
+                x = carray(pointer(at), (columns, ROWS), np.float32)
+                _add_products(g, x, carray(pointer(here), (rows, columns), np.float32))
+                if layer > 1:
+                    y = carray(pointer(scratch[(last - layer + 1) % 2].ctypes.data), (columns, ROWS), np.float32)
+                    _multiply(carray(pointer(transposed.ctypes.data + place), (columns, rows), np.float32), g, y)
+                    g = y
+        atomic_add(control, DONE, 1)
