@@ -1,7 +1,7 @@
 """Multilayer perceptrons, forward and backward, compiled: blocks of rows go through all layers while they are in the cache.
 
-A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop; widths
-are padded to multiples of 4 with zeros. The parameters of a layer lie behind one another: weights (outputs, inputs), biases.
+A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop.
+Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a row: weights (outputs, inputs), then biases.
 """
 
 import numpy as np

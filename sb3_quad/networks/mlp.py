@@ -24,7 +24,8 @@ def fits(modules: Sequence[nn.Module]) -> bool:
     linear, between = modules[::2], modules[1::2]
     return (
         len(modules) % 2 == 1
-        and all(type(each) is nn.Linear and each.weight.dtype == th.float32 and each.weight.device.type == "cpu" for each in linear)
+        and all(type(each) is nn.Linear and each.bias is not None for each in linear)
+        and all(each.weight.dtype == th.float32 and each.weight.device.type == "cpu" for each in linear)
         and all(type(each) in _ACTIVATIONS for each in between)
         and not any(each._forward_hooks or each._forward_pre_hooks or each._backward_hooks for each in modules)
     )
@@ -35,23 +36,29 @@ def apply(modules: Sequence[nn.Module], x: th.Tensor) -> th.Tensor:
     linear = modules[::2]
     kinds = [*(_ACTIVATIONS[type(each)] for each in modules[1::2]), LINEAR]  # type: ignore[index]
     parameters = [parameter for each in linear for parameter in (each.weight, each.bias)]
+    if not th.is_grad_enabled():
+        return _forward(x, kinds, parameters, keep=False)[0]
     result: th.Tensor = _Mlp.apply(x, kinds, *parameters)  # type: ignore[no-untyped-call]
     return result
+
+
+def _forward(x: th.Tensor, kinds: list[int], parameters: Sequence[th.Tensor], keep: bool) -> tuple[th.Tensor, Any]:
+    """The output, and what :meth:`_Mlp.backward` needs if it is to ``keep`` that."""
+    layers = list(zip(parameters[::2], parameters[1::2], strict=True))
+    widths = np.array([-(-size // 4) * 4 for size in (x.shape[1], *(len(bias) for _, bias in layers))])
+    packed, transposed = _pack(layers, widths, keep)
+    rows, blocks = x.detach().contiguous().numpy(), -(-len(x) // ROWS)
+    kept = np.empty((blocks if keep else 0, int(widths.sum()), ROWS), np.float32)
+    out = np.empty((len(rows), len(parameters[-1])), np.float32)
+    _helpers.run(forward, blocks, rows, widths, np.array(kinds), packed, kept, out)
+    return th.from_numpy(out), (layers, widths, np.array(kinds), transposed, kept)
 
 
 class _Mlp(th.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: th.Tensor, kinds: list[int], *parameters: th.Tensor) -> th.Tensor:
-        layers = list(zip(parameters[::2], parameters[1::2], strict=True))
-        widths = np.array([-(-size // 4) * 4 for size in (x.shape[1], *(len(bias) for _, bias in layers))])
-        packed, transposed = _pack(layers, widths, ctx.needs_input_grad[2])
-        rows = x.detach().contiguous().numpy()
-        blocks = -(-len(rows) // ROWS)
-        kept = np.empty((blocks if transposed is not None else 0, int(widths.sum()), ROWS), np.float32)
-        out = np.empty((len(rows), len(parameters[-1])), np.float32)
-        _helpers.run(forward, blocks, rows, widths, np.array(kinds), packed, kept, out)
-        ctx.held = layers, widths, np.array(kinds), transposed, kept
-        return th.from_numpy(out)
+        out, ctx.held = _forward(x, kinds, parameters, keep=True)
+        return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
@@ -86,7 +93,7 @@ def _pack(layers: Sequence[tuple[th.Tensor, th.Tensor]], widths: Any, for_backwa
 
 
 class _Helpers:
-    """Threads that take chunks of a call, too. A call waits for none that has not begun, and returns when all chunks are done."""
+    """Threads that take chunks of a call, too. A call returns when all chunks are done, and waits for nobody without one."""
 
     def __init__(self) -> None:
         self.threads = 1

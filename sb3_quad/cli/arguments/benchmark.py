@@ -16,7 +16,8 @@ def add_arguments(parser: Parser) -> None:
     add("--sizes", nargs="+", type=positive, default=[64, 240, 1024, 4096, 16384], metavar="N", help="rows of the batch")
     add("--n-envs", type=positive, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
     add("--seconds", type=above_zero, default=3.0, metavar="S", help="duration of each measurement (3)")
-    add("--algo", default="ppo_bc", help="algorithm of the training loop (ppo_bc)")
+    add("--algo", nargs="+", default=["dagger", "ppo_bc"], help="algorithms of the training loops (dagger ppo_bc)")
     add("-conf", "--conf-file", metavar="FILE", help="its settings (those of train without arguments)")
-    add("--training", action=argparse.BooleanOptionalAction, default=True, help="also measure a training loop")
+    training = "only, or no, training loops: where the time goes in rollouts and updates"
+    add("--training", action=argparse.BooleanOptionalAction, help=training)
     add("--output", metavar="FILE", help="write everything as JSON, with machine, versions and thread counts")
