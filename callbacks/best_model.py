@@ -9,11 +9,13 @@ import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.experts.controller import Controller
 
 KEYS = ("timesteps", "results", "ep_lengths", "successes", "seconds")  # of the file
+LIVES = 20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
 Score = tuple[float, float]  # success rate, mean reward
 
 
@@ -53,8 +55,10 @@ class BestModel(EveryTimesteps):
     :param expert: as DAgger takes it; it flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
         is then the model's mean reward minus the expert's.
     :param should_continue: is asked after each evaluation, with its success rate and mean reward; False ends the training.
-    :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read.
+    :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read or
+        flew another number of episodes.
     :raises ExpertError: at the first evaluation, an expert that does not fit the environment.
+    :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's Monitor.
     """
 
     def __init__(
@@ -90,6 +94,9 @@ class BestModel(EveryTimesteps):
             if path.is_file():
                 arrays = read_arrays(path)
                 self._rows[group] = {key: list(arrays[key]) for key in KEYS}
+                flown = arrays["results"].shape[-1]
+                if flown != self._n_episodes:
+                    raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")
         rows = self._rows["eval"]
         self._start = time.perf_counter() - (rows["seconds"] or [0.0])[-1]
         self.best = max(map(_score, rows["successes"], rows["results"]), default=self.best)
@@ -120,10 +127,18 @@ class BestModel(EveryTimesteps):
 
     def _fly(self, group: str, seconds: float) -> Score:
         env, rows, successes, survived = self._envs[group], self._rows[group], [], []
+        unreported = 0  # ends in a row
 
         def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
+            nonlocal unreported
             if local_variables["done"]:  # an environment that knows no success counts as failing: reward decides
                 info = local_variables["info"]
+                if local_variables.get("is_monitor_wrapped") and "episode" not in info:  # evaluate_policy does not count it
+                    unreported += 1
+                    if unreported > LIVES * env.num_envs:
+                        raise TrainingError("evaluation: a wrapper drops info['episode'], by which SB3 counts episodes")
+                    return
+                unreported = 0
                 successes.append(float(info.get("is_success", 0.0)))
                 if "survival" in info:
                     survived.append(float(info["survival"]))

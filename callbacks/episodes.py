@@ -10,6 +10,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import read_text
 from sb3_quad.experts.controller import true_state_of
 
 
@@ -17,7 +18,7 @@ class EpisodeLog(BaseCallback):
     """Adds a line for each episode that ends: return, length, seconds since the start, success.
 
     It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and rl-zoo's plots read the file.
-    An existing file is continued.
+    An existing file is continued, its seconds too.
 
     >>> from stable_baselines3 import PPO
     >>> from stable_baselines3.common.results_plotter import load_results
@@ -40,7 +41,10 @@ class EpisodeLog(BaseCallback):
     def _on_training_start(self) -> None:
         self._start = time.time()
         header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
+        rows = read_text(self._path).splitlines()[2:] if self._path.exists() else []
         self._writer = ResultsWriter(str(self._path), header, ("is_success",), override_existing=not self._path.exists())
+        if rows:
+            self._start -= float(rows[-1].split(",")[2])
 
     def _on_step(self) -> bool:
         infos, seconds = self.locals["infos"], round(time.time() - self._start, 3)

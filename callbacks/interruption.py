@@ -17,7 +17,7 @@ ENVIRONMENT = "environment."  # before the names of the environments' arrays
 
 
 class StopOnSignal(BaseCallback):
-    """Makes Ctrl-C (SIGINT) and SIGTERM end ``model.learn`` after the step, and saves the model, whole or not at all.
+    """Makes Ctrl-C (SIGINT), SIGTERM and SIGHUP end ``model.learn`` after the step, and saves the model, whole or not at all.
 
     For your own scripts; ``sb3-quad train`` does more (resumable runs). A second signal interrupts at once, without saving.
     ``learn`` returns as usual and the script continues; ``signal`` tells whether one came.
@@ -44,7 +44,7 @@ class StopOnSignal(BaseCallback):
     signal = ""
     """The name of the signal that ended the training, empty if none did."""
     exit_code = 0
-    """For ``sys.exit``, as a shell expects it: 130 after SIGINT, 143 after SIGTERM; 0 if none came."""
+    """For ``sys.exit``, as a shell expects it: 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP; 0 if none came."""
 
     def __init__(self, path: str | Path, verbose: int = 1) -> None:
         super().__init__(verbose)
@@ -59,6 +59,7 @@ class StopOnSignal(BaseCallback):
         return self._signals.received is None
 
     def _on_training_end(self) -> None:
+        self._signals.hold()
         self.signal, self.exit_code = self._signals.name, self._signals.exit_code
         try:
             if self.signal:

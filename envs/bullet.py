@@ -1,8 +1,11 @@
 """PyBullet's part of ``QuadcopterEnv``: the rigid body, and pictures of its flight."""
 
 import sys
+import tempfile
 import time
 import weakref
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -85,6 +88,20 @@ class BulletBody:
         velocity, angular_velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
         write_body(state, position, quaternion, velocity, angular_velocity)
 
+    def save(self) -> bytes:
+        """The whole simulation, to the bit: poses that PyBullet gives and takes are rounded."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "simulation.bullet"
+            p.saveBullet(str(path), physicsClientId=self.client)
+            return path.read_bytes()
+
+    def restore(self, saved: bytes) -> None:
+        """Put everything where :meth:`save` found it, in a simulation of the same bodies."""
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "simulation.bullet"
+            path.write_bytes(saved)
+            p.restoreState(fileName=str(path), physicsClientId=self.client)
+
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""
         self._close()
@@ -136,6 +153,13 @@ class Renderer:
         else:
             self.shown_at -= ahead  # too slow for real time: do not hurry afterwards
         return None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name not in ("scene", "shown_at")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """A renderer that goes on as another one did, in a scene of its own."""
+        vars(self).update(vars(Renderer(state["vehicle"], *state["size"])) | state)
 
     def _place(self, state: FloatArray, wrench: FloatArray) -> None:
         self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])

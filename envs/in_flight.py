@@ -1,5 +1,6 @@
 """What all environments have in common: their spaces, and what they can be asked and told in flight."""
 
+import copy
 import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -42,6 +43,9 @@ class InFlight:
     """
 
     batch: QuadcopterBatch
+
+    def __copy__(self) -> Any:
+        return copy.deepcopy(self)  # two environments that share a batch would fly each other's rows
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         """A copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""

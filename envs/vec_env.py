@@ -52,7 +52,7 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
     within the same step, and its info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``,
     ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
     infos of other rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are
-    fresh.
+    fresh. A copy, or what is unpickled, flies on from the same state, and apart.
 
     See :class:`~sb3_quad.simulation.batch.QuadcopterBatch` for the other arguments.
 

@@ -98,7 +98,7 @@ def one_line_of_error(capsys) -> str:
         (["train", "--algo", "dagger", "-n", "many"], "no whole number"),
         (["train", "--algo", "dagger", "--hyperparams", "n_setps:3"], "did you mean 'n_steps'"),
         (["train", "--algo", "dagger", "--hyperparams", "n_steps"], "key:value"),
-        (["train", "--algo", "dagger", "--hyperparams", "batch_size:0"], "batch_size 0"),
+        (["train", "--algo", "dagger", "--hyperparams", "batch_size:0"], "batch_size is 0"),
         (["train", "--algo", "dagger", "--env-kwargs", "noise:-1"], "noise -1"),
         (["train", "--algo", "dagger", "--env-kwargs", "vehicle:itn"], "did you mean 'itm'"),
         (["train", "--algo", "dagger", "--env-kwargs", "task_kwargs:{'target_distanse':3}"], "did you mean 'target_distance'"),
@@ -362,7 +362,7 @@ def test_only_interrupted_runs_resume(tmp_path, capsys):
     assert f"-i {result.run.model}" in one_line_of_error(capsys)
 
 
-@pytest.mark.parametrize("name", ["model", "resume_state", "dataset", "config"])
+@pytest.mark.parametrize("name", ["resume_state", "config"])
 def test_damaged_run_folders_are_refused(tmp_path, capsys, name):
     Interrupt.sent = False
     run = train(job(tmp_path, callback={"test_cli.Interrupt": {"after": 500}}), report=lambda line: None).run

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.folder import load_results, write_results
@@ -32,6 +33,15 @@ def test_an_interrupted_run_goes_on_to_the_agent_of_the_uninterrupted_one(tmp_pa
         np.testing.assert_allclose(tensor.numpy(), expected["whole"][name], rtol=1e-3, atol=1e-5, err_msg=name)
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
+
+
+@pytest.mark.parametrize("name", ["QuadTargetTracking-v0.zip", "dataset.npz", "resume.npz"])
+def test_an_interrupted_run_with_a_damaged_file_is_refused(tmp_path, name):
+    run = tmp_path / "QuadTargetTracking-v0_1"
+    shutil.copytree(OLD / run.name, run)
+    (run / name).write_bytes((run / name).read_bytes()[:100])
+    with pytest.raises(ConfigError, match=name):
+        resume(str(run), report=lambda line: None)
 
 
 def test_a_zip_flies_the_same(expected):
@@ -80,7 +90,6 @@ def test_flights_of_its_random_streams_are_not_mixed_with_ours_and_are_shown(tmp
 
 
 def test_names_that_were_documented_can_still_be_imported():
-    from sb3_quad.base.errors import ConfigError
     from sb3_quad.dynamics.state import QuadcopterState
     from sb3_quad.dynamics.vehicle import Vehicle, load_vehicle
     from sb3_quad.errors import ConfigError as Same

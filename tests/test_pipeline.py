@@ -16,8 +16,10 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.pretrained_policies import load_pretrained
+from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training import trim as trim_module
-from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
+from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, with_settings
+from sb3_quad.training.trainer import train
 from sb3_quad.training.trim import scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
@@ -164,3 +166,48 @@ def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, mo
         one, two = (next((tmp_path / name / algo).rglob("Quad*.zip")) for name in ("whole", "interrupted"))
         for ours, theirs in zip(policy(one).values(), policy(two).values(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
+
+
+def two_stages(tmp_path):
+    """The first is to be trimmed."""
+    stages = [{**STAGES[0], "trim": "hover"}, {**STAGES[0], "name": "two"}]
+    return with_settings(load_pipeline(write(tmp_path, stages)), {**TINY, "policy_kwargs": {"net_arch": [8]}})
+
+
+def test_a_stage_is_not_trained_anew_when_its_trimming_was_interrupted(tmp_path, job, monkeypatch):
+    def interrupted(model, seed, settings):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setitem(pipeline_module.TRIMS, "hover", (interrupted, ""))
+    lines = []
+    result = run_pipeline(two_stages(tmp_path), job, "stages", lines.append)
+    assert result.exit_code == 143 and f"--resume {result.folder}" in lines[-1]
+
+    monkeypatch.setitem(pipeline_module.TRIMS, "hover", (lambda model, seed, settings: None, ""))
+    after = resume_pipeline(result.folder, lambda line: None)
+    assert after.stages["one"].agent.endswith("trimmed_model.zip")
+    assert len(list((tmp_path / "logs" / "dagger").iterdir())) == 2
+    again = resume_pipeline(result.folder, lambda line: None)  # as after a kill in the final tables
+    assert again.stages == after.stages
+
+
+def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(tmp_path, job, monkeypatch):
+    def killed(*args, **kwargs):
+        raise SystemExit
+
+    pipeline, folder = two_stages(tmp_path), tmp_path / "logs" / "stages" / "stages_1"
+    monkeypatch.setitem(pipeline_module.TRIMS, "hover", (lambda model, seed, settings: None, ""))
+    monkeypatch.setattr(pipeline_module, "train", killed)  # the first stage has no run folder yet
+    with pytest.raises(SystemExit):
+        run_pipeline(pipeline, job, "stages", lambda line: None)
+    monkeypatch.setattr(pipeline_module, "train", train)
+    passed_on = pipeline_module._passed_on
+    monkeypatch.setattr(pipeline_module, "_passed_on", killed)  # its model is saved
+    with pytest.raises(SystemExit):
+        resume_pipeline(folder, lambda line: None)
+    monkeypatch.setattr(pipeline_module, "_passed_on", passed_on)
+    (model,) = (tmp_path / "logs" / "dagger").rglob("Quad*.zip")
+    before = model.stat().st_mtime_ns
+    result = resume_pipeline(folder, lambda line: None)
+    assert result.exit_code == 0 and result.stages["one"].timesteps == 256
+    assert model.stat().st_mtime_ns == before

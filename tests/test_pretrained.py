@@ -107,13 +107,13 @@ def run_folder(tmp_path_factory):
 
 def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folder, tmp_path, capsys, observations):
     source = run_folder / "QuadStateRecovery-v0.zip"
-    (run_folder / "QuadStateRecovery-v0" / "command.txt").write_text("typed so\n")
+    (run_folder / "QuadStateRecovery-v0" / "command.txt").write_text("typed\n```\nso\n")
     command = ["publish", str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
     assert main(command) == 0
     card = (tmp_path / "mine.md").read_text(encoding="utf-8")
     for part in (
         "# mine",
-        "typed so",
+        "```bash\ntyped ''' so\n```",
         "| seed | 3 |",
         "`dagger`, 1,600 timesteps",
         "16 fresh recoveries and 4 fresh targets",

@@ -198,6 +198,12 @@ def test_plots_are_narrow_enough_for_a_telephone_and_legends_cover_nothing(parts
     assert plot_of(parts, "tracking", "times").figure.get_figheight() == HEIGHT
 
 
+def test_the_tables_as_markdown_hold_no_html(folder, page):
+    lines = (folder / "report.md").read_text().splitlines()
+    assert any('&lt;b&gt;g&lt;/b&gt; "2" &lt;/script&gt;' in line for line in lines)
+    assert "<" not in "".join(lines)
+
+
 def test_isolated_survivals_beyond_the_first_loss_are_not_joined(folder):
     results = load_results(folder)
     entry, (scenario,) = results.entry("pid", "hit"), (each for each in results.scenarios if each.name == "hit")

@@ -1,5 +1,6 @@
 """Run folders: no two runs share one, files are whole or absent, and a run can be read again."""
 
+import os
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -95,3 +96,11 @@ def test_files_are_replaced_whole(tmp_path, monkeypatch):
         write_bytes(path, b"new")
     assert path.read_text() == "old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file.txt"]
+
+
+def test_a_device_or_pipe_is_not_replaced_by_a_file(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    with pytest.raises(ConfigError, match=r"pipe.*names no file that can be written"):
+        write_text(pipe, "text")
+    assert pipe.is_fifo()

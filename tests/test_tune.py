@@ -162,9 +162,9 @@ def test_a_trial_that_fails_is_told_and_the_others_go_on(command, capsys):
     output, rows = capsys.readouterr().out, trials()
     failed = [row for row in rows if row["state"] == "FAIL"]
     assert failed and len(failed) < 5
-    assert all(row["batch_size"] == "0" and "batch_size 0" in row["error"] for row in failed)
+    assert all(row["batch_size"] == "0" and "batch_size is 0" in row["error"] for row in failed)
     assert all(row["state"] == "COMPLETE" for row in rows if row["batch_size"] == "100")
-    assert f"trial {failed[0]['number']} failed: ConfigError: batch_size 0" in output
+    assert f"ConfigError: trial {failed[0]['number']}: batch_size is 0, must be at least 1" in output
     assert f"{len(failed)} failed" in output
 
     Path("space.yml").write_text(yaml.safe_dump({"batch_size": [0, -1]}))

@@ -330,8 +330,8 @@ def test_setters_reach_the_rows_they_name():
     assert [wrench.tolist() for wrench in env.get_attr("wrench", [0, 1])] == [[0.0] * 12, [0.0, 2.0] + [0.0] * 10]
     env.set_attr("task", "state_recovery")
     assert env.get_attr("task") == ["state_recovery"] * 4 and env.get_attr("task_kwargs") == [{}] * 4
-    env.set_task(MIXTURE, {"max_distance": 9.0})
-    assert (env.task, env.task_kwargs) == (MIXTURE, {"max_distance": 9.0})
+    env.set_task(MIXTURE, {"max_distance": 19.0})
+    assert (env.task, env.task_kwargs) == (MIXTURE, {"max_distance": 19.0})
 
 
 def test_its_episodes_are_a_monitors():

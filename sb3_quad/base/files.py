@@ -1,27 +1,36 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
+import fcntl
 import io
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.memory import check_memory
+
+MAX_TEXT = 2**26  # characters of a text that is read whole
 
 
-def write_bytes(path: str | Path, content: bytes) -> None:
-    """Write beside ``path`` and move the finished file there, so that a reader never meets half of it.
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A stream to a file beside ``path`` that is moved there when it is finished, so that a reader never meets half of it.
 
-    :raises ConfigError: a folder that cannot be written, a full disk; whatever ``path`` held is still there.
+    :raises ConfigError: no name of a file, a folder that cannot be written, a full disk; what ``path`` held is still there.
     """
     file = Path(path)
+    if not file.name or (file.exists() and not file.is_file()):  # a device, as /dev/null, would be replaced, too
+        raise ConfigError(f"{str(path)!r}: names no file that can be written")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         try:
             with beside.open("wb") as stream:
-                stream.write(content)
+                yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
             os.replace(beside, file)
@@ -31,6 +40,36 @@ def write_bytes(path: str | Path, content: bytes) -> None:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 
 
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file by :func:`replacing`."""
+    with replacing(path) as stream:
+        stream.write(content)
+
+
+@contextmanager
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """Keep a folder to this process, and remove what a killed one has left half-written in it.
+
+    The lock ends with the process, however that ends, and leaves no file. A file system without locks grants every one.
+
+    :param what: the folder in an error message.
+    :raises ConfigError: another process has it.
+    """
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigError(f"{what} {folder}: another process is writing to it; wait until that ends") from None
+        except OSError:  # no locks here
+            pass
+        for half in folder.glob(".*.tmp"):
+            half.unlink(missing_ok=True)
+        yield
+    finally:
+        os.close(descriptor)
+
+
 def write_text(path: str | Path, text: str) -> None:
     """As :func:`write_bytes`, of text in UTF-8."""
     write_bytes(path, text.encode("utf-8"))
@@ -38,19 +77,21 @@ def write_text(path: str | Path, text: str) -> None:
 
 def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> None:
     """As :func:`write_bytes`, of NumPy arrays as ``.npz``."""
-    buffer = io.BytesIO()
-    (np.savez_compressed if compressed else np.savez)(buffer, **arrays)
-    write_bytes(path, buffer.getvalue())
+    with replacing(path) as stream:
+        (np.savez_compressed if compressed else np.savez)(stream, **arrays)
 
 
 def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
     """The arrays of an ``.npz`` file whose names begin with ``prefix``; the others are not even read.
 
-    :raises ConfigError: a missing or damaged file.
+    :raises ConfigError: a missing or damaged file, or one that unpacks to more than the memory.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
+            check_memory(str(path), sum(entry.file_size for entry in file.zip.infolist()))
             return {name: file[name] for name in file.files if name.startswith(prefix)}
+    except ConfigError:
+        raise
     except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
 
@@ -58,14 +99,18 @@ def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
 def read_text(path: str | Path) -> str:
     """The text of a file.
 
-    :raises ConfigError: it is missing or cannot be read.
+    :raises ConfigError: it is missing, cannot be read, or has no end in sight, as ``/dev/zero``.
     """
     try:
-        return Path(path).read_text(encoding="utf-8")
+        with Path(path).open(encoding="utf-8") as file:
+            text = file.read(MAX_TEXT + 1)
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:  # ValueError: no UTF-8, or no path
         raise ConfigError(f"{path}: cannot be read ({error})") from None
+    if len(text) > MAX_TEXT:
+        raise ConfigError(f"{path}: has more than {MAX_TEXT:,} characters")
+    return text
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:

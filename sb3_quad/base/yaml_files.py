@@ -1,5 +1,6 @@
 """YAML files by name, where they come with the package, or by path."""
 
+from collections import Counter
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
@@ -11,17 +12,57 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
 
 SUFFIXES = (".yaml", ".yml")
+MAX_CHARACTERS, MAX_DEPTH, MAX_VALUES = 2**20, 50, 100_000  # of a file; levels; values, with those that aliases repeat
 
 
-def parse_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> Any:
-    """:raises ConfigError: text that is not YAML, in one line."""
+class LimitedLoader(yaml.SafeLoader):
+    """PyYAML's SafeLoader; it refuses a key given twice, an alias of what it is part of, and what is too deep or too much."""
+
+    _depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            raise yaml.YAMLError(f"nested more than {MAX_DEPTH} levels deep")
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+    def get_single_node(self) -> Any:
+        node = super().get_single_node()
+        if node is not None and self._count(node, {}) > MAX_VALUES:
+            raise yaml.YAMLError(f"its aliases stand for more than {MAX_VALUES:,} values")
+        return node
+
+    def _count(self, node: Any, known: dict[Any, int]) -> int:
+        """The values in a node, those of an alias as often as it stands there; 0 in ``known`` marks what is being counted."""
+        if node in known:
+            if known[node] == 0:
+                raise yaml.YAMLError(f"an alias of what it is part of{node.start_mark}")
+            return known[node]
+        known[node], parts = 0, []
+        if isinstance(node, yaml.SequenceNode):
+            parts = node.value
+        elif isinstance(node, yaml.MappingNode):
+            keys = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+            if twice := [name for (_, name), times in keys.items() if times > 1]:
+                raise yaml.YAMLError(f"{', '.join(twice)}: given twice{node.start_mark}")
+            parts = [part for pair in node.value for part in pair]
+        known[node] = 1 + sum(self._count(part, known) for part in parts)
+        return known[node]
+
+
+def parse_yaml(text: str, where: str, loader: type[LimitedLoader] = LimitedLoader) -> Any:
+    """:raises ConfigError: text that is not YAML, or is too much of it, in one line."""
+    if len(text) > MAX_CHARACTERS:
+        raise ConfigError(f"{where}: has more than {MAX_CHARACTERS:,} characters; this is no file of settings")
     try:
         return yaml.load(text, Loader=loader)
-    except yaml.YAMLError as error:
+    except Exception as error:  # beside YAMLError, whatever a value raises that is none of its tag's
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
 
 
-def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader] = yaml.SafeLoader) -> dict[str, Any]:
+def parse_mapping_file(path: Path, loader: type[LimitedLoader] = LimitedLoader) -> dict[str, Any]:
     """The keys and values of a YAML file.
 
     :raises ConfigError: it is missing, unreadable or holds something else.

@@ -4,11 +4,14 @@ import importlib
 import io
 import pkgutil
 import sys
+import traceback
 from collections.abc import Sequence
 from pathlib import Path
 
 from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.signals import interrupts_leave
+from sb3_quad.base.trust import trusting
 from sb3_quad.cli import arguments
 from sb3_quad.cli.parser import Parser
 
@@ -24,7 +27,8 @@ EPILOG = """examples:
 exit codes:
   0    done
   1    some controllers of an evaluation failed (one line each on stderr), or a vehicle cannot hover
-  2    bad input, or a training that cannot continue: one line on stderr says what
+  2    bad input, a training that cannot continue, or any other error: one line on stderr says what
+  129  the terminal was closed (SIGHUP), after saving
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
 """
@@ -52,27 +56,54 @@ def main(argv: Sequence[str] | None = None) -> int:
     given = list(sys.argv[1:] if argv is None else argv)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(line_buffering=True)  # lines appear at once, also in a pipe
-    parser = make_parser()
     try:
+        parser = make_parser()
+        if any("\ud800" <= letter <= "\udfff" for letter in "".join(given)):  # how Python shows bytes that are no text
+            raise ConfigError(f"arguments {' '.join(given)!r}: not valid UTF-8")
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise ConfigError(unknown("command", given[0], COMMANDS))
-        options = parser.parse_args(given)
+        try:
+            options = parser.parse_args(given)
+        except SystemExit as leaving:  # argparse, after --help
+            return int(leaving.code or 0)
         if options.command is None:
             parser.print_help()
             return 0
         agent = getattr(options, "trained_agent", None)
         if agent is not None and not any(Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds it
             raise ConfigError(f"-i {agent}: no such file")  # at once: what the command imports takes seconds
-        command = importlib.import_module(f"sb3_quad.cli.commands.{options.command.replace('-', '_')}")
-        return int(command.run(options))
+        with interrupts_leave():
+            command = importlib.import_module(f"sb3_quad.cli.commands.{options.command.replace('-', '_')}")
+        with trusting(getattr(options, "trust", False)):
+            return int(command.run(options))
     except SB3QuadError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return _refuse(str(error))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
     except BrokenPipeError:  # as in `sb3-quad train --help | head`
         sys.stderr.close()
         return 0
-    except SystemExit as leaving:  # argparse, after --help
-        return int(leaving.code or 0)
+    except SystemExit as leaving:
+        return _refuse(
+            f"a module that was called left with sys.exit({leaving.code!r}); what the command was to do is not done"
+        )
+    except Exception as error:  # a wrapper's, an environment's or a callback's of the user, a full disk, or a fault of ours
+        if sys.flags.dev_mode:
+            raise
+        return _refuse(_unexpected(error))
+
+
+def _refuse(message: str) -> int:
+    """Print what stops a command, in one line. Returns the exit code."""
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return 2
+
+
+def _unexpected(error: Exception) -> str:
+    """What an exception says that no check foresaw, and where it was raised."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename or 'a file'}: {error.strerror}"
+    told = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())])
+    last = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{told} ({Path(last.filename).name}, line {last.lineno}; all of it: python -X dev -m sb3_quad.cli …)"

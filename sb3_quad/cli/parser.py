@@ -1,6 +1,7 @@
 """Argument parsing with one-line errors, and the kinds of arguments rl-zoo has."""
 
 import argparse
+import math
 import random
 from collections.abc import Mapping
 from typing import Any, NoReturn
@@ -8,6 +9,7 @@ from typing import Any, NoReturn
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.settings.literals import parse_number, parse_value
 
+TRUST = "let zips run whatever is pickled in them, see docs/security.md"
 BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo {}, docs/zoo.md"
 
 
@@ -46,8 +48,8 @@ def pointers(flags: str, where: str) -> dict[str, str]:
 def whole(text: str) -> int:
     """A whole number, also as ``1e6``."""
     number = parse_number(text)
-    if isinstance(number, str) or number != int(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number")
+    if isinstance(number, str) or not abs(number) < 2**63 or number != int(number):
+        raise argparse.ArgumentTypeError(f"{text!r} is no whole number below 2**63")
     return int(number)
 
 
@@ -67,6 +69,14 @@ def seed(text: str) -> int:
     """A whole number; a negative one asks for a random one."""
     number = whole(text)
     return number if number >= 0 else random.SystemRandom().randrange(2**31)
+
+
+def above_zero(text: str) -> float:
+    """A finite number above 0."""
+    number = float(text)
+    if not 0 < number < math.inf:
+        raise argparse.ArgumentTypeError(f"{text}: must be above 0, and finite")
+    return number
 
 
 class Pairs(argparse.Action):

@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_quad.base.arrays import Float32Array, IntArray
+from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays
+from sb3_quad.base.memory import check_memory
 
 
 class AggregatedDataset:
@@ -19,36 +20,39 @@ class AggregatedDataset:
     :param observation_shape: shape of one observation
     :param action_dim: length of one action
     :param dtype: of the observations; actions are float32
+    :raises ConfigError: more than this machine's memory holds
     """
 
     def __init__(
         self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike = np.float32
     ) -> None:
         self.capacity = capacity
+        size = int(np.prod(observation_shape)) * np.dtype(dtype).itemsize + action_dim * 4
+        check_memory(f"dataset_capacity {capacity:,}", capacity * size)
         # np.empty takes no memory before it is written to, so a large capacity costs what is in use.
         self._observations = th.from_numpy(np.empty((capacity, *observation_shape), dtype=dtype))
         self._actions = th.from_numpy(np.empty((capacity, action_dim), dtype=np.float32))
-        self._added = 0  # since it was empty
+        self.added = 0  # since it was empty
 
     def __len__(self) -> int:
-        return min(self._added, self.capacity)
+        return min(self.added, self.capacity)
 
     def clear(self) -> None:
         """Forget every pair."""
-        self._added = 0
+        self.added = 0
 
     def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
         """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
         observations, actions = observations[-self.capacity :], actions[-self.capacity :]
-        rows = (self._added + np.arange(len(actions))) % self.capacity
+        rows = (self.added + np.arange(len(actions))) % self.capacity
         self._observations.numpy()[rows] = observations
         self._actions.numpy()[rows] = actions
-        self._added += len(actions)
+        self.added += len(actions)
 
     def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """Observations (b, ...) and expert actions (b, action_dim) of rows (b,), counted from the oldest."""
-        if self._added > self.capacity:
-            rows = (rows + self._added) % self.capacity
+        if self.added > self.capacity:
+            rows = (rows + self.added) % self.capacity
         return self._observations.index_select(0, rows), self._actions.index_select(0, rows)
 
     def save(self, path: str | Path) -> None:
@@ -65,13 +69,37 @@ class AggregatedDataset:
         :raises ConfigError: a file that is missing, damaged, or of other observations or actions
         """
         arrays = read_arrays(_npz(path))
-        n, stores = len(arrays.get("actions", ())), {"observations": self._observations, "actions": self._actions}
+        self._check(arrays, len(arrays.get("actions", ())), path)
+        self.clear()
+        self.add(arrays["observations"], arrays["actions"])
+
+    def snapshot(self, added: int) -> Arrays:
+        """The memory as it was when it had been added ``added`` pairs: now, or before the latest :meth:`add`.
+
+        What :meth:`add` has replaced since then is not there any more: as many pairs must be added before the next are taken.
+        The arrays are views.
+        """
+        n = min(added, self.capacity)
+        return {"added": np.array(added), "observations": self._observations.numpy()[:n], "actions": self._actions.numpy()[:n]}
+
+    def restore(self, snapshot: Arrays, path: str | Path) -> None:
+        """Go back to a :meth:`snapshot`.
+
+        :param path: the file that it comes from, for the message.
+        :raises ConfigError: it is of another capacity, or of other observations or actions
+        """
+        added = int(snapshot.get("added", 0))
+        n = min(added, self.capacity)
+        self._check(snapshot, n, path)
+        self._observations.numpy()[:n], self._actions.numpy()[:n] = snapshot["observations"], snapshot["actions"]
+        self.added = added
+
+    def _check(self, arrays: Arrays, n: int, path: str | Path) -> None:
+        stores = {"observations": self._observations, "actions": self._actions}
         given = {name: arrays[name].shape for name in stores if name in arrays}
         needed = {name: (n, *store.shape[1:]) for name, store in stores.items()}
         if given != needed:
             raise ConfigError(f"dataset {path}: holds arrays of shape {given}, this model needs {needed}")
-        self.clear()
-        self.add(arrays["observations"], arrays["actions"])
 
 
 def sample_rows(n_rows: int, count: int, rng: np.random.Generator) -> IntArray:

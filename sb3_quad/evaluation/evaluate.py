@@ -4,19 +4,25 @@ import hashlib
 import itertools
 import json
 import multiprocessing
+import os
+import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from sb3_quad import __version__
-from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
+from sb3_quad.base.files import locked
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
 from sb3_quad.evaluation.fleets import FLEETS
@@ -93,17 +99,15 @@ def evaluate(
     :param report: told in one line of each agent that flies another vehicle than it was trained on, or does not say on which.
     :return: all results in the folder, those of earlier calls included; where nothing has been flown, it is not written.
     :raises ConfigError: an unknown backend; results in the folder of the same names that were flown otherwise; a folder that
-        cannot be written.
+        cannot be written, or that another process is writing to.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
-    place = Path(folder)
-    before = load_results(place) if (place / RESULTS).is_file() else None
-    asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
-    earlier = [] if before is None else before.failures
-    failures = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
+    if Path(folder).is_file():
+        raise ConfigError(f"{folder}: is a file; the results need a folder, give another with -o")
+    failures: list[Failure] = []
     loaded: list[tuple[ControllerSpec, ControllerRecord]] = []
     vehicles: dict[str, str] = {}  # by label, where a scenario names none
     for spec in controllers:
@@ -124,20 +128,46 @@ def evaluate(
         each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
         report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
     jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
-    missing = _missing(place, jobs, overwrite)
-    done = len(jobs) - len(missing)
-    try:
-        progress(done, len(jobs), "")
-        for job, outcome in run_jobs(missing, workers):
-            done += 1
-            if isinstance(outcome, Failure):
-                failures.append(outcome)
-            progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
-    finally:  # an interrupt, too, leaves what is done in order
-        results = _collect(place, before, suite, [record for _, record in loaded], failures)
-        if results.entries or before is not None:
-            write_results(place, results)
+    asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
+    with _claimed(Path(folder), bool(jobs)) as place:
+        before = load_results(place) if (place / RESULTS).is_file() else None
+        earlier = [] if before is None else before.failures
+        failures[:0] = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
+        missing = _missing(place, jobs, overwrite)
+        done = len(jobs) - len(missing)
+        try:
+            progress(done, len(jobs), "")
+            for job, outcome in run_jobs(missing, workers):
+                done += 1
+                if isinstance(outcome, Failure):
+                    failures.append(outcome)
+                progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+        finally:  # an interrupt, too, leaves what is done in order
+            results = _collect(place, before, suite, [record for _, record in loaded], failures)
+            if results.entries or before is not None:
+                write_results(place, results)
     return results
+
+
+@contextmanager
+def _claimed(folder: Path, make: bool) -> Iterator[Path]:
+    """A folder for this process alone, made if it is to be written to; one that stays empty is removed again.
+
+    :raises ConfigError: another process has it; it cannot be made.
+    """
+    new = make and not folder.exists()
+    if new:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    try:
+        with locked(folder, "folder") if folder.is_dir() else nullcontext():
+            yield folder
+    finally:
+        if new:
+            with suppress(OSError):
+                folder.rmdir()
 
 
 def _missing(folder: Path, jobs: Sequence[Job], overwrite: bool) -> list[Job]:
@@ -216,25 +246,51 @@ def run_job(job: Job) -> Entry | Failure:
 def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | Failure]]:
     """Do jobs, one after another or by worker processes, and hand out each as it is done.
 
+    A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.
+
     :raises SB3QuadError: a folder that cannot be written.
     """
     if workers <= 1 or len(jobs) <= 1:
         yield from ((job, run_job(job)) for job in jobs)
         return
-    pool = ProcessPoolExecutor(min(workers, len(jobs)), multiprocessing.get_context("spawn"), _begin_worker)
+    context = multiprocessing.get_context("spawn")
+    watched, held = context.Pipe(duplex=False)  # what holds it open is closed below, or ends with this process
+    waiting, idle, at_work = deque(jobs), list[ProcessPoolExecutor](), dict[Future[Any], tuple[Job, ProcessPoolExecutor]]()
     try:
-        waiting = {pool.submit(run_job, job): job for job in jobs}
-        for future in as_completed(waiting):
-            yield waiting[future], future.result()
-    except BrokenProcessPool:
-        raise SB3QuadError("a worker process ended unexpectedly (out of memory?); try --workers 1") from None
+        while waiting or at_work:
+            while waiting and len(at_work) < workers:
+                pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin_worker, (watched,))
+                job = waiting.popleft()
+                at_work[pool.submit(run_job, job)] = job, pool
+            future = wait(at_work, return_when=FIRST_COMPLETED).done.pop()
+            job, pool = at_work.pop(future)
+            try:
+                outcome = future.result()
+                idle.append(pool)
+            except BrokenProcessPool:  # one process a pool, so that the job is known, and no other is lost
+                pool.shutdown()
+                ended = ControllerError("its worker process ended unexpectedly (out of memory?)")
+                outcome = _failure(job.record.label, job.scenario.name, ended)
+            yield job, outcome
     finally:
-        pool.shutdown(cancel_futures=True)
+        for pool in idle:
+            pool.shutdown()
+        held.close()
+        for _, pool in at_work.values():
+            pool.shutdown(cancel_futures=True)
+        watched.close()
 
 
-def _begin_worker() -> None:
+def _begin_worker(watched: Connection) -> None:
     ignore_interrupts()  # the process that started the workers ends them
+    threading.Thread(target=_end_with_evaluation, args=(watched,), daemon=True).start()
     torch.set_num_threads(1)
+
+
+def _end_with_evaluation(watched: Connection) -> None:
+    """End this worker as soon as the evaluation that it works for is left, also by being killed."""
+    watched.poll(None)
+    os._exit(1)
 
 
 def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from sb3_quad.base.errors import ConfigError, ControllerError, SB3QuadError, unknown
+from sb3_quad.base.errors import ConfigError, ControllerError, unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import quadcopter_spaces
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
@@ -200,7 +200,3 @@ def _ask(controller: Controller, observation: Float32Array, flying: BoolArray, t
         return controller.actions(observation, flying)
     except ControllerError as error:
         raise ControllerError(f"{error}, after {time:.2f} s") from error
-    except SB3QuadError:
-        raise
-    except Exception as error:  # a controller of the user's may raise anything
-        raise ControllerError(f"fails after {time:.2f} s with {type(error).__name__}: {error}") from error

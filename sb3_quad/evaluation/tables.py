@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from html import escape as escape_html
 from typing import Literal
 
 import rich.table
@@ -96,11 +97,11 @@ class Table:
     caption: str = ""
 
     def markdown(self) -> str:
-        """The lines of the table; the best of a row is bold."""
+        """The lines of the table; the best of a row is bold. Names of any characters make no HTML."""
         lines = [[self.corner, *(column.heading for column in self.columns)], ["---"] * (1 + len(self.columns))]
         for row in self.rows:
             lines.append([row.heading, *(f"**{cell.text}**" if cell.best else cell.text for cell in row.cells)])
-        return "\n".join(f"| {' | '.join(cell.replace('|', '/') for cell in line)} |" for line in lines)
+        return "\n".join(f"| {' | '.join(escape_html(cell.replace('|', '/'), False) for cell in line)} |" for line in lines)
 
     def __rich__(self) -> rich.table.Table:
         """The table as ``rich`` prints it; the best of a row is bold."""

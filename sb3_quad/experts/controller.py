@@ -83,10 +83,18 @@ class Controller:
 
         :param observation: (n, ...): the observations of that state.
         :param rows: bool (n,): the rows that matter; the others get zeros. None: all.
-        :raises ExpertError: of an expert, actions that are not finite, or not of this shape; ``ControllerError`` of others.
+        :raises ExpertError: of an expert, what it raises itself, actions that are not finite, or not of this shape;
+            ``ControllerError`` of others.
         """
         error = ExpertError if self.kind == "expert" else ControllerError
-        raw = np.asarray(self._ask(observation))
+        try:
+            raw = np.asarray(self._ask(observation))
+        except SB3QuadError:
+            raise
+        except (Exception, SystemExit) as failed:  # a controller of the user's may raise anything
+            raise error(f"{self.kind} {self.name}: fails with {type(failed).__name__}: {failed}") from failed
+        if raw.dtype.kind not in "fiub":
+            raise error(f"{self.kind} {self.name}: gives actions of type {raw.dtype}, must be real numbers")
         n = len(observation)
         if raw.shape not in ((n, *self._space.shape), (n, self._action_dim)):
             raise error(f"{self.kind} {self.name}: gives actions of shape {raw.shape}, must be {(n, *self._space.shape)}")

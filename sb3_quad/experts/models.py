@@ -1,14 +1,21 @@
 """Loading a saved SB3 model without being told which algorithm made it."""
 
+import io
 import json
 import zipfile
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import stable_baselines3
+import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.memory import check_unpacked
+from sb3_quad.base.trust import trusted
+from sb3_quad.experts.unpickle import unpickle
+
+Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 # The module of the saved policy class tells the algorithm's family.
 _ACTOR_CRITIC = "stable_baselines3.common.policies"
@@ -19,20 +26,25 @@ _FAMILIES = {
     "stable_baselines3.dqn.policies": "DQN",
 }
 _OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
+_TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")  # what is read of the pickles of an agent
+_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}  # for those others that cannot be None
 
 
-def saved_data(path: str | Path) -> dict[str, Any]:
+def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
     """The attributes of the model in an SB3 ``.zip`` as its JSON has them; those that are pickled there stay so.
 
-    :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a zip bomb.
     """
-    file = Path(path)
-    if not file.is_file():
+    file = path if isinstance(path, io.BytesIO) else Path(path)
+    if isinstance(file, Path) and not file.is_file():
         raise ConfigError(f"model {file}: " + ("no run with an agent in this folder" if file.is_dir() else "no such file"))
     try:
+        check_unpacked(file)
         with zipfile.ZipFile(file) as archive:
             return dict(json.loads(archive.read("data")))
-    except (OSError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as error:
+    except ConfigError:
+        raise
+    except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
 
 
@@ -56,16 +68,37 @@ def saved_algorithm(path: str | Path) -> str:
     return "DDPG" if _FAMILIES[module] == "TD3" and data.get("policy_delay") == 1 else _FAMILIES[module]
 
 
+def load_zip(algorithm: type[Algorithm], path: str | Path | io.BytesIO, to_fly: bool = False, **kwargs: Any) -> Algorithm:
+    """``algorithm.load(path, **kwargs)``, in which no code of the file's own runs, unless :func:`trusted`.
+
+    PyTorch reads the weights with ``weights_only``; what is pickled beside them is read by :func:`unpickle`.
+
+    :param to_fly: only for ``predict``: schedules, noise and the like, which may be functions, are not read at all.
+    :raises ConfigError: a missing or damaged file, or one that may run code of its own.
+    """
+    objects: dict[str, Any] = {}
+    for key, entry in {} if trusted() else saved_data(path).items():
+        if isinstance(entry, dict) and ":serialized:" in entry:
+            unread = to_fly and key not in _TO_FLY
+            objects[key] = _STAND_INS.get(key) if unread else unpickle(entry[":serialized:"], f"model {path}: its {key}")
+    return algorithm.load(path, custom_objects=objects, **kwargs)
+
+
 def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     """The model in an SB3 ``.zip``, of any algorithm of Stable-Baselines3 (and of this package), ready for ``predict``.
 
-    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an unknown family.
+    :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown family, or with parameters
+        that are not finite; a file that may run code of its own.
     """
-    file = Path(path)
-    algorithm = saved_algorithm(file)
-    stock = "PPO" if algorithm in _OURS.values() else algorithm
+    algorithm = saved_algorithm(path)
+    stock: type[BaseAlgorithm] = getattr(stable_baselines3, "PPO" if algorithm in _OURS.values() else algorithm)
     try:
-        model: BaseAlgorithm = getattr(stable_baselines3, stock).load(file, device=device)
+        model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
+    except ConfigError:
+        raise
     except Exception as error:  # a zip whose parts do not fit raises whatever its unpickling raises
-        raise ConfigError(f"model {file}: cannot be loaded ({type(error).__name__}: {error})") from None
+        raise ConfigError(f"model {path}: cannot be loaded ({type(error).__name__}: {error})") from None
+    broken = [name for name, tensor in model.policy.state_dict().items() if not th.isfinite(tensor).all()]
+    if broken:
+        raise ConfigError(f"model {path}: {broken[0]} is not finite; no policy flies by that")
     return model

@@ -39,7 +39,7 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
         return factory(load_vehicle(vehicle))
     except SB3QuadError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
 
 
@@ -54,5 +54,5 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
     try:
         return pkgutil.resolve_name(location)
-    except Exception as error:  # whatever the module does when it is imported
+    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
         raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error

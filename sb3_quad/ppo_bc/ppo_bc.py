@@ -108,7 +108,7 @@ class PPOBC(PPO):
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
         self.bc_coef = FloatSchedule(self.bc_coef)
-        if self.expert is not None and self._will_clone():
+        if self.expert is not None and self.will_clone():
             self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
@@ -135,7 +135,7 @@ class PPOBC(PPO):
             self._check_cloning()
         self.bc_coef = FloatSchedule(bc_coef)  # a rollout under way keeps the weight by which it was labelled, or not
 
-    def _will_clone(self) -> bool:
+    def will_clone(self) -> bool:
         """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell."""
         return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())  # type: ignore[operator]
 
@@ -304,7 +304,7 @@ class PPOBC(PPO):
         progress_bar: bool = False,
     ) -> Self:
         """As ``PPO.learn``; see the class for what it raises."""
-        if self._will_clone():
+        if self.will_clone():
             self._check_cloning()
         return super().learn(
             total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar

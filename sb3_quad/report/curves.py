@@ -39,6 +39,11 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
     arrays = read_arrays(path)
     if missing := NAMES - arrays.keys():
         raise ConfigError(f"{path}: cannot be read ({', '.join(sorted(missing))}: no such array)")
+    shapes = [arrays[name].shape for name in ("timesteps", "seconds", "successes", "results")]
+    count = shapes[0][0] if shapes[0] else 0
+    right = [len(each) for each in shapes] == [1, 1, 2, 2] and all(each[0] == count for each in shapes)
+    if not (right and count and all(arrays[name].dtype.kind in "fiub" for name in NAMES)):
+        raise ConfigError(f"{path}: cannot be read (timesteps, seconds, successes and results do not fit together)")
     timesteps, seconds = (np.asarray(arrays[name], dtype=np.float64) for name in ("timesteps", "seconds"))
     return Curve(timesteps, seconds, arrays["successes"].mean(axis=1), arrays["results"].mean(axis=1))
 

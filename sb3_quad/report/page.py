@@ -2,6 +2,7 @@
 
 import base64
 import gzip
+import html
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -73,8 +74,8 @@ def render_markdown(results: Results, parts: Sequence[Section]) -> str:
     """The tables as text, for the pages of a repository: a heading, what it is about, and a table for each section."""
     blocks = [f"# Suite {results.suite}"]
     for part in parts:
-        texts = (" ".join(text.split()) for text in (part.description, part.facts) if text)
-        blocks += [f"## {part.heading}", *texts, *(table.markdown() for table in part.tables)]
+        heading, *texts = (html.escape(" ".join(text.split()), False) for text in (part.heading, part.description, part.facts))
+        blocks += [f"## {heading}", *filter(None, texts), *(table.markdown() for table in part.tables)]
     return "\n\n".join(blocks) + "\n"
 
 

@@ -19,6 +19,7 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 DEFAULT_VEHICLE = "itm"
+MAX_CONTROL_STEPS = 10**10  # of all episodes of a scenario together: about half an hour on one core
 NumberOrRange = float | tuple[float, float]
 
 
@@ -41,7 +42,9 @@ class Reference(Frozen):
     @field_validator("time_to", mode="before")
     @classmethod
     def _as_text(cls, value: Any) -> Any:
-        return {f"{key:g}" if isinstance(key, float) else str(key): time for key, time in dict(value).items()}
+        if not isinstance(value, dict):
+            raise ValueError("must map tolerances in m to times in s")
+        return {f"{key:g}" if isinstance(key, float) else str(key): time for key, time in value.items()}
 
 
 class HitSearch(Frozen):
@@ -90,6 +93,9 @@ class Scenario(Frozen):
         step = vehicle.control_step
         if self.duration < step:
             raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
+        if self.episodes * self.steps > MAX_CONTROL_STEPS:
+            together = f"{self.episodes} of {self.duration:g} s are {self.episodes * self.steps:.3g} control steps"
+            raise ValueError(f"episodes: {together}, at most {MAX_CONTROL_STEPS:.0e} are flown")
         for number, wrench in enumerate(self.wrenches):
             if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
                 raise ValueError(f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control step, {step:g} s")

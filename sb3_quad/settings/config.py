@@ -19,7 +19,7 @@ from sb3_quad.experts.resolve import DEFAULT_EXPERT
 from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping, parse_number
-from sb3_quad.settings.values import as_list, check, convert, qualified_classes
+from sb3_quad.settings.values import BASES, as_list, check, convert, import_class, qualified_classes
 from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -28,6 +28,9 @@ SETTINGS = YamlFolder(
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
+MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as many in a process
+LIMITS = {"learning_rate": (0, 1)} | dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size"), (1, 2**40))
+"""Of keywords of the algorithms: the least and the greatest."""
 
 
 def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
@@ -98,12 +101,28 @@ class TrainingConfig(Frozen):
     def _known_policy(cls, value: Any, info: ValidationInfo) -> str:
         return _one_of(get_algorithm(info.data["algo"]).policy_aliases, value, info)
 
+    @field_validator("policy_kwargs")
+    @classmethod
+    def _some_units(cls, value: dict[str, Any]) -> dict[str, Any]:
+        parts = value.get("net_arch")
+        lists = parts.values() if isinstance(parts, dict) else [parts] if isinstance(parts, list) else []
+        if any(isinstance(units, int) and units < 1 for part in lists if isinstance(part, list) for units in part):
+            raise ConfigError(f"net_arch {parts}: every layer has at least 1 unit")
+        return value
+
     @field_validator("env_kwargs", "eval_env_kwargs")
     @classmethod
     def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         for key in value:
             if info.data["env_id"] in ENVIRONMENTS and key not in FlightSettings.model_fields:
                 raise ConfigError(unknown(f"keyword of {info.data['env_id']}", key, FlightSettings.model_fields))
+        return value
+
+    @field_validator(*BASES)
+    @classmethod
+    def _known_classes(cls, value: list[tuple[str, dict[str, Any]]], info: ValidationInfo) -> list[tuple[str, dict[str, Any]]]:
+        for path, _ in value:
+            import_class(path, str(info.field_name))
         return value
 
     @field_validator("eval_tasks")
@@ -122,6 +141,8 @@ class TrainingConfig(Frozen):
 
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
+        if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
+            raise ConfigError(f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made")
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
         if not takes_expert(get_algorithm(self.algo)):
@@ -175,8 +196,8 @@ def build_config(
     parameters = constructor_parameters(get_algorithm(algo))
     check_environment(env_id)
     settings = {key: with_vehicle_path(value) if key.endswith("env_kwargs") else value for key, value in settings.items()}
-    if takes_expert(get_algorithm(algo)):
-        settings["expert"] = settings.get("expert") or DEFAULT_EXPERT  # so that config.yml names it
+    if takes_expert(get_algorithm(algo)) and settings.get("expert") is None:
+        settings["expert"] = DEFAULT_EXPERT  # so that config.yml names it
 
     def source(key: str) -> str:
         return "command line" if key in changes else where
@@ -186,7 +207,9 @@ def build_config(
             raise ConfigError(f"{source(key)}: {unknown(f'key of {algo}', key, [*JOB_KEYS, *parameters])}")
     given = {key: value for key, value in settings.items() if key in JOB_KEYS and value is not None}
     hyperparams = {
-        key: convert(value, parameters[key], f"{source(key)}: {key}") for key, value in settings.items() if key in parameters
+        key: convert(value, parameters[key], f"{source(key)}: {key}", *LIMITS.get(key, ()))
+        for key, value in settings.items()
+        if key in parameters
     }
     defaults: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
     whole = {**defaults, **given, "algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": dict(settings)}

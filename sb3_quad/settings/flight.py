@@ -27,7 +27,7 @@ class FlightSettings(Frozen):
     noise: float = Field(default=0.05, ge=0, description="relative standard deviation of the observation noise")
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
     observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
-    max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, description="control steps of an episode")
+    max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, lt=2**62, description="control steps of an episode")
 
     def given(self) -> dict[str, Any]:
         """The keywords that are not left at their defaults."""

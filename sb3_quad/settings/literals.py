@@ -10,8 +10,10 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
+from sb3_quad.base.yaml_files import LimitedLoader
 
-_NUMBER = re.compile(r"[+-]?(\d+(_\d+)*\.?\d*|\.\d+)([eE][+-]?\d+)?")
+_NUMBER = re.compile(r"[+-]?(\d+(_\d+)*(\.\d*)?|\.\d+)([eE][+-]?\d{1,9})?")
+_DIGITS = 400  # of a number, at most; Python refuses to read whole numbers of some thousands
 _ACTIVATIONS = ("ELU", "GELU", "Hardtanh", "LeakyReLU", "Mish", "ReLU", "ReLU6", "SELU", "Sigmoid", "SiLU", "Softplus", "Tanh")
 _OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
 CLASSES = (*(f"nn.{name}" for name in _ACTIVATIONS), *(f"optim.{name}" for name in _OPTIMIZERS))
@@ -24,7 +26,7 @@ def parse_number(value: Any) -> Any:
     >>> parse_number("1e-3"), parse_number("2_000"), parse_number("mse"), parse_number(3)
     (0.001, 2000, 'mse', 3)
     """
-    if not isinstance(value, str) or not _NUMBER.fullmatch(value.strip()):
+    if not isinstance(value, str) or len(value) > _DIGITS or not _NUMBER.fullmatch(value.strip()):
         return value
     return float(value) if re.search(r"[.eE]", value) else int(value)
 
@@ -85,7 +87,7 @@ class _AsLiterals(ast.NodeTransformer):
         return ast.Constant(text) if _CLASS_NAME.match(text) else node
 
 
-class ZooLoader(yaml.SafeLoader):
+class ZooLoader(LimitedLoader):
     """Of rl_zoo3's YAML, which may call any function there: ordered mappings, tuples and the names of ``CLASSES`` alone."""
 
     def construct_python(self, tag: str, node: Any) -> Any:  # torch.nn.modules.activation.Tanh becomes nn.Tanh

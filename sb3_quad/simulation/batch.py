@@ -9,17 +9,16 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.simulation.checks import per_row, whole_number
+from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
 from sb3_quad.simulation.engine.random import new_streams
-from sb3_quad.simulation.engine.work import ARRAYS, FLY, JOB, LOOK, OUTCOME, SCORE, StepArrays, step_arrays
-from sb3_quad.simulation.engine.workers import available_cpus, compilation_notice, run
+from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
+from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.state import STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-_MODE = (JOB.names or ()).index("mode")
+MAX_ROWS = 2**20
 _MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns", "limits")  # all that future flight depends on
 
 
@@ -38,10 +37,11 @@ class BatchKeywords(TypedDict, total=False):
 class QuadcopterBatch:
     """n quadcopters, each in an episode of its own; arrays in, arrays out.
 
-    :param n_envs: number of rows, at least 1.
+    :param n_envs: number of rows, from 1 to 2^20.
     :param task: name, :class:`~sb3_quad.simulation.tasks.Task`, or mixture ``{name: weight}`` sampled from at each reset.
     :param task_kwargs: fields of the task to override.
-    :param vehicle: name, path or :class:`Vehicle`; or a sequence of ``n_envs`` of them whose time steps and delays agree.
+    :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of ``n_envs`` of them whose time
+        steps and delays agree.
     :param noise: relative standard deviation of the observation noise, shape () or (n_envs,).
     :param observation_mean: μ of Eq. 3.16, shape (18,) or (n_envs, 18); None: zero.
     :param observation_std: σ of Eq. 3.16, likewise; None: Table A.2.
@@ -50,6 +50,10 @@ class QuadcopterBatch:
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
     """
+
+    _bound: Arrays
+    _sizes: dict[str, float]
+    _jobs: list[IntArray]
 
     def __init__(
         self,
@@ -65,12 +69,12 @@ class QuadcopterBatch:
         n_threads: int | None = None,
         autoreset: bool = True,
     ) -> None:
-        n = self.n = whole_number("n_envs", n_envs)
-        self.max_episode_steps = whole_number("max_episode_steps", max_episode_steps)
+        n = self.n = whole_number("n_envs", n_envs, most=MAX_ROWS)
+        self.max_episode_steps = whole_number("max_episode_steps", max_episode_steps, most=2**62)
         self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads)
         self.autoreset = autoreset
         one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
-        self.vehicle_list = _vehicles(vehicle if one_each else [vehicle] * n, n)
+        self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle] * n, n)
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
         self.vehicles = np.stack([each.parameters() for each in columns], axis=1)
         self.tasks = resolve_tasks(task, task_kwargs)
@@ -87,6 +91,7 @@ class QuadcopterBatch:
         self.returns = np.zeros(n)
         self.limits = np.full(n, self.max_episode_steps, dtype=np.int64)  # control steps of the present episodes, at most
         self.outcome = np.zeros(n, dtype=OUTCOME)
+        self.lock = batch_lock()  # held while compiled code reads and writes the arrays, and while some are replaced
         self._bind()
         self.set_noise(noise)
         self.set_observation_scaling(observation_mean, observation_std)
@@ -122,7 +127,7 @@ class QuadcopterBatch:
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
         arrays = step_arrays(self.n, array)
-        if not run(self._job_numbers, self.threads, arrays):
+        if not self._do(FLY, arrays):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
         return arrays.observations, arrays.rewards, arrays.dones
@@ -143,10 +148,12 @@ class QuadcopterBatch:
         arrays = step_arrays(self.n)
         if resetting is not None:
             arrays.dones[resetting] = True
-        self._job_numbers[_MODE] = mode
-        run(self._job_numbers, self.threads, arrays)
-        self._job_numbers[_MODE] = FLY
+        self._do(mode, arrays)
         return arrays
+
+    def _do(self, mode: int, arrays: StepArrays) -> bool:
+        with self.lock:
+            return run(self._jobs[mode], self.threads, arrays)
 
     def rows(self, rows: Rows) -> IntArray:
         """Row numbers from None (all), a number, a slice or a sequence."""
@@ -164,20 +171,26 @@ class QuadcopterBatch:
 
     def snapshot(self) -> Arrays:
         """Copies of all that future flight depends on, by name."""
-        return {name: getattr(self, name).copy() for name in _MEMORY}
+        with self.lock:
+            return {name: getattr(self, name).copy() for name in _MEMORY}
 
     def restore(self, snapshot: Arrays) -> None:
         """Undo what has happened since :meth:`snapshot`.
 
         :raises ConfigError: the snapshot is of other environments.
         """
-        for name, array in snapshot.items():
-            current = getattr(self, name, None)
-            if name not in _MEMORY or current is None or current.shape != array.shape:
+        with self.lock:
+            other = sorted(set(snapshot) - set(_MEMORY))
+            try:
+                if other:
+                    raise ConfigError(f"{other[0]}: not part of it")
+                check_arrays({**self._bound, **snapshot}, self._sizes)
+            except ConfigError as error:
                 raise ConfigError(
-                    f"the saved state of the environments does not fit these ({name}); use the run's own settings"
-                )
-            current[...] = array
+                    f"the saved state of the environments does not fit these ({error}); use the run's own settings"
+                ) from None
+            for name, array in snapshot.items():
+                getattr(self, name)[...] = array
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
         """Move targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
@@ -225,9 +238,8 @@ class QuadcopterBatch:
 
     def set_max_episode_steps(self, steps: int) -> None:
         """Control steps after which an episode is truncated, for all rows from the next step on."""
-        self.max_episode_steps = whole_number("max_episode_steps", steps)
-        self.limits[:] = self.max_episode_steps
-        self._bind()
+        most = whole_number("max_episode_steps", steps)
+        self._bind(max_episode_steps=most, limits=np.full(self.n, most, dtype=np.int64))
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
         """Set the task of all episodes that begin from now on; episodes under way end as they began.
@@ -239,55 +251,50 @@ class QuadcopterBatch:
                 "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
             )
         new = resolve_tasks(task, task_kwargs)
-        self.task, self.task_kwargs = task, dict(task_kwargs or {})
-        used, index = np.unique(self.task_index, return_inverse=True)
-        parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
-        # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
-        weights = np.concatenate([np.zeros(used.size), new.weights])
-        self.task_index[:] = index
-        self.tasks = TaskTable(parameters, weights)
-        self._bind()
+        with self.lock:
+            used, index = np.unique(self.task_index, return_inverse=True)
+            parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
+            # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
+            weights = np.concatenate([np.zeros(used.size), new.weights])
+            table = TaskTable(parameters, weights)
+            self._bind(task=task, task_kwargs=dict(task_kwargs or {}), tasks=table, task_index=index.astype(np.int64))
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
         """The columns of noise level and scaling to write for some rows, which are set apart unless one serves all."""
-        if self.mean.shape[1] < self.n:
-            if rows is None and one_for_all:
-                return np.zeros(1, dtype=np.int64)
-            self.noise_level = np.repeat(self.noise_level, self.n)
-            self.mean, self.std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-            self._bind()
+        with self.lock:
+            if self.mean.shape[1] < self.n:
+                if rows is None and one_for_all:
+                    return np.zeros(1, dtype=np.int64)
+                mean, std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
+                self._bind(noise_level=np.repeat(self.noise_level, self.n), mean=mean, std=std)
         return self.rows(rows)
 
-    def _bind(self) -> None:
-        """Write down for the compiled step where all arrays are; again whenever one is replaced."""
-        first = self.vehicle_list[0]
-        table = {"task_parameters": self.tasks.parameters, "task_weights": self.tasks.weights}
-        self._bound = {name: table[name] if name in table else getattr(self, name) for name in ARRAYS}
-        sizes = {
-            "n": self.n,
-            "delay": first.delay,
-            "substeps": first.substeps,
-            "physics_step": first.physics_step,
-            "max_steps": self.max_episode_steps,
-            "tasks": self.tasks.weights.size,
-            "vehicle_columns": self.vehicles.shape[1],
-            "scaling_columns": self.mean.shape[1],
-            "mode": FLY,
-            "autoreset": self.autoreset,
-        }
-        self.job = np.zeros(1, dtype=JOB)
-        self._job_numbers = self.job.view(np.int64)
-        for name, value in {**sizes, **{f"{name}_at": array.ctypes.data for name, array in self._bound.items()}}.items():
-            self.job[name] = value
+    def _bind(self, **replaced: Any) -> None:
+        """Replace attributes, and write down for the compiled step where all arrays are: all of it at once, or nothing."""
+        with self.lock:
+            values = {**vars(self), **replaced}
+            first, table = values["vehicle_list"][0], values["tasks"]
+            bound = {"task_parameters": table.parameters, "task_weights": table.weights}
+            bound = {name: bound[name] if name in bound else values[name] for name in ARRAYS}
+            sizes = {
+                "n": self.n,
+                "delay": first.delay,
+                "substeps": first.substeps,
+                "physics_step": first.physics_step,
+                "max_steps": values["max_episode_steps"],
+                "tasks": table.weights.size,
+                "vehicle_columns": values["vehicles"].shape[1],
+                "scaling_columns": values["mean"].shape[1],
+                "autoreset": self.autoreset,
+            }
+            vars(self).update(replaced, _bound=bound, _sizes=sizes, _jobs=new_jobs(bound, sizes))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle is made of: arrays of its own."""
+        with self.lock:
+            values = {name: value for name, value in vars(self).items() if name not in ("lock", "_bound", "_jobs")}
+            return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
-def _vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
-    if len(given) != n:
-        raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give one, or one for each")
-    loaded = {key: load_vehicle(each) for key, each in {id(each): each for each in given}.items()}  # each file once
-    vehicles = [loaded[id(each)] for each in given]
-    first = vehicles[0]
-    for row, each in enumerate(vehicles):
-        if (each.delay, each.physics_step, each.substeps) != (first.delay, first.physics_step, first.substeps):
-            raise ConfigError(f"vehicle of row {row}: delay, physics_step and control_step must be those of row 0")
-    return vehicles
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, lock=batch_lock())
+        self._bind()

@@ -3,7 +3,7 @@
 :raises ConfigError: by every function.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
 """What a start can fix, and where it lies in a state."""
@@ -77,6 +77,19 @@ def whole_number(name: str, value: Any, least: int = 1, most: int | None = None,
         limits = f"of at least {least}" if most is None else f"of {least} to {most}"
         raise ConfigError(f"{name} {value!r}: must be a whole number {limits}{unit}")
     return int(value)
+
+
+def row_vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
+    """The vehicles of n rows, whose time steps and delays must agree."""
+    if len(given) != n:
+        raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give one, or one for each")
+    loaded = {key: load_vehicle(each) for key, each in {id(each): each for each in given}.items()}  # each file once
+    vehicles = [loaded[id(each)] for each in given]
+    first = vehicles[0]
+    for row, each in enumerate(vehicles):
+        if (each.delay, each.physics_step, each.substeps) != (first.delay, first.physics_step, first.substeps):
+            raise ConfigError(f"vehicle of row {row}: delay, physics_step and control_step must be those of row 0")
+    return vehicles
 
 
 def check_size(width: int, height: int) -> None:

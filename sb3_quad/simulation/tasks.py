@@ -23,7 +23,7 @@ class Task(Frozen):
 
     name: str = Field(default="custom", min_length=1, description="what the task is called")
     start_position: tuple[float, float, float] = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
-    target_distance: NonNegativeFloat = Field(default=0.0, description="|r_T - r0|, m; 0: the target is r0")
+    target_distance: NonNegativeFloat = Field(default=0.0, description="|r_T - r0|, m, at most max_distance; 0: r0 itself")
     nearest_target: NonNegativeFloat | None = Field(
         default=None, description="if given, |r_T - r0| is uniform between this and target_distance, m"
     )
@@ -53,6 +53,9 @@ class Task(Frozen):
     def _nearest_first(self) -> "Task":
         if self.nearest_target is not None and self.nearest_target > self.target_distance:
             raise ValueError(f"nearest_target {self.nearest_target} exceeds target_distance {self.target_distance}")
+        if self.target_distance > self.max_distance:
+            beyond = f"target_distance {self.target_distance:g} exceeds max_distance {self.max_distance:g}"
+            raise ValueError(f"{beyond}: every episode would end at once")
         return self
 
     def parameters(self) -> FloatArray:

@@ -1,18 +1,22 @@
 """The vectorised environment of a job: batched, one process, or one process each; the same learning problem in all."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import gymnasium
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
+from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 import sb3_quad  # noqa: F401  (registers the environments, also in a worker process)
-from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.settings.config import TrainingConfig
-from sb3_quad.settings.values import import_class
+from sb3_quad.settings.values import instance
 
 
 class _Dummy(RowSeeds, DummyVecEnv):
@@ -20,7 +24,43 @@ class _Dummy(RowSeeds, DummyVecEnv):
 
 
 class _Subproc(RowSeeds, SubprocVecEnv):
-    pass
+    """SB3's waits for ever, when closed, for the answers of a worker process that has ended; this one ends the others.
+
+    :raises TrainingError: a worker process ended, in ``reset`` and ``step``.
+    """
+
+    def reset(self) -> VecEnvObs:
+        with _worker_errors():
+            return super().reset()
+
+    def step_async(self, actions: FloatArray) -> None:
+        with _worker_errors():
+            super().step_async(actions)
+
+    def step_wait(self) -> VecEnvStepReturn:
+        with _worker_errors():
+            return super().step_wait()
+
+    def close(self) -> None:
+        if not self.closed and (self.waiting or not all(process.is_alive() for process in self.processes)):
+            for process in self.processes:
+                process.terminate()
+                process.join()
+            for remote in self.remotes:
+                remote.close()
+            self.closed = True
+        super().close()
+
+
+@contextmanager
+def _worker_errors() -> Iterator[None]:
+    try:
+        yield
+    except (EOFError, ConnectionError):
+        raise TrainingError(
+            "a worker process of the environments ended (its error, if it had time for one, is above; else out of memory?);"
+            " vec_env dummy needs none"
+        ) from None
 
 
 def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False) -> VecEnv:
@@ -30,6 +70,7 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
 
     :param staggered: whether the first episodes end at different times, as of :class:`QuadcopterVecEnv`.
     :raises ConfigError: keywords that the environment does not take.
+    :raises TrainingError: a worker process that ended.
     """
     env: VecEnv
     try:
@@ -41,14 +82,15 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
             in_worker = config.vec_env == "subproc"
             make = partial(_make_one, config.env_id, config.env_kwargs, config.env_wrapper, in_worker)
             rows = range(n_envs) if staggered else [0] * n_envs
-            env = (_Subproc if in_worker else _Dummy)([partial(make, row, n_envs) for row in rows])
+            with _worker_errors():
+                env = (_Subproc if in_worker else _Dummy)([partial(make, row, n_envs) for row in rows])
             env.seed(seed)
     except SB3QuadError:
         raise
     except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(f"{config.env_id}: cannot be made with env_kwargs {config.env_kwargs} ({error})") from error
     for path, kwargs in config.vec_env_wrapper:
-        env = import_class(path, "vec_env_wrapper")(env, **kwargs)
+        env = instance(path, "vec_env_wrapper", env, **kwargs)
     return env
 
 
@@ -61,7 +103,7 @@ def _make_one(
     limit = (made.spec and made.spec.max_episode_steps) or 0
     env: gymnasium.Env[Any, Any] = Monitor(_FirstEpisode(made, limit - row * limit // n_envs) if row and limit else made)
     for path, wrapper_kwargs in wrappers:
-        env = import_class(path, "env_wrapper")(env, **wrapper_kwargs)
+        env = instance(path, "env_wrapper", env, **wrapper_kwargs)
     return env
 
 

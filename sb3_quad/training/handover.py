@@ -8,6 +8,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line
+from sb3_quad.base.memory import check_unpacked
 
 
 def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
@@ -20,8 +21,11 @@ def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
         first that does.
     """
     try:
+        check_unpacked(path)
         _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")  # unpickles nothing
         theirs, ours = dict(parameters["policy"]), model.policy.state_dict()
+    except ConfigError:
+        raise
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except Exception as error:  # what a damaged archive raises depends on where the damage is

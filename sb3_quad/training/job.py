@@ -3,7 +3,7 @@
 from typing import Annotated, Any
 
 import torch as th
-from pydantic import AfterValidator, Field, PositiveInt
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import check_seed
@@ -34,6 +34,7 @@ class TrainingJob(Frozen):
     n_eval_envs: PositiveInt | None = Field(default=None, description="None: as many as episodes if batched, else 1")
     eval_env_kwargs: dict[str, Any] | None = Field(default=None, description="put over env_kwargs in evaluations")
     save_freq: int = Field(default=-1, description="timesteps between checkpoints; below 1 none")
+    snapshot_every: NonNegativeFloat = Field(default=60.0, description="seconds between snapshots to resume from; 0: none")
     log_interval: PositiveInt = Field(default=1, description="rollouts between two lines of the log")
     tensorboard_log: str | None = Field(default=None, description="folder for TensorBoard")
     progress: bool = Field(default=False, description="whether to show a progress bar")

@@ -23,9 +23,11 @@ import yaml
 from pydantic import Field, PositiveInt
 
 from sb3_quad.base.errors import ConfigError, TrainingError
-from sb3_quad.base.files import save_model, write_text
+from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.experts.models import load_zip, saved_data
 from sb3_quad.report.curves import read_curve
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
@@ -75,6 +77,7 @@ class StageResult(Frozen):
 
     run: str = Field(description="its run folder")
     agent: str = Field(description="the zip that is passed on")
+    trimmed: bool = Field(default=True, description="whether that is done, where the stage is to be trimmed")
     timesteps: int
     seconds: float = Field(description="of training; of a stage that was resumed, since then")
 
@@ -151,14 +154,14 @@ def run_pipeline(
 
 
 def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **changes: Any) -> PipelineResult:
-    """Go on with an interrupted pipeline: within the stage that was interrupted, then with the stages after it.
+    """Go on with an interrupted or killed pipeline: within the stage that was under way, then with the stages after it.
+
+    One whose stages are all done is returned as it is.
 
     :param changes: arguments of the jobs to change, as for :func:`~sb3_quad.training.trainer.resume`.
-    :raises ConfigError: a folder without an interrupted pipeline, or with a damaged ``pipeline.yml``.
+    :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
     """
     status = validate(Status, *SETTINGS.read(folder / STATUS_FILE))
-    if len(status.done) == len(status.stages):
-        raise ConfigError(f"{folder}: all stages of this pipeline are done")
     status = status.model_copy(update={"job": {**status.job, **changes}})
     return _go_on(folder, status, _make_jobs(status), report, **changes)
 
@@ -179,34 +182,74 @@ def _make_jobs(status: Status) -> list[TrainingJob]:
 def _go_on(
     folder: Path, status: Status, jobs: list[TrainingJob], report: Callable[[str], None], **changes: Any
 ) -> PipelineResult:
-    done, current, exit_code = list(status.done), status.current, 0
+    done = list(status.done)
 
     def write(under_way: str | None) -> None:
         content = status.model_copy(update={"done": tuple(done), "current": under_way})
         text = yaml.safe_dump(content.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
         write_text(folder / STATUS_FILE, text)
 
-    for stage, job in list(zip(status.stages, jobs, strict=True))[len(done) :]:
-        report(f"{stage.name}: {describe(job)}")
-        if current is not None and open_run(current).resume_state.is_file():
-            result = resume(current, report, **changes)
-        else:
-            start = job.model_copy(update={"trained_agent": done[-1].agent}) if done else job
-            result = train(start, report, on_start=lambda run: write(str(run.path)))
-        current, exit_code = None, result.exit_code
-        if exit_code != 0:
-            report(f"to go on with the whole pipeline: --resume {folder}")
-            break
-        agent, seconds = _passed_on(stage, job, result.run, report), round(result.seconds, 1)
-        timesteps = result.model.num_timesteps
-        done.append(StageResult(run=str(result.run.path), agent=str(agent), timesteps=timesteps, seconds=seconds))
-        write(None)
+    with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
+        try:
+            write(status.current)
+            for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
+                if number == len(done):
+                    report(f"{stage.name}: {describe(job)}")
+                    current = status.current if number == len(status.done) else None
+                    start = job.model_copy(update={"trained_agent": done[-1].agent}) if done else job
+                    entry = _train_stage(stage, start, current, report, write, changes)
+                    if entry is not None:
+                        done.append(entry)
+                        write(None)
+                if signals.received is not None:
+                    break
+                if not done[number].trimmed:
+                    agent = _trim(stage, job, open_run(done[number].run), done[number].agent, report)
+                    done[number] = done[number].model_copy(update={"agent": str(agent), "trimmed": True})
+                    write(None)
+        except KeyboardInterrupt:
+            if signals.received is None:
+                raise
+    if signals.received is not None:
+        report(f"to go on with the whole pipeline: --resume {folder}")
     names = [stage.name for stage in status.stages[: len(done)]]
-    return PipelineResult(folder, dict(zip(names, done, strict=True)), jobs[0], exit_code)
+    return PipelineResult(folder, dict(zip(names, done, strict=True)), jobs[0], signals.exit_code)
 
 
-def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]) -> Path:
-    """The zip that a stage passes on; a trimmed one lies beside the agent that was trimmed.
+def _train_stage(
+    stage: Stage,
+    job: TrainingJob,
+    current: str | None,
+    report: Callable[[str], None],
+    write: Callable[[str | None], None],
+    changes: Mapping[str, Any],
+) -> StageResult | None:
+    """Train a stage, or what is left of it; None if it was interrupted.
+
+    :param current: its run folder, if it has one already.
+    :param write: told of its run folder if it gets one.
+    """
+    run = None if current is None else open_run(current)
+    timesteps, seconds = 0, 0.0
+    if run is not None and run.model.is_file() and not run.resume_state.is_file():  # killed before that was noted
+        timesteps = int(saved_data(run.model)["num_timesteps"])
+        seconds = float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
+    if run is None or timesteps < job.config.n_timesteps:
+        if run is not None and (run.not_begun or run.resume_state.is_file()):
+            result = resume(str(run.path), report, **changes)
+        else:
+            result = train(job, report, on_start=lambda begun: write(str(begun.path)))
+        if result.exit_code != 0:
+            return None
+        run, timesteps, seconds = result.run, result.model.num_timesteps, result.seconds
+    agent = _passed_on(stage, run)
+    return StageResult(
+        run=str(run.path), agent=str(agent), trimmed=stage.trim is None, timesteps=timesteps, seconds=round(seconds, 1)
+    )
+
+
+def _passed_on(stage: Stage, run: RunFolder) -> Path:
+    """The zip that a stage passes on, before it is trimmed.
 
     :raises TrainingError: its best evaluation misses the stage's requirement.
     """
@@ -220,10 +263,13 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[
                 f"stage {stage.name!r}: success {success:.3f} and mean reward {reward:.2f} miss what it requires "
                 f"(success_rate {stage.require.success_rate:g}, mean_reward {wanted:g}); its run is {run.path}"
             )
-    agent = run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
-    if stage.trim is None:
-        return agent
-    model = get_algorithm(job.config.algo).load(agent, device=job.device)
+    return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
+
+
+def _trim(stage: Stage, job: TrainingJob, run: RunFolder, agent: str, report: Callable[[str], None]) -> Path:
+    """Trim a stage's agent; the trimmed one lies beside it."""
+    assert stage.trim is not None
+    model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
     trimmed, words = TRIMS[stage.trim]
     did = trimmed(model, seed_for("trim", job.seed), job.flight_settings)
     save_model(model, run.trimmed_model)

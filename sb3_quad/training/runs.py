@@ -35,8 +35,8 @@ class RunFolder:
         self.trimmed_model = path / TRIMMED  # the same after trimming, where a pipeline does that
         self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
-        self.resume_state = path / "resume.npz"  # of an interrupted run: random numbers and environments
-        self.dataset = path / "dataset.npz"  # of an interrupted run
+        self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run
+        self.dataset = path / "dataset.npz"  # that of an interrupted run, in version 0.1
         self.config = path / name / "config.yml"  # the settings
         self.arguments = path / name / "args.yml"  # of the command line; env_kwargs: what the agent is judged with
         self.command = path / name / "command.txt"  # what was typed
@@ -45,6 +45,11 @@ class RunFolder:
     def result(self) -> Path:
         """What the run has to offer: its trimmed agent, else its best one, else its last one."""
         return run_agent(self.path, self.name)
+
+    @property
+    def not_begun(self) -> bool:
+        """Whether the run ended before its first rollout: it holds neither a snapshot nor any model."""
+        return not self.resume_state.is_file() and not any(self.path.glob("*.zip"))
 
     def checkpoint(self, timesteps: int) -> Path:
         """Where the model after ``timesteps`` goes."""

@@ -1,6 +1,6 @@
 """Running a training job: from its settings to a run folder with a model, whatever happens on the way.
 
-The snapshot of an interrupted run lies between two rollouts. Where the environments can be restored (the batched one can), the
+A snapshot of a run lies between two rollouts. Where the environments can be restored (the batched one can), the
 resumed run is bit for bit the one that was not interrupted; elsewhere episodes start anew.
 """
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
+import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
@@ -20,24 +21,28 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import one_line, read_arrays, save_model, write_arrays, write_bytes
+from sb3_quad.base.files import locked, one_line, save_model, write_bytes
+from sb3_quad.base.memory import check_memory
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import ENVIRONMENT, LastGoodModel, Snapshot, set_random_state
+from sb3_quad.callbacks.interruption import LastGoodModel
+from sb3_quad.experts.controller import Controller
 from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.settings.algorithms import get_algorithm, takes_expert
 from sb3_quad.settings.config import TrainingConfig, build_config
-from sb3_quad.settings.values import import_class
+from sb3_quad.settings.values import instance
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
+from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
 
+ROLLOUT_COLUMNS = 6  # of a rollout buffer, float32 each, beside observations and actions
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 EvalEnvs = dict[str | None, VecEnv]
@@ -49,7 +54,7 @@ class TrainingResult:
 
     :param seconds: wall-clock time of the training, evaluations along the way included.
     :param signal: the name of the signal that interrupted it, empty if none did.
-    :param exit_code: 0; 130 after SIGINT, 143 after SIGTERM.
+    :param exit_code: 0; 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP.
     """
 
     job: TrainingJob
@@ -77,19 +82,22 @@ def train(
     check_tensorboard(job)
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
-        if job.trained_agent is not None:
-            transfer_policy(job.trained_agent, model)
+        callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
         run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
-        run.write_yaml(config.settings, job.arguments() | made_with())
-        on_start(run)
-        return _learn(job, run, model, eval_envs, signals, report, should_continue)
+        with locked(run.path, "run folder"):
+            run.write_yaml(config.settings, job.arguments() | made_with())
+            on_start(run)
+            return _learn(job, run, model, eval_envs, callbacks, signals, report, should_continue)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
-    """Go on with an interrupted run, in its folder: same settings, seed, optimiser, schedules, dataset and step count.
+    """Go on with an interrupted or killed run, in its folder: same settings, seed, optimiser, dataset and step count.
+
+    A run that has not come to its first rollout is begun.
 
     :param changes: arguments of the job to change, such as ``progress``.
-    :raises SB3QuadError: a folder without an interrupted run, or with damaged files; else as :func:`train`.
+    :raises SB3QuadError: a folder without such a run, one that another process trains, or with damaged files; else as
+        :func:`train`.
     """
     run = open_run(run_folder)
     settings, arguments = run.read_yaml()
@@ -99,12 +107,15 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs", *MADE_WITH)}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
     check_tensorboard(job)
-    with StopSignals() as signals, _environments(job) as (env, eval_envs):
-        attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
-        model = _load_snapshot(run, config.algo, env, job.device, **attributes)
-        env.seed(seed_for("training", job.seed))  # as in build_model
+    with StopSignals() as signals, locked(run.path, "run folder"), _environments(job) as (env, eval_envs):
+        if run.not_begun:
+            model = build_model(job, env)
+        else:
+            attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
+            model = load_snapshot(run, config.algo, env, job.device, **attributes)
+            env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
-        return _learn(job, run, model, eval_envs, signals, report)
+        return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
 
 
 def check_tensorboard(job: TrainingJob) -> None:
@@ -150,12 +161,21 @@ def _expert(config: TrainingConfig) -> dict[str, Any]:
     return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
 
 
-def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
-    """The algorithm of a job, new.
+def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
+    """Those that the settings name."""
+    return [instance(path, "callback", **kwargs) for path, kwargs in config.callback]
 
-    :raises ConfigError: settings that it refuses.
+
+def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
+    """The algorithm of a job, new, with the policy that it starts from.
+
+    :raises ConfigError: settings that it refuses, or for which this machine has too little memory; an agent that does not fit.
+    :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
+    numbers = sum(int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space)) + ROLLOUT_COLUMNS
+    n_steps = config.keyword("n_steps")
+    check_memory(f"n_steps {n_steps:,} by n_envs {env.num_envs:,}", 4.0 * numbers * n_steps * env.num_envs)
     keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
@@ -166,10 +186,16 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         raise
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
+    asked: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
+    if asked():  # an expert that fails does so before there is a run folder
+        observation: Any = env.reset()
+        Controller.for_env(keywords["expert"], env).labels(observation)
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
         rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
     env.seed(seed_for("training", job.seed))  # SB3 has just seeded it with the seed of the policy
+    if job.trained_agent is not None:
+        transfer_policy(job.trained_agent, model)
     return model
 
 
@@ -178,11 +204,12 @@ def _learn(
     run: RunFolder,
     model: OnPolicyAlgorithm,
     eval_envs: EvalEnvs,
+    own_callbacks: list[BaseCallback],
     signals: StopSignals,
     report: Report,
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
-    last_good, best = LastGoodModel(), None
+    last_good, best = SnapshotFile(run, job.snapshot_every, report), None
     if job.config.task is not None and not (job.config.env_wrapper or job.config.vec_env_wrapper):  # flights have none
         job.flight_settings.write_into(model)
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
@@ -202,21 +229,24 @@ def _learn(
         callbacks.append(best)
     if job.save_freq > 0:
         callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
-    callbacks += [import_class(path, "callback")(**kwargs) for path, kwargs in job.config.callback]
+    callbacks += own_callbacks
     if job.progress:
         callbacks.append(ProgressBar())
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
     start = time.perf_counter()
     try:
-        model.learn(
-            job.config.n_timesteps - model.num_timesteps,
-            callback=callbacks,
-            log_interval=job.log_interval,
-            tb_log_name=f"{job.config.algo}_{run.path.name}",
-            reset_num_timesteps=model.num_timesteps == 0,
-        )
-        if best is not None and signals.received is None and not best.stopped:
-            best.evaluate()
+        try:
+            model.learn(
+                job.config.n_timesteps - model.num_timesteps,
+                callback=callbacks,
+                log_interval=job.log_interval,
+                tb_log_name=f"{job.config.algo}_{run.path.name}",
+                reset_num_timesteps=model.num_timesteps == 0,
+            )
+            if best is not None and signals.received is None and not best.stopped:
+                best.evaluate()
+        finally:
+            signals.hold()
     except (Exception, KeyboardInterrupt) as error:
         if signals.received is None:
             _save_after(error, run, last_good, model)
@@ -224,17 +254,18 @@ def _learn(
     seconds = time.perf_counter() - start
     if signals.received is None:
         save_model(model, run.model)
-        for only_interrupted in (run.resume_state, run.dataset):
-            only_interrupted.unlink(missing_ok=True)
+        for only_meanwhile in (run.resume_state, run.dataset):
+            only_meanwhile.unlink(missing_ok=True)
         return TrainingResult(job, run, model, seconds)
+    after = "before the first rollout"
     if last_good.snapshot is not None:
-        _write_snapshot(run, last_good.snapshot, model)
-        report(
-            f"interrupted by {signals.name} after {last_good.snapshot.timesteps:,} timesteps: model saved to {run.model}; "
-            f"to go on: --resume {run.path}"
-        )
-    else:
-        report(f"interrupted by {signals.name} before the first rollout: nothing to save in {run.path}")
+        after = f"after {last_good.snapshot.timesteps:,} timesteps: model saved to {run.model}"
+        write_bytes(run.model, last_good.snapshot.model)  # first: it needs the least room
+        try:
+            last_good.write()
+        except ConfigError as error:
+            raise ConfigError(f"{error}; interrupted {after}") from error
+    report(f"interrupted by {signals.name} {after}; to go on: --resume {run.path}")
     return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
 
 
@@ -243,7 +274,10 @@ def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, 
     snapshot = last_good.snapshot
     if snapshot is None:
         return
-    write_bytes(run.model, snapshot.model)
+    try:
+        write_bytes(run.model, snapshot.model)
+    except ConfigError as second:  # the disk is full for both; what failed first is what counts
+        raise type(error)(f"{error}; nor could the model be saved: {second}") from error
     where = f"the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
         raise type(error)(f"{error}; {where}") from error
@@ -252,47 +286,3 @@ def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, 
         raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate; {where}") from error
     if hasattr(error, "add_note"):  # Python 3.11 and later
         error.add_note(where)
-
-
-def _write_snapshot(run: RunFolder, snapshot: Snapshot, model: OnPolicyAlgorithm) -> None:
-    """Write the snapshot's model, random numbers and environments, and the dataset if there is one.
-
-    :raises ConfigError: a folder that cannot be written, a full disk.
-    """
-    if hasattr(model, "save_dataset"):
-        model.save_dataset(run.dataset)
-    state: dict[str, Any] = {"timesteps": snapshot.timesteps, **snapshot.state}
-    write_arrays(run.resume_state, **state)
-    write_bytes(run.model, snapshot.model)
-
-
-def _load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> OnPolicyAlgorithm:
-    """The model of an interrupted run, ready for ``learn(…, reset_num_timesteps=False)``.
-
-    :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
-    :raises ConfigError: a file that is missing or damaged.
-    """
-    if not run.resume_state.is_file():
-        raise ConfigError(f"run folder {run.path}: holds no interrupted run; to train its model further use -i {run.model}")
-    state = read_arrays(run.resume_state)
-    environment = {name.removeprefix(ENVIRONMENT): array for name, array in state.items() if name.startswith(ENVIRONMENT)}
-    try:
-        model = get_algorithm(algo).load(run.model, env=env, device=device, force_reset=not environment, **attributes)
-    except ConfigError:
-        raise
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(f"{run.model}: not a complete SB3 zip ({one_line(error)})") from None
-    if model.num_timesteps != int(state["timesteps"]):
-        raise ConfigError(
-            f"run folder {run.path}: {run.model.name} is after {model.num_timesteps:,} timesteps, "
-            f"{run.resume_state.name} after {int(state['timesteps']):,}; they belong to different interruptions"
-        )
-    if hasattr(model, "load_dataset"):
-        model.load_dataset(run.dataset)
-    batch: Any = getattr(env.unwrapped, "batch", None)
-    if environment and batch is None:
-        raise ConfigError(f"{run.resume_state}: holds the state of batched environments; use the run's own settings")
-    if environment:
-        batch.restore(environment)
-    set_random_state(state)
-    return model

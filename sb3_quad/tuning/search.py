@@ -5,11 +5,12 @@ import json
 import math
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from optuna import Trial
-from optuna.exceptions import OptunaError
+from optuna.exceptions import OptunaError, UpdateFinishedTrialError
 from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
@@ -19,7 +20,7 @@ from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace, current
-from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, open_study
+from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, dead_trials, open_study, owned
 
 BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
@@ -86,6 +87,7 @@ class Search:
         failures = 0
         try:
             for number in range(n_trials):
+                self._free_dead_trials()
                 if signals.received is not None or len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                     break
                 trial = ask(self.study, self.sampler, self.job.seed, self.n_startup_trials)
@@ -109,13 +111,24 @@ class Search:
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
     def _train(self, trial: Trial) -> None:
-        """Train as a trial says, and tell the study how it ended. One that is interrupted will be tried again."""
+        """Train as a trial says, and tell the study how it ended."""
         state, value, error = "FAIL", None, INTERRUPTED
         try:
-            state, value = self._outcome(trial)
+            with owned(trial):
+                state, value = self._outcome(trial)
         except Exception as failure:  # whatever a choice of settings leads to, the next one may fare better
             error = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
         finally:
+            self._tell(trial, state, value, error)
+
+    def _free_dead_trials(self) -> None:
+        """Have the trials of processes that were killed tried again."""
+        for dead in dead_trials(self.study):
+            self._tell(Trial(self.study, dead._trial_id), "FAIL", None, INTERRUPTED)
+
+    def _tell(self, trial: Trial, state: str, value: float | None, error: str) -> None:
+        """Tell the study how a trial ended, unless one that took this process for dead did; if interrupted, try it again."""
+        with suppress(UpdateFinishedTrialError):
             if state == "FAIL":
                 trial.set_user_attr(ERROR, error)
             self.study.tell(trial, value, state=TrialState[state])
@@ -130,6 +143,7 @@ class Search:
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
         rollout = int(current(config.algo, config.hyperparams, "n_steps")) * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
+        every = total // count + 1 if count > 1 else -1  # never due with the last timestep: that one follows the last update
         evaluations: list[tuple[float, float]] = []
 
         def value() -> float:
@@ -144,8 +158,7 @@ class Search:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
             result = train(
-                # Never due with the last timestep: that evaluation follows the last update.
-                self.job.model_copy(update={"config": config, "eval_freq": total // count + 1 if count > 1 else -1}),
+                self.job.model_copy(update={"config": config, "eval_freq": every, "snapshot_every": 0}),
                 report=lambda line: None,
                 on_start=lambda run: trial.set_user_attr(RUN, str(run.path)),
                 should_continue=should_continue,

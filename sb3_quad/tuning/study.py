@@ -1,8 +1,12 @@
 """Optuna's studies: where they are remembered, what proposes their trials, what cuts them short."""
 
+import os
+import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event, Thread
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +16,8 @@ from optuna.exceptions import DuplicatedStudyError
 from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
 from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
 from optuna.storages import JournalStorage
-from optuna.storages.journal import JournalFileBackend
+from optuna.storages.journal import JournalFileBackend, JournalFileSymlinkLock
+from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line
@@ -28,6 +33,9 @@ PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {  # from n_startup_tr
     "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
     "none": lambda n, evaluations: NopPruner(),
 }
+LINE = b'{"op_code":'  # begins every line of a journal
+OWNER = "owner"  # user attribute of a trial: the machine and process that train it, and when they last said so
+SIGN, LEASE = 20.0, 120.0  # s between two signs of life; without any for so long, a process counts as dead
 PATIENCE = 10.0  # s to wait for the process that begins a study to say what it began with
 
 
@@ -50,7 +58,7 @@ def open_study(
     try:
         if storage is not None and "://" not in str(storage):
             Path(storage).parent.mkdir(parents=True, exist_ok=True)
-            opened = JournalStorage(JournalFileBackend(str(opened)))
+            opened = JournalStorage(_Journal(str(opened)))
         try:
             study, new = optuna.create_study(study_name=name, storage=opened, direction=direction), True
         except DuplicatedStudyError:
@@ -69,6 +77,33 @@ def open_study(
     return study, study.user_attrs.get(attribute)
 
 
+class _Journal(JournalFileBackend):
+    """A journal file whose last line, where a full disk has cut it, is dropped before the next one is appended to it."""
+
+    def __init__(self, path: str) -> None:
+        self._path, self._own_lock = Path(path), JournalFileSymlinkLock(path)
+        super().__init__(path, self._own_lock)
+
+    def append_logs(self, logs: list[dict[str, Any]]) -> None:
+        """As Optuna's.
+
+        :raises ValueError: a file that ends as no journal does.
+        """
+        with self._path.open("rb+") as file:
+            if file.seek(0, os.SEEK_END) and (file.seek(-1, os.SEEK_CUR), file.read())[1] != b"\n":
+                self._own_lock.acquire()  # another process may be in the middle of a line
+                try:
+                    file.seek(0)
+                    content = file.read()
+                    whole = content.rfind(b"\n") + 1
+                    if content[whole : whole + len(LINE)] != LINE[: len(content) - whole]:
+                        raise ValueError("its last line is not a journal's")
+                    file.truncate(whole)
+                finally:
+                    self._own_lock.release()
+        super().append_logs(logs)
+
+
 def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
     """The next trial of a study. What is proposed depends on ``seed``, the trial's number and the trials known.
 
@@ -82,3 +117,49 @@ def ask(study: Study, sampler: str, seed: int, n_startup_trials: int) -> Trial:
     own = int(np.random.SeedSequence([seed, trial.number]).generate_state(1)[0])
     study.sampler = SAMPLERS[sampler](own, n_startup_trials)
     return Trial(study, trial._trial_id)
+
+
+@contextmanager
+def owned(trial: Trial) -> Iterator[None]:
+    """Within the block, a thread tells the study every 20 s that this process still trains a trial.
+
+    Optuna's heartbeats do the same, for databases alone.
+    """
+    ended = Event()
+
+    def sign() -> None:
+        trial.set_user_attr(OWNER, [platform.node(), os.getpid(), time.time()])
+
+    def keep_signing() -> None:
+        while not ended.wait(SIGN):
+            with suppress(Exception):  # a storage that fails is told of by who trains
+                sign()
+
+    thread = Thread(target=keep_signing, daemon=True)
+    try:
+        sign()
+        thread.start()
+        yield
+    finally:
+        ended.set()
+        if thread.ident is not None:
+            thread.join()
+
+
+def dead_trials(study: Study) -> list[FrozenTrial]:
+    """The trials that are said to run, but whose process is gone from this machine or has given no sign of life for 120 s."""
+    running = study.get_trials(deepcopy=False, states=[TrialState.RUNNING])
+    return [trial for trial in running if _is_dead(trial)]
+
+
+def _is_dead(trial: FrozenTrial) -> bool:
+    begun = trial.datetime_start.timestamp() if trial.datetime_start else 0.0
+    machine, process, last = trial.user_attrs.get(OWNER, ["", 0, begun])
+    if machine == platform.node():
+        try:
+            os.kill(process, 0)  # does nothing but fail where there is none
+        except ProcessLookupError:
+            return True
+        except PermissionError:  # another user's
+            pass
+    return bool(time.time() - last > LEASE)

@@ -15,6 +15,7 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.vehicles.gains import GeometricGains
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
+MAX_SUBSTEPS = 1000  # physics steps in a control step
 PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
@@ -23,6 +24,7 @@ PARAMETER_NAMES = (
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
 )
+NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 OTHER_LIMITS = {
     "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
     "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
@@ -42,7 +44,9 @@ class Vehicle(Frozen):
 
     other_keys = tuple(OTHER_LIMITS)
 
-    name: str = Field(min_length=1, description="what the vehicle is called")
+    name: str = Field(
+        pattern=NAME, description="what the vehicle is called; up to 100 characters, none of / \\ < > or control"
+    )
     mass: PositiveFloat = Field(description="m, kg")
     inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2"
@@ -103,6 +107,9 @@ class Vehicle(Frozen):
         substeps = self.control_step / self.physics_step
         if abs(substeps - round(substeps)) > 1e-9 or round(substeps) < 1:
             raise ValueError(f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step}")
+        if substeps > MAX_SUBSTEPS:
+            found = f"makes {round(substeps)} physics steps of a control step"
+            raise ValueError(f"physics_step {self.physics_step:g}: {found}, at most {MAX_SUBSTEPS} are allowed")
         if self.motor_gain * self.physics_step > 1.0:
             raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
         mixer = self.mixer

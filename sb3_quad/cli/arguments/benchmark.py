@@ -8,14 +8,14 @@ examples:
 
 import argparse
 
-from sb3_quad.cli.parser import Parser, positive
+from sb3_quad.cli.parser import Parser, above_zero, positive
 
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("--sizes", nargs="+", type=positive, default=[64, 240, 1024, 4096, 16384], metavar="N", help="rows of the batch")
     add("--n-envs", type=positive, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
-    add("--seconds", type=float, default=3.0, metavar="S", help="duration of each measurement (3)")
+    add("--seconds", type=above_zero, default=3.0, metavar="S", help="duration of each measurement (3)")
     add("--algo", default="ppo_bc", help="algorithm of the training loop (ppo_bc)")
     add("-conf", "--conf-file", metavar="FILE", help="its settings (those of train without arguments)")
     add("--training", action=argparse.BooleanOptionalAction, default=True, help="also measure a training loop")

@@ -15,7 +15,7 @@ Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip
 
 import argparse
 
-from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, whole
+from sb3_quad.cli.parser import BRIDGE, TRUST, Pairs, Parser, above_zero, natural, pointers, positive, whole
 
 LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects"
 DEFAULT_ENV = "QuadTargetTracking-v0"
@@ -59,12 +59,13 @@ def add_flight_arguments(parser: Parser) -> None:
     last = "last checkpoint"
     which.add_argument("--load-last-checkpoint", dest="which", action="store_const", const=last, help=f"the {last}")
     add("--n-envs", type=positive, default=1, metavar="N", help="episodes side by side, with consecutive seeds (1)")
-    add("--seed", type=whole, default=0, metavar="N", help="seed of the first episode (0); later ones count up")
+    add("--seed", type=natural, default=0, metavar="N", help="seed of the first episode (0); later ones count up")
     actions = parser.add_mutually_exclusive_group()
     actions.add_argument("--deterministic", action="store_true", help="fly the mean of a policy's actions (default)")
     actions.add_argument("--stochastic", action="store_true", help="sample from a policy's actions")
     add("--env-kwargs", action=Pairs, nargs="+", default={}, metavar="K:V", help="environment keywords, such as noise:0")
+    add("--trust", action="store_true", help=TRUST)
     add("--size", default="", metavar="WxH", help="size of one controller's panel, pixels")
-    add("--speed", type=float, default=1.0, metavar="X", help="playback speed of film and window; 0.5 is slow motion (1)")
+    add("--speed", type=above_zero, default=1.0, metavar="X", help="playback speed of film and window; 0.5 is slow motion (1)")
     add("--overwrite", action="store_true", help="replace existing files")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar of a film (in a terminal: yes)")

@@ -21,7 +21,7 @@ Results are kept in a folder: the same command again flies only what is missing,
 
 import argparse
 
-from sb3_quad.cli.parser import Parser, whole
+from sb3_quad.cli.parser import TRUST, Parser, whole
 
 DEFAULT_FOLDER = "evaluations"
 
@@ -38,6 +38,7 @@ def add_arguments(parser: Parser) -> None:
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
+    add("--trust", action="store_true", help=TRUST)
     add("--overwrite", action="store_true", help="replace results of these controllers from other settings")
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="update report.html and its plots (yes)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")

@@ -13,7 +13,7 @@ examples:
 ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. A C header needs a C compiler to check it.
 """
 
-from sb3_quad.cli.parser import Parser
+from sb3_quad.cli.parser import TRUST, Parser
 from sb3_quad.pretrained_policies import agent_path
 
 
@@ -26,4 +26,5 @@ def add_arguments(parser: Parser) -> None:
     add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
     add("--vehicle", metavar="VEHICLE", help="name or YAML file (the one that the zip or its run folder says)")
     add("--name", metavar="NAME", help="name the C function NAME_policy (the file's name without its ending)")
+    add("--trust", action="store_true", help=TRUST)
     add("--overwrite", action="store_true", help="replace FILE if it exists")

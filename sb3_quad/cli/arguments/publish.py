@@ -10,7 +10,7 @@ examples:
 How it was trained is taken from its run folder. What is recorded nowhere, the card calls so.
 """
 
-from sb3_quad.cli.parser import Parser, positive
+from sb3_quad.cli.parser import TRUST, Parser, positive
 from sb3_quad.pretrained_policies import agent_path
 
 
@@ -22,4 +22,5 @@ def add_arguments(parser: Parser) -> None:
     add("-o", metavar="FOLDER", dest="folder", default=".", help="folder for both (here)")
     add("--command", metavar="TEXT", dest="made_by", help="the command that trained it (command.txt of the run)")
     add("--episodes", type=positive, default=960, metavar="N", help="episodes of each task (960; recoveries: 4 times as many)")
+    add("--trust", action="store_true", help=TRUST)
     add("--overwrite", action="store_true", help="replace existing files")

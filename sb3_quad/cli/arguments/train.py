@@ -17,7 +17,7 @@ examples:
 
 import argparse
 
-from sb3_quad.cli.parser import BRIDGE, Pairs, Parser, pointers, positive, seed, whole
+from sb3_quad.cli.parser import BRIDGE, TRUST, Pairs, Parser, pointers, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
 DEFAULT_PIPELINE = "two_stage.yml"
@@ -55,6 +55,7 @@ def add_settings(parser: Parser) -> None:
     add("-i", "--trained-agent", type=agent_path, metavar="ZIP", help=start)
     add("--n-eval-envs", type=whole, metavar="N", help="environments of an evaluation (batch: one per episode; else 1)")
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
+    add("--trust", action="store_true", help=TRUST)
     add("--device", help="cpu (default), cuda or auto")
     add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
 
@@ -64,13 +65,15 @@ def add_arguments(parser: Parser) -> None:
     add_settings(parser)
     add = parser.add_argument
     add("--reference", action="store_true", help="with a pipeline: also train PPO alone on the same budget, for comparison")
-    add("--resume", metavar="RUN_FOLDER", help="continue an interrupted run with all its settings")
+    add("--resume", metavar="RUN_FOLDER", help="continue an interrupted or killed run with all its settings")
     add("-f", "--log-folder", metavar="DIR", help="folder for the run folders (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a UUID to the run folder's name")
     add("--seed", type=seed, help="seed (0); negative: a random one, recorded in args.yml")
     add("--eval-freq", type=whole, metavar="N", help="timesteps between evaluations (250000); below 1: one at the end")
     add("--eval-episodes", type=whole, metavar="N", help="episodes per evaluation (48); 0: no evaluations")
     add("--save-freq", type=whole, metavar="N", help="timesteps between checkpoints (none)")
+    snapshots = "seconds between snapshots, from which --resume goes on after a crash (60); 0: none"
+    add("--snapshot-every", type=float, metavar="SECONDS", help=snapshots)
     add("--log-interval", type=whole, metavar="N", help="rollouts between two tables of --verbose 1 (1)")
     add("-tb", "--tensorboard-log", metavar="DIR", help="folder for TensorBoard")
     add("--verbose", type=int, choices=(0, 1, 2), help="1: SB3's tables, 2: debugging (0)")

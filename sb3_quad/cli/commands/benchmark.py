@@ -4,7 +4,6 @@ import argparse
 import json
 from dataclasses import asdict
 
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.cli.output import console
 from sb3_quad.evaluation.tables import text_table
@@ -14,8 +13,6 @@ from sb3_quad.training.benchmark import ENV_ID, machine, single, training_loop, 
 
 def run(options: argparse.Namespace) -> int:
     """Measure, print, write. Returns the exit code."""
-    if options.seconds <= 0:
-        raise ConfigError(f"--seconds {options.seconds:g}: must be above 0")
     screen = console()
     config = load_config(options.algo, ENV_ID, options.conf_file) if options.training else None
     measurements = []

@@ -97,8 +97,6 @@ def _check(options: argparse.Namespace, window: bool) -> None:
     if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
     FlightSettings().with_changes(**options.env_kwargs)  # says what does not fit
-    if options.speed <= 0:
-        raise ConfigError(f"--speed {options.speed:g}: must be above 0")
     if options.times is not None and not options.sequence:
         raise ConfigError("--times goes with --sequence")
     if options.times is not None and min(options.times) < 0:

@@ -17,7 +17,7 @@ def run(options: argparse.Namespace) -> int:
     if options.format not in FORMATS:
         raise ConfigError(unknown("format", options.format, FORMATS))
     model = Path(options.model)
-    file = output_file(options.file, model.with_suffix(FORMATS[options.format]).name)
+    file = output_file(options.file, model.stem + FORMATS[options.format])
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
     refuse_existing(file, options.overwrite)

@@ -1,10 +1,14 @@
 """``publish``: a trained policy as a small zip for stock PPO, with a card that says what it can and where it comes from."""
 
 import argparse
+import html
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_text, refuse_existing, write_bytes, write_text
+from sb3_quad.base.files import read_text, refuse_existing, replacing
+from sb3_quad.base.signals import StopSignals
 from sb3_quad.experts.models import load_model, saved_algorithm, saved_data
 from sb3_quad.export.policy import slim_bytes
 from sb3_quad.report.card import measure, write_card
@@ -29,14 +33,22 @@ def run(options: argparse.Namespace) -> int:
         facts["vehicle"] = f"{UNKNOWN}; measured on `{settings.vehicle}`"
     if settings.observation_mean is not None or settings.observation_std is not None:
         facts["observation"] = "scaled by a mean and std of its own, in the zip's `flight_settings`"
-    write_bytes(zip_file, content)
     how = {"noise": settings.noise, **settings.in_any_task(), "vehicle": load_vehicle(settings.vehicle)}
-    rows = measure(load_model(zip_file), options.episodes, **how)
-    card = write_card(options.name, rows, options.made_by or command, facts, {**how, "vehicle": how["vehicle"].name})
-    write_text(card_file, card)
+    with ExitStack() as last, replacing(zip_file) as zip_stream, replacing(card_file) as card_stream:
+        zip_stream.write(content)
+        zip_stream.flush()
+        rows = measure(load_model(zip_stream.name), options.episodes, **how)
+        card = write_card(options.name, rows, options.made_by or command, facts, {**how, "vehicle": how["vehicle"].name})
+        card_stream.write(card.encode("utf-8"))
+        signals = last.enter_context(StopSignals())  # nothing comes between replacing the one and the other
     print(card)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
-    return 0
+    return signals.exit_code
+
+
+def _plain(text: Any) -> str:
+    """One line that ends no code span or fence of the card, whatever a run folder says."""
+    return " ".join(str(text).split()).replace("`", "'")
 
 
 def _origin(model: Path) -> tuple[str, dict[str, str]]:
@@ -49,12 +61,12 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
     run = open_run(folder)
     settings, arguments = run.read_yaml()
     if run.command.is_file():
-        command = read_text(run.command).strip()
+        command = _plain(read_text(run.command))
     start = arguments.get("trained_agent")
-    facts["algorithm"] = f"`{arguments.get('algo', saved_algorithm(model))}`, {timesteps:,} timesteps"
+    facts["algorithm"] = f"`{_plain(arguments.get('algo', saved_algorithm(model)))}`, {timesteps:,} timesteps"
     if start:
-        facts["algorithm"] += f" from `{Path(start).name}`"
-    facts["environment"] = f"`{arguments.get('env', run.name)}`"
+        facts["algorithm"] += f" from `{_plain(Path(start).name)}`"
+    facts["environment"] = f"`{_plain(arguments.get('env', run.name))}`"
     if settings.get("expert"):
-        facts["expert"] = f"`{settings['expert']}`"
-    return command, facts | {name: str(arguments.get(name, UNKNOWN)) for name in ("seed", *MADE_WITH)}
+        facts["expert"] = f"`{_plain(settings['expert'])}`"
+    return command, facts | {name: html.escape(_plain(arguments.get(name, UNKNOWN))) for name in ("seed", *MADE_WITH)}

@@ -77,8 +77,8 @@ def prepare(options: argparse.Namespace) -> None:
     for package in options.gym_packages:
         try:
             importlib.import_module(package)
-        except ImportError as error:
-            raise ConfigError(f"--gym-packages {package}: cannot be imported ({error})") from None
+        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+            raise ConfigError(f"--gym-packages {package}: cannot be imported ({type(error).__name__}: {error})") from None
     if options.num_threads is not None:
         torch.set_num_threads(options.num_threads)
 

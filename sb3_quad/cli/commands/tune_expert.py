@@ -35,7 +35,10 @@ def run(options: argparse.Namespace) -> int:
             show(done, options.trials, f"least cost {least:.3f}")
             return signals.received is None
 
-        search.run(options.trials, should_continue)
+        try:
+            search.run(options.trials, should_continue)
+        except OSError as error:  # Optuna's, which does not say which file
+            raise ConfigError(f"journal {journal}: cannot be written ({error.strerror or error})") from error
     if signals.received is not None:
         print(f"{signals.name}: writing the best of {search.trials_done} so far")
     seeds = row_seeds(seed_for("expert", options.seed), FRESH_SETS)

@@ -4,7 +4,7 @@ A block (:mod:`.block`) is reached through one pointer, and every array in it ha
 each distance between two rows, needs no test for overlap, and vectorises the loops over lanes.
 """
 
-import contextlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,8 @@ import numba
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+
+from sb3_quad.simulation.engine.cache import Cache, tell_unkept
 
 LANES = 64  # rows of a block; a multiple of every vector width, small enough for a block to stay in the first cache
 
@@ -24,9 +26,11 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
-    dispatcher = numba.njit(cache=True, error_model="numpy", nogil=True, **options)(function)
-    with contextlib.suppress(AttributeError):  # another version of numba: its own rule then holds
-        dispatcher._cache._cache_file._source_stamp = _source_stamp()
+    dispatcher = numba.njit(error_model="numpy", nogil=True, **options)(function)
+    try:
+        dispatcher._cache = Cache(function, _source_stamp())
+    except RuntimeError:
+        tell_unkept("no folder for it can be written")
     return dispatcher
 
 
@@ -72,3 +76,7 @@ def atomic_get(typing_context: Any, array: Any, index: Any) -> Any:
         return builder.load_atomic(builder.gep(data, [args[1]]), "seq_cst", 8, typ=ir.IntType(64))
 
     return types.int64(array, types.int64), codegen
+
+
+give_way = types.ExternalFunction("SwitchToThread" if sys.platform == "win32" else "sched_yield", types.int32())
+"""Let another thread have this core; the operating system's, found by its name wherever the code was compiled."""

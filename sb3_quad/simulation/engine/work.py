@@ -5,12 +5,14 @@ under way and how many of its blocks are not taken yet. Whoever comes takes the 
 comes, costs time but changes nothing, since each row has a stream of its own and each block its own memory.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import carray, int64
 
-from sb3_quad.base.arrays import BoolArray, Float32Array
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.engine.block import (
     MEMORY,
     block_in,
@@ -22,7 +24,7 @@ from sb3_quad.simulation.engine.block import (
     store_observations,
     store_state,
 )
-from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, pointer
+from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
 from sb3_quad.simulation.engine.physics import fly_block
 from sb3_quad.simulation.engine.random import STEP
 from sb3_quad.simulation.episodes import start_episode
@@ -36,17 +38,6 @@ from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 LOOK, SCORE, FLY = range(3)
 """What a job does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a control
 step that another simulator has flown; it flies and scores one."""
-
-# Columns of vehicles and of scaling: 1 where one serves all rows. Control steps of an episode: limits of the present ones,
-# max_steps of those that follow.
-SIZES = ("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "scaling_columns", "mode", "autoreset")
-ARRAYS = (
-    *("state", "queue", "wrench", "vehicles", "streams", "mean", "std", "noise_level", "task_index"),
-    *("task_parameters", "task_weights", "returns", "limits", "outcome"),
-)
-STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
-_ADDRESSES = tuple(f"{name}_at" for name in ARRAYS + STEP_ARRAYS)
-JOB = np.dtype([("physics_step", "f8"), *((name, "i8") for name in SIZES + _ADDRESSES)])
 
 OUTCOME = np.dtype(
     [
@@ -64,10 +55,38 @@ OUTCOME = np.dtype(
 )
 """How the last episode of a row ended."""
 
-# The control array, each number on a cache line of its own; from AWAKE on: whether worker k is looking for blocks.
-LINE = 16
-LEFT, DONE, NOW, SERIAL, AWAKE = (LINE * k for k in first_rows(dict.fromkeys(("left", "done", "job", "serial", "awake"), 1)))
+# Columns of vehicles and of scaling: 1 where one serves all rows. Control steps of an episode: limits of the present ones,
+# max_steps of those that follow.
+SIZES = ("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "scaling_columns", "mode", "autoreset")
 _PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
+ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and shape, of which a name is one of the sizes
+    "state": ("f8", (STATE_SIZE, "n")),
+    "queue": ("f8", ("delay", 4, "n")),
+    "wrench": ("f8", (WRENCH_SIZE, "n")),
+    "vehicles": ("f8", (_PARAMETERS, "vehicle_columns")),
+    "streams": ("u4", (4, "n")),
+    "mean": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
+    "std": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
+    "noise_level": ("f8", ("scaling_columns",)),
+    "task_index": ("i8", ("n",)),
+    "task_parameters": ("f8", ("tasks", _COLUMNS)),
+    "task_weights": ("f8", ("tasks",)),
+    "returns": ("f8", ("n",)),
+    "limits": ("i8", ("n",)),
+    "outcome": (OUTCOME, ("n",)),
+}
+STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
+_ADDRESSES = tuple(f"{name}_at" for name in (*ARRAYS, *STEP_ARRAYS))
+JOB = np.dtype([("physics_step", "f8"), *((name, "i8") for name in SIZES + _ADDRESSES)])
+
+# The control array, each number on a cache line of its own. Taken: whether a job is under way. From AWAKE on: whether worker k
+# is looking for blocks.
+LINE = 16
+_CONTROL = first_rows(dict.fromkeys(("left", "done", "job", "serial", "taken", "awake"), 1))
+LEFT, DONE, NOW, SERIAL, TAKEN, AWAKE = (LINE * k for k in _CONTROL)
+NOT_FINITE, BUSY, LATE, IN_TIME = range(4)
+"""What came of a job: nothing, since an action is not finite, or since another job is under way; or all is done, late if the
+last block kept the thread that brought the job waiting."""
 
 
 class StepArrays(NamedTuple):
@@ -84,6 +103,34 @@ def step_arrays(n: int, actions: Float32Array | None = None) -> StepArrays:
     observations = np.empty((n, OBSERVATION_SIZE), dtype=np.float32)
     given = np.zeros((n, 4), np.float32) if actions is None else actions
     return StepArrays(given, observations, np.empty(n, np.float32), np.zeros(n, np.bool_))
+
+
+def check_arrays(arrays: Arrays, sizes: Mapping[str, float]) -> None:
+    """Refuse what compiled code, which checks no index, would read or write outside of.
+
+    :param arrays: each of ``ARRAYS``.
+    :param sizes: each of ``SIZES`` but the mode, and the physics step.
+    :raises ConfigError: an array of another type, shape or order in memory, or a row of a task that does not exist.
+    """
+    for name, (kind, shape) in ARRAYS.items():
+        array, wanted = arrays[name], tuple(int(sizes[size]) if isinstance(size, str) else size for size in shape)
+        if array.dtype != kind or array.shape != wanted or not array.flags.carray:
+            raise ConfigError(f"{name}: {array.dtype} of shape {array.shape}; needed is {np.dtype(kind)} of shape {wanted}")
+    for name in ("vehicle_columns", "scaling_columns"):
+        if sizes[name] not in (1, sizes["n"]):
+            raise ConfigError(f"{name} {sizes[name]}: must be 1, or one for each of {sizes['n']} rows")
+    if not ((arrays["task_index"] >= 0) & (arrays["task_index"] < sizes["tasks"])).all():
+        raise ConfigError(f"task_index: every number must be one of the {sizes['tasks']} tasks, counted from 0")
+
+
+def new_jobs(arrays: Arrays, sizes: Mapping[str, float]) -> list[IntArray]:
+    """A job for each mode, a ``JOB`` viewed as int64, of arrays that must live as long; see :func:`check_arrays`."""
+    check_arrays(arrays, sizes)
+    jobs = np.zeros(3, dtype=JOB)
+    for name, value in {**sizes, **{f"{name}_at": arrays[name].ctypes.data for name in ARRAYS}}.items():
+        jobs[name] = value
+    jobs["mode"] = LOOK, SCORE, FLY
+    return [*jobs.view(np.int64).reshape(3, -1)]
 
 
 @compiled(inline="always")
@@ -185,16 +232,21 @@ def work(control, worker, patience, job, actions, observations, rewards, dones):
 
     :param control: int64, see this module's constants; shared by all threads.
     :param worker: number of a worker thread, which returns after ``patience`` looks without a block; -1 for the thread that
-        brings the job, which returns when the job is done or after ``patience`` looks at a block that a worker still has.
+        brings the job, which returns when the job is done: no interrupt, which Python sees to between two calls, leaves a
+        worker with a block. After ``patience`` looks at a block that a worker still has, it lets that have the core.
     :param job: of the dtype ``JOB``, (1,), viewed as int64, which numba tells apart sooner; unused by workers, as are the
         :class:`StepArrays`.
-    :return: whether all is done; -1 if an action is not finite, and then nothing has been done.
+    :return: ``NOT_FINITE``, ``BUSY``, ``LATE`` or ``IN_TIME``.
     """
     memory = np.empty(MEMORY, np.uint8)
     blocks = int64(0)
-    if worker < 0:
+    if worker >= 0:
+        atomic_set(control, AWAKE + LINE * worker, 1)
+    else:
         if not _finite(actions):
-            return -1
+            return NOT_FINITE
+        if atomic_set(control, TAKEN, 1) == 1:
+            return BUSY
         own = carray(pointer(job.ctypes.data), 1, JOB)[0]
         own.actions_at, own.observations_at = actions.ctypes.data, observations.ctypes.data
         own.rewards_at, own.dones_at = rewards.ctypes.data, dones.ctypes.data
@@ -217,12 +269,15 @@ def work(control, worker, patience, job, actions, observations, rewards, dones):
                 atomic_add(control, DONE, 1)
                 idle = 0
         elif worker < 0 and atomic_get(control, DONE) == blocks:
-            return 1
+            atomic_set(control, TAKEN, 0)
+            return LATE if idle > patience else IN_TIME
         idle += 1
         if idle > patience:
-            if worker >= 0:
-                atomic_set(control, AWAKE + LINE * worker, 0)
-                if atomic_get(control, LEFT) > 0 and atomic_set(control, AWAKE + LINE * worker, 1) == 0:
-                    idle = 0
-                    continue
-            return 0
+            if worker < 0:
+                give_way()
+                continue
+            atomic_set(control, AWAKE + LINE * worker, 0)
+            if atomic_get(control, LEFT) <= 0:
+                return IN_TIME
+            atomic_set(control, AWAKE + LINE * worker, 1)
+            idle = 0

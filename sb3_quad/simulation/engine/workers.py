@@ -8,15 +8,16 @@ last one, then sleeps; nobody waits for it unless it holds a block.
 import os
 import sys
 import threading
-import time
+import weakref
 from contextlib import AbstractContextManager
+from typing import Any
 
 import numpy as np
 from numba.core import event
 
 from sb3_quad.base.arrays import IntArray
 from sb3_quad.simulation.engine.lowlevel import LANES
-from sb3_quad.simulation.engine.work import AWAKE, DONE, JOB, LINE, StepArrays, step_arrays, work
+from sb3_quad.simulation.engine.work import AWAKE, BUSY, JOB, LATE, LINE, NOT_FINITE, StepArrays, step_arrays, work
 
 PATIENCE = 20_000  # looks for a block before a worker sleeps: some 30 microseconds
 WORTHWHILE = 3  # blocks; fewer are done before a worker has woken
@@ -33,36 +34,48 @@ class Workers:
     """Threads that take blocks of whatever job is under way; one job at a time."""
 
     def __init__(self) -> None:
-        self.lock = threading.Lock()
         self.control = np.zeros(AWAKE + LINE * max(available_cpus(), MOST), dtype=np.int64)
         self.resting = 0
-        self._signals: list[threading.Semaphore] = []
+        self._lock = threading.Lock()
+        self._asleep: list[threading.Lock] = []  # a worker sleeps by locking its own twice
 
     def wake(self, count: int) -> None:
         """Have ``count`` workers look for blocks."""
-        while len(self._signals) < count:
-            number, signal = len(self._signals), threading.Semaphore(0)
-            self._signals.append(signal)
-            threading.Thread(target=_loop, args=(self.control, number, signal), daemon=True, name="sb3_quad worker").start()
-        for k in range(count):
-            if not self.control[AWAKE + LINE * k]:
-                self.control[AWAKE + LINE * k] = 1
-                self._signals[k].release()
+        with self._lock:
+            for number in range(len(self._asleep), count):
+                asleep = threading.Lock()
+                threading.Thread(
+                    target=_loop, args=(self.control, number, asleep), daemon=True, name="sb3_quad worker"
+                ).start()
+                self._asleep.append(asleep)
+            for k in range(count):
+                if not self.control[AWAKE + LINE * k] and self._asleep[k].locked():
+                    self._asleep[k].release()
 
 
-def _loop(control: IntArray, number: int, signal: threading.Semaphore) -> None:
+def _loop(control: IntArray, number: int, asleep: threading.Lock) -> None:
     nothing = np.zeros(1, dtype=JOB).view(np.int64), *step_arrays(1)
     while True:
-        signal.acquire()
+        asleep.acquire()
         work(control, number, PATIENCE, *nothing)
 
 
 _workers = Workers()
+_batch_locks: weakref.WeakSet[Any] = weakref.WeakSet()
+
+
+def batch_lock() -> AbstractContextManager[Any]:
+    """A lock for a batch, which one thread may take several times; free in a forked child, whatever the parent was at."""
+    lock = threading.RLock()
+    _batch_locks.add(lock)
+    return lock
 
 
 def _renew() -> None:
     global _workers
     _workers = Workers()  # a forked child has no threads but the one that forked
+    for lock in _batch_locks:
+        lock._at_fork_reinit()
 
 
 if hasattr(os, "register_at_fork"):
@@ -80,19 +93,16 @@ def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
     if count > 0 and workers.resting > 0:
         workers.resting -= 1
         count = 0
-    if count < 1 or not workers.lock.acquire(blocking=False):
-        alone = np.zeros(AWAKE + LINE, dtype=np.int64)  # a control array that no worker looks at
-        return bool(work(alone, -1, PATIENCE, job, *arrays) >= 0)
-    try:
+    outcome = BUSY
+    if count > 0:
         workers.wake(count)
         outcome = work(workers.control, -1, PATIENCE, job, *arrays)
-        if outcome == 0:
+        if outcome == LATE:
             workers.resting = REST
-            while workers.control[DONE] < blocks:
-                time.sleep(0)
-        return bool(outcome >= 0)
-    finally:
-        workers.lock.release()
+    if outcome == BUSY:
+        alone = np.zeros(AWAKE, dtype=np.int64)  # a control array that no worker looks at
+        outcome = work(alone, -1, PATIENCE, job, *arrays)
+    return bool(outcome != NOT_FINITE)
 
 
 def compilation_notice() -> AbstractContextManager[None]:

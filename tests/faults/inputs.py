@@ -1,0 +1,167 @@
+"""Gives every option of every command, and every key of every file, values that nobody should give.
+
+    python tests/faults/inputs.py FOLDER COUNT [SEED]
+
+Of all cases ``COUNT`` are tried, drawn by the seed; ``all`` tries all. A case must end within ``SECONDS`` with an exit code of
+0, 1 or 2, without a traceback, without a message that no check foresaw, within ``MEMORY``, and must write nothing outside its
+folder nor run what it is given. Prints a line for each case that does not. Exit code 1 if any did.
+"""
+
+import argparse
+import itertools
+import os
+import random
+import resource
+import shutil
+import signal
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+import sb3_quad.cli.commands.train
+from sb3_quad.cli import main
+from sb3_quad.cli.app import COMMANDS, make_parser
+from sb3_quad.dagger.dagger import DAgger
+from sb3_quad.scenarios.scenario import Scenario
+from sb3_quad.settings.algorithms import constructor_parameters
+from sb3_quad.settings.config import TrainingConfig
+from sb3_quad.simulation.tasks import Task
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+
+SECONDS, MEMORY = 60.0, 3 * 2**30  # bytes; the imports take half a GB
+OUTSIDE = "../escaped"
+TEXTS = [  # as arguments; values that are only large are those of the corpus
+    *("", " ", "-1", "0", "nan", "inf", "1e400", "1e-400", "0x10", "1,2", "a:b", "a:b:c", "[[", "{a: b}", "(1, 2)", "lin_x"),
+    *(".", "no/such/file", "x" * 5000, "\udcff", "ü<b>", "None", "os.system", "os:system"),
+    *("!!python/object/apply:os.system ['touch escaped']", "__import__('os').system('touch escaped')", "-", "--", "a=b=c"),
+]
+VALUES: list[Any] = [  # in YAML
+    *(None, True, "", "x", "nan", -1, 0, 0.5, float("nan"), float("inf"), 10**30, [], [[]], [None], {}, {"a": "b"}, {1: 2}),
+    *("os.system", {"os.system": {}}, "lin_x", "../escaped", "/dev/zero", "__import__('os').system('touch escaped')"),
+    *("x" * 5000, "\x00", [1, 2], [1, 2, 3], ["a"] * 4, [float("nan")] * 3, {"name": {"name": {}}}),
+]
+SUITE = {"name": "one", "scenarios": [{"name": "near", "target": {"distance": 1.0}, "duration": 2.0, "episodes": 2}]}
+SETTINGS = {"n_timesteps": 20, "n_envs": 2, "n_steps": 10, "batch_size": 20, "policy_kwargs": {"net_arch": [4]}}
+BASES = {
+    "benchmark": "--no-training --seconds 0.001 --sizes 2 --n-envs 1",
+    "check-vehicle": "itm -n 1",
+    "enjoy": "pid --no-render -n 3",
+    "evaluate": "pid --suite suite.yaml --no-report",
+    "export": "itm-recovery --format torchscript",
+    "plot": "a=no_run",
+    "publish": "itm-recovery --name mine --episodes 1",
+    "record-video": "pid -n 3 --size 64x64",
+    "report": "no_results",
+    "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
+    "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 --n-evaluations 1",
+    "tune-expert": "-n 1 --starts 60 --targets 1 --no-progress",
+}
+Case = tuple[str, list[str], dict[str, str]]  # what it is, a command, files
+
+
+def cases() -> list[Case]:
+    """All of them, in a fixed order."""
+    found: list[Case] = []
+    files = {"settings.yml": _yaml({"QuadTargetTracking-v0": SETTINGS}), "suite.yaml": _yaml(SUITE)}
+    subparsers: Any = next(each for each in make_parser()._actions if isinstance(each, argparse._SubParsersAction))
+    assert {*COMMANDS} == {*BASES}
+    for command, base in BASES.items():
+        for action in subparsers.choices[command]._actions:
+            if action.nargs == 0 or isinstance(action, argparse.BooleanOptionalAction):
+                continue
+            paths = action.metavar in ("FILE", "FOLDER", "DIR", "PATH", "WHERE", "AGENT")
+            for text in [*TEXTS, *([] if paths else [OUTSIDE])]:
+                given = (
+                    [*base.split(), action.option_strings[-1], text] if action.option_strings else [text, *base.split()[1:]]
+                )
+                found.append((f"{command} {action.dest}", [command, *given], files))
+    dagger = ["train", *BASES["train"].split()]
+    keys = sorted(
+        {*TrainingConfig.model_fields, *constructor_parameters(DAgger)} - {"algo", "env_id", "settings", "hyperparams"}
+    )
+    for key, value in itertools.product(keys, VALUES):
+        settings = {"QuadTargetTracking-v0": {**SETTINGS, key: value}}
+        found.append((f"settings {key}", dagger, {**files, "settings.yml": _yaml(settings)}))
+    for key, value in itertools.product(Task.model_fields, VALUES):
+        settings = {"QuadTargetTracking-v0": {**SETTINGS, "env_kwargs": {"task_kwargs": {key: value}}}}
+        found.append((f"task {key}", dagger, {**files, "settings.yml": _yaml(settings)}))
+    itm = load_vehicle("itm").model_dump(mode="json", exclude_none=True)
+    for key, value in itertools.product(Vehicle.model_fields, VALUES):
+        found.append((f"vehicle {key}", ["check-vehicle", "v.yaml", "-n", "1"], {"v.yaml": _yaml({**itm, key: value})}))
+    evaluate = ["evaluate", *BASES["evaluate"].split()]
+    for key, value in itertools.product(Scenario.model_fields, VALUES):
+        scenario = {**SUITE["scenarios"][0], key: value}
+        found.append((f"scenario {key}", evaluate, {"suite.yaml": _yaml({**SUITE, "scenarios": [scenario]})}))
+    return found
+
+
+def _yaml(content: Any) -> str:
+    return str(yaml.safe_dump(content, allow_unicode=True, width=10**6))
+
+
+def attempt(case: Case, folder: Path) -> str:
+    """What is wrong with how the case ends; empty if nothing is."""
+    what, command, files = case
+    place = folder / "place"
+    shutil.rmtree(folder, ignore_errors=True)
+    place.mkdir(parents=True)
+    for name, text in files.items():
+        (place / name).write_text(text, encoding="utf-8", errors="surrogateescape")
+    start, log = time.monotonic(), folder / "log.txt"
+    child = os.fork()
+    if child == 0:
+        os.chdir(place)
+        with log.open("w") as stream, open(os.devnull) as nothing:
+            for number, file in enumerate((nothing, stream, stream)):
+                os.dup2(file.fileno(), number)
+        torch.set_num_threads(1)
+        signal.alarm(int(SECONDS))
+        code = 70
+        try:
+            code = main(command)
+        finally:
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(code)
+    _, status, usage = os.wait4(child, 0)
+    code, text = os.waitstatus_to_exitcode(status), log.read_text(errors="replace")
+    last = text.splitlines()[-1] if text else ""
+    strange = {
+        f"exit code {code}": code not in (0, 1, 2),
+        "no line says why": code == 2 and not last.startswith("error: "),
+        "a traceback": "Traceback (most recent call last)" in text,
+        "unforeseen": "python -X dev" in text,
+        f"{usage.ru_maxrss / 2**20:.1f} GB": usage.ru_maxrss * 1024 > MEMORY,
+        f"{time.monotonic() - start:.0f} s": time.monotonic() - start > SECONDS,
+        "something outside": len(list(folder.iterdir())) > 2,
+        "foreign code": (place / "escaped").exists(),
+    }
+    return ", ".join(name for name, is_so in strange.items() if is_so) and (
+        f"{what}: {', '.join(name for name, is_so in strange.items() if is_so)}: {command} {last[-300:]}"
+    )
+
+
+def campaign(folder: Path, count: int | None, seed: int) -> int:
+    """How many cases end as none should."""
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    chosen = cases()
+    if count is not None:
+        chosen = random.Random(seed).sample(chosen, count)
+    failed = 0
+    for number, case in enumerate(chosen):
+        wrong = attempt(case, folder / f"case_{seed}")
+        failed += bool(wrong)
+        if wrong:
+            print(f"{number}: {wrong}", flush=True)
+    print(f"{len(chosen)} inputs, {failed} ended as none should")
+    return failed
+
+
+if __name__ == "__main__":
+    target, asked, *more = sys.argv[1:]
+    sb3_quad.cli.commands.train.FRESH_EPISODES = 2
+    sys.exit(campaign(Path(target), None if asked == "all" else int(asked), int(more[0]) if more else 0) > 0)

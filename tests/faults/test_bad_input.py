@@ -1,0 +1,134 @@
+"""Bad input, as data: ``corpus.yaml`` holds what is given and what the one line must say."""
+
+import errno
+import shlex
+import subprocess
+import sys
+import time
+import zipfile
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import yaml
+from stable_baselines3 import PPO
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.cli.app import main
+from sb3_quad.cli.commands import plot
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.training import trainer
+from sb3_quad.training.runs import RunFolder
+from sb3_quad.tuning.expert import ExpertSearch
+
+CORPUS = yaml.safe_load(Path(__file__).with_name("corpus.yaml").read_text(encoding="utf-8"))
+SECONDS = 20.0  # at most for any input, imports included
+
+
+def write(path, content):
+    """A text, or one of ``{begin, repeat, times, end}``; an .npz of ``{arrays}``; a zip that ``unpacks_to`` many bytes."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if isinstance(content, str):
+        path.write_text(content, encoding="utf-8")
+    elif "arrays" in content:
+        np.savez(path, **content["arrays"])
+    elif "zip" in content:
+        with zipfile.ZipFile(path, "w") as archive:
+            archive.writestr(content["zip"], "")
+            archive.infolist()[0].file_size = content["unpacks_to"]  # as its directory says
+    else:
+        text = content["repeat"] * content["times"]
+        path.write_text(content.get("begin", "") + text + content.get("end", ""), encoding="utf-8")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    QuadcopterVecEnv(1)
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("name", CORPUS)
+def test_bad_input_is_one_line_and_leaves_nothing_behind(name, here, capsys):
+    case = CORPUS[name]
+    for file, content in case.get("files", {}).items():
+        write(here / file, content)
+    before = sorted(here.rglob("[!_]*"))
+    start = time.perf_counter()
+    code = main([part.format(digits="1" * 5000) for part in shlex.split(case["command"])])
+    seconds = time.perf_counter() - start
+    lines = capsys.readouterr().err.splitlines()
+    assert code == case.get("code", 2), lines
+    assert lines and lines[-1].startswith(case.get("begins", "error: ")) and case["says"] in lines[-1]
+    assert not any("Traceback" in line or "python -X dev" in line for line in lines)  # somebody foresaw it
+    assert [path for path in sorted(here.rglob("[!_]*")) if path not in before] == []
+    assert seconds < SECONDS
+
+
+@pytest.mark.parametrize(
+    ("raised", "says"),
+    [
+        (SystemExit(0), "left with sys.exit(0)"),
+        (OSError(errno.ENOSPC, "No space left on device", "run/0.monitor.csv"), "run/0.monitor.csv: No space left on device"),
+        (ZeroDivisionError("in a callback"), "ZeroDivisionError: in a callback (test_bad_input.py, line"),
+    ],
+)
+def test_what_no_check_foresees_is_a_line_too(raised, says, monkeypatch, capsys):
+    def run(options):
+        raise raised
+
+    monkeypatch.setattr(plot, "run", run)
+    assert main(["plot", "agent=run"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and says in line
+
+
+def test_an_interrupt_while_modules_are_imported_leaves_at_once():
+    code = "\n".join(
+        [
+            "import os, signal",
+            "from sb3_quad.base.signals import interrupts_leave",
+            "with interrupts_leave():",
+            "    try:",
+            "        os.kill(os.getpid(), signal.SIGINT)",
+            "    except BaseException:",  # as some compiled modules do
+            "        pass",
+            "print('goes on')",
+        ]
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "interrupted\n")
+
+
+def test_an_agent_whose_parameters_are_not_finite_is_refused(here, capsys):
+    agent = PPO("MlpPolicy", QuadcopterVecEnv(1), device="cpu")
+    agent.policy.action_net.bias.data[0] = float("inf")  # SB3 clips the action, so that it looks sound
+    agent.save("agent.zip")
+    assert main(["enjoy", "agent.zip", "--no-render"]) == 2
+    assert "agent.zip: action_net.bias is not finite" in capsys.readouterr().err
+
+
+def test_a_full_disk_names_what_failed_first(here, monkeypatch):
+    def write_bytes(path, content):
+        raise ConfigError(f"{path}: cannot be written (No space left on device)")
+
+    monkeypatch.setattr(trainer, "write_bytes", write_bytes)
+    last_good = SimpleNamespace(snapshot=SimpleNamespace(model=b"", timesteps=5))
+    first = ConfigError("evaluations.npz: cannot be written (No space left on device)")
+    with pytest.raises(ConfigError, match=r"^evaluations\.npz: .*; nor could the model be saved: .*Quad\.zip"):
+        trainer._save_after(first, RunFolder(here, "Quad"), last_good, None)
+
+
+def test_a_full_disk_in_a_search_of_gains_names_the_journal(here, monkeypatch, capsys):
+    def run(search, trials, after_each):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(ExpertSearch, "run", run)
+    assert main(["tune-expert", "-n", "1", "--journal", "search.journal"]) == 2
+    assert "error: journal search.journal: cannot be written (No space left on device)" in capsys.readouterr().err

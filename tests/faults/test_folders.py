@@ -1,0 +1,159 @@
+"""Files of a search, an evaluation and a published policy: full disks, interrupts and two processes at once cost nothing."""
+
+import csv
+import errno
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from optuna.trial import TrialState
+from stable_baselines3.common.callbacks import BaseCallback
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.cli import main
+from sb3_quad.cli.commands import publish
+from sb3_quad.evaluation.folder import load_results
+from sb3_quad.tuning.study import LEASE, OWNER, dead_trials, open_study
+
+
+def study_in(path):
+    return open_study("search", path, "maximize", ("begun_with", "these"), None)[0]
+
+
+@pytest.mark.parametrize("left", [1, 5, 20, -1])
+def test_a_journal_cut_by_a_full_disk_loses_its_last_line_alone(tmp_path, left):
+    path = tmp_path / "study.log"
+    study = study_in(path)
+    for value in (1.0, 2.0):
+        study.tell(study.ask(), value)
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:-1]) + lines[-1][:left])  # the end of the second trial
+    study_in(path).tell(1, 3.0)
+    study_in(path).tell(study_in(path).ask(), 4.0)
+    assert [trial.value for trial in study_in(path).trials] == [1.0, 3.0, 4.0]
+    assert all(trial.state == TrialState.COMPLETE for trial in study_in(path).trials)
+
+
+def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("remember the milk")
+    with pytest.raises(ConfigError, match="cannot be used"):
+        study_in(path)
+    assert path.read_text() == "remember the milk"
+
+
+@pytest.mark.parametrize(
+    ("machine", "process", "silent", "dead"),
+    [
+        (platform.node(), os.getpid(), 0.0, False),
+        (platform.node(), 2**30, 0.0, True),
+        ("elsewhere", 2**30, LEASE - 10.0, False),
+        ("elsewhere", os.getpid(), LEASE + 1.0, True),
+    ],
+    ids=("this process", "no process", "elsewhere, heard of", "elsewhere, silent"),  # the same in every worker
+)
+def test_trials_are_dead_without_a_process_or_a_sign_of_life(tmp_path, machine, process, silent, dead):
+    study = study_in(tmp_path / "study.log")
+    study.ask().set_user_attr(OWNER, [machine, process, time.time() - silent])
+    assert [trial.number for trial in dead_trials(study)] == [0] * dead
+
+
+class KilledAtSecond(BaseCallback):
+    """Kills this process outright in the second training that it is part of, once it has the environment variable KILL."""
+
+    made = 0
+
+    def _on_training_start(self) -> None:
+        KilledAtSecond.made += 1
+
+    def _on_step(self) -> bool:
+        if KilledAtSecond.made == 2 and "KILL" in os.environ:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return True
+
+
+@pytest.mark.timeout(200)
+def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    settings = "n_timesteps: 32, n_steps: 32, batch_size: 32, callback: test_folders.KilledAtSecond"
+    (tmp_path / "small.yml").write_text(f"Pendulum-v1: {{{settings}}}\n")
+    (tmp_path / "space.yml").write_text("gamma: {low: 0.5, high: 1.0}\n")
+    command = ["tune", "--algo", "ppo", "--env", "Pendulum-v1", "--conf-file", "small.yml", "--search-space", "space.yml"]
+    command += [
+        "--eval-episodes",
+        "1",
+        "--n-evaluations",
+        "1",
+        "--no-progress",
+        "--storage",
+        "study.log",
+        "--sampler",
+        "random",
+    ]
+    path = os.pathsep.join([str(Path(__file__).parents[2]), str(Path(__file__).parent)])
+    environment = {**os.environ, "KILL": "yes", "PYTHONPATH": path}
+    killed = subprocess.run([sys.executable, "-m", "sb3_quad.cli", *command], env=environment, check=False)
+    assert killed.returncode == -signal.SIGKILL
+    assert main([*command, "--max-total-trials", "2"]) == 0
+    with (tmp_path / "logs/tune/ppo/Pendulum-v1_2/trials.csv").open(encoding="utf-8") as file:
+        trials = list(csv.DictReader(file))
+    assert [(trial["state"], trial["error"]) for trial in trials] == [
+        ("COMPLETE", ""),
+        ("FAIL", "interrupted"),
+        ("COMPLETE", ""),
+    ]
+    assert trials[2]["gamma"] == trials[1]["gamma"] != trials[0]["gamma"]
+
+
+SUITE = "name: one\nsource: paper\nscenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]\n"
+codes = []
+
+
+def hover(vehicle):
+    return lambda observation: np.zeros((len(observation), 4))
+
+
+def meanwhile(vehicle):
+    """Another evaluation into the same folder, while this one is under way."""
+    if not codes:
+        codes.append(main(["evaluate", "other=test_folders:hover", "--suite", "suite.yaml", "-o", "out", "--no-report"]))
+    return hover(vehicle)
+
+
+def test_of_two_evaluations_into_a_folder_at_once_neither_loses_its_results(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "suite.yaml").write_text(SUITE)
+    codes.clear()
+    command = ["evaluate", "first=test_folders:meanwhile", "--suite", "suite.yaml", "-o", "out", "--no-report"]
+    codes.append(main(command))
+    there = {entry.controller for entry in load_results("out").entries}
+    assert there == {name for name, code in zip(("other", "first"), codes, strict=True) if code == 0}
+    refused = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(refused) == codes.count(2) and all("another process" in line for line in refused)
+    codes[0] = main(["evaluate", "other=test_folders:hover", *command[2:]])
+    assert codes == [0, 0] and {entry.controller for entry in load_results("out").entries} == {"other", "first"}
+
+
+def interrupted(*arguments, **settings):
+    raise KeyboardInterrupt
+
+
+def disk_full(*arguments, **settings):
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(("fault", "code"), [(interrupted, 130), (disk_full, 2)])
+def test_publish_replaces_both_the_zip_and_its_card_or_neither(tmp_path, monkeypatch, fault, code):
+    command = ["--name", "mine", "-o", str(tmp_path), "--episodes", "1"]
+    assert main(["publish", "itm-imitation", *command]) == 0
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    assert len(before) == 2
+    monkeypatch.setattr(publish, "measure" if code == 130 else "write_card", fault)
+    assert main(["publish", "itm-recovery", *command, "--overwrite"]) == code
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

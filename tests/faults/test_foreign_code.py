@@ -1,0 +1,224 @@
+"""What comes from strangers, zips, run folders and settings, runs nothing of theirs: each would leave a file named MARK."""
+
+import base64
+import json
+import os
+import pickle
+import shutil
+import zipfile
+from pathlib import Path
+
+import cloudpickle
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.cli import main
+from sb3_quad.experts.models import load_model, load_zip
+from sb3_quad.experts.unpickle import unpickle
+from sb3_quad.pretrained_policies import pretrained
+from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.vehicles.vehicle import load_vehicle
+
+MARK = Path("foreign_code_ran")
+AGENT = pretrained("itm-imitation")
+COMMAND = f"echo > {MARK}"
+RUN = Path(__file__).parent.parent / "data" / "version_0_1" / "QuadTargetTracking-v0_1"
+
+
+class Calls:
+    """Calls a function when it is unpickled."""
+
+    def __init__(self, function, *arguments):
+        self.call = function, arguments
+
+    def __reduce__(self):
+        return self.call
+
+
+def text(value: str) -> bytes:
+    return b"\x8c" + bytes([len(value)]) + value.encode()
+
+
+FOREIGN = Calls(os.system, COMMAND)
+PICKLES = {
+    "os.system": pickle.dumps(FOREIGN),
+    "protocol 0": pickle.dumps(FOREIGN, 0),
+    "within others": pickle.dumps([{"a": (1, FOREIGN)}]),
+    "eval": pickle.dumps(Calls(eval, f"open({str(MARK)!r}, 'w')")),
+    "a dotted name": b"\x80\x04" + text("torch") + text("serialization.os.system") + b"\x93" + text(COMMAND) + b"\x85R.",
+    "names from the memo": b"\x80\x04"
+    + text("os")
+    + b"\x940"
+    + text("system")
+    + b"\x940h\x00h\x01\x93"
+    + text(COMMAND)
+    + b"\x85R.",
+    "a pickle within": pickle.dumps(Calls(pickle.loads, pickle.dumps(FOREIGN))),
+    "SB3's wrapper of pickles": pickle.dumps(CloudpickleWrapper(FOREIGN)),
+    "a function by value": cloudpickle.dumps(Calls(eval("lambda name: open(name, 'w')"), str(MARK))),
+    "NumPy's loader": pickle.dumps(Calls(np.load, "foreign.npy", None, True)),
+}
+
+
+@pytest.fixture(autouse=True)
+def here(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("SB3_QUAD_TRUST", raising=False)
+    return tmp_path
+
+
+def foreign_zip(key: str, source: Path = AGENT, path: str = "foreign.zip") -> str:
+    """A copy of an agent's zip, in which a pickle is put; as an attribute of the model, or as a file of weights."""
+    with zipfile.ZipFile(source) as archive:
+        parts = {name: archive.read(name) for name in archive.namelist()}
+    if key.endswith(".pth"):
+        parts[key] = PICKLES["os.system"]
+    else:
+        data = json.loads(parts["data"])
+        data[key] = {":type:": "harmless", ":serialized:": base64.b64encode(PICKLES["os.system"]).decode()}
+        parts["data"] = json.dumps(data).encode()
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in parts.items():
+            archive.writestr(name, content)
+    return path
+
+
+def same_actions(*models) -> bool:
+    observation = models[0].observation_space.sample()
+    first, second = (model.predict(observation, deterministic=True)[0] for model in models)
+    return np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("name", PICKLES)
+def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
+    np.save("foreign.npy", np.array([FOREIGN], object), allow_pickle=True)
+    with pytest.raises(ConfigError, match=r"^here names \S+\.\S+, which may run anything; .* --trust"):
+        unpickle(base64.b64encode(PICKLES[name]).decode(), "here")
+    assert not MARK.exists()
+    pickle.loads(PICKLES[name])
+    assert MARK.exists()  # so it does what it is here for
+
+
+@pytest.mark.parametrize(
+    ("command", "key"),
+    [
+        ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_kwargs"),
+        ("evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2", "policy_kwargs"),
+        ("enjoy foreign.zip --no-render -n 1", "action_space"),
+        ("export foreign.zip --format torchscript", "observation_space"),
+        ("publish foreign.zip --name mine", "policy_kwargs"),
+        ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "action_space"),
+        ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
+        ("train --algo ppo -i foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
+    ],
+)
+def test_no_command_runs_what_a_zip_holds(command, key, capsys):
+    foreign_zip(key)
+    assert main(command.split()) != 0
+    lines = [line for line in capsys.readouterr().err.splitlines() if "foreign.zip: " in line]
+    assert lines
+    for line in lines:
+        assert key == "policy.pth" or (f"its {key} names posix.system" in line and "--trust" in line)
+    assert not MARK.exists()
+
+
+@pytest.mark.parametrize("key", ["learning_rate", "policy_class", "clip_range", "anything"])
+def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, here):
+    shutil.copytree(RUN, "run")
+    zip_file = Path("run/QuadTargetTracking-v0.zip")
+    foreign_zip(key, zip_file, str(zip_file))
+    assert main(["train", "--resume", "run"]) == 2
+    assert f"its {key} names posix.system, which may run anything" in capsys.readouterr().err
+    assert not MARK.exists()
+
+
+def test_trust_goes_on_and_ends_with_the_command(capsys):
+    export = ["export", foreign_zip("observation_space"), "--format", "torchscript"]
+    main([*export, "--trust"])
+    assert MARK.exists()
+    MARK.unlink()
+    assert main(export) == 2
+    assert not MARK.exists()
+
+
+@pytest.mark.parametrize("key", ["learning_rate", "lr_schedule", "clip_range", "ep_info_buffer", "expert"])
+def test_what_flying_does_not_need_is_not_even_read(key):
+    agent, whole = load_model(foreign_zip(key)), load_model(AGENT)
+    assert not MARK.exists()
+    assert same_actions(agent, whole)
+
+
+@pytest.mark.parametrize("algorithm", [PPO, A2C, SAC, TD3, DDPG, DQN])
+def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
+    off_policy = algorithm in (SAC, TD3, DDPG, DQN)
+    kwargs = {"buffer_size": 200} if off_policy else {"n_steps": 16}
+    kwargs |= {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))} if algorithm in (SAC, TD3, DDPG) else {}
+    kwargs |= {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.ELU, "optimizer_class": torch.optim.SGD}}
+    env = "CartPole-v1" if algorithm is DQN else "Pendulum-v1"
+    model = algorithm("MlpPolicy", env, learning_rate=lambda progress: 1e-3 * progress, **kwargs).learn(32)
+    model.save("agent.zip")
+    again = load_model("agent.zip")
+    assert type(again) is algorithm
+    assert same_actions(again, model)
+    with pytest.raises(ConfigError, match=r"its learning_rate names cloudpickle\.cloudpickle\._"):
+        load_zip(algorithm, "agent.zip")
+    model.learning_rate = model.lr_schedule = LinearSchedule(1e-3, 0.0, 1.0)
+    model.save("agent.zip")
+    assert load_zip(algorithm, "agent.zip", device="cpu").lr_schedule(0.5) == 5e-4  # all of it, as for going on
+
+
+@pytest.mark.parametrize(
+    ("key", "entry"),
+    [
+        ("callback", {"os.makedirs": {"name": str(MARK)}}),
+        ("callback", {"gymnasium.Wrapper": {"env": 1}}),
+        ("callback", [{"stable_baselines3.common.callbacks.EventCallback": None}, {"pathlib.Path": {}}]),
+        ("vec_env_wrapper", {"os.makedirs": {"exist_ok": True}}),
+        ("vec_env_wrapper", "builtins.print"),
+        ("env_wrapper", "os.mkdir"),
+    ],
+)
+@pytest.mark.parametrize("way", ["a settings file", "a run folder"])
+def test_settings_call_only_classes_of_the_right_kind(key, entry, way, capsys):
+    environment = "QuadTargetTracking-v0"
+    settings = {"n_timesteps": 400, "n_envs": 2, "n_steps": 100, "vec_env": "dummy", key: entry}
+    if way == "a run folder":
+        shutil.copytree(RUN, "run")
+        file, content = Path(f"run/{environment}/config.yml"), settings
+    else:
+        file, content = Path("foreign.yml"), {environment: settings}
+    file.write_text(json.dumps(content))  # which is YAML, too
+    how = ["--resume", "run"] if way == "a run folder" else ["--conf-file", "foreign.yml", "--algo", "dagger"]
+    assert main(["train", *how]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {file}: {key}: ")
+    assert "name a subclass of" in line
+    assert not MARK.exists()
+    assert not Path("logs").exists()
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside", "a/b", "a\\b", "*/ int x; /*", "<script>", "two\nlines", "\x1b[2J", "", "a" * 101]
+)
+def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
+    own = here / "own"
+    own.mkdir()
+    monkeypatch.chdir(own)
+    parameters = load_vehicle("itm").model_dump(mode="json") | {"name": name}
+    Path("foreign.yaml").write_text(json.dumps(parameters))
+    assert main(["tune-expert", "--vehicle", "foreign.yaml", "--trials", "1", "--starts", "60", "--targets", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: foreign.yaml: name: ")
+    with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:
+        data = json.loads(archive.read("data"))
+        data["flight_settings"]["vehicle"]["name"] = name
+        copy.writestr("data", json.dumps(data))
+    with pytest.raises(ConfigError, match=r"foreign\.zip: flight_settings: name: "):
+        FlightSettings.of("foreign.zip")
+    assert sorted(path.name for path in here.rglob("*")) == ["foreign.yaml", "foreign.zip", "own"]
