@@ -40,7 +40,9 @@ def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
 
 
 Whole: TypeAlias = Annotated[
-    int, BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name))
+    int,
+    Field(lt=2**63),
+    BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
 ]
 Keywords: TypeAlias = Annotated[dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))]
 Classes: TypeAlias = Annotated[

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 INPUTS = Path(__file__).with_name("inputs.py")
-COUNT = os.environ.get("SB3_QUAD_INPUTS", "100")
+COUNT = os.environ.get("SB3_QUAD_INPUTS", "60")
 
 
 @pytest.mark.slow
