@@ -51,6 +51,16 @@ def cloning_errors(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actio
     return huber if kind == "huber" else huber + MSE_WEIGHT * squared
 
 
+def cloning_loss(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """L_BC, a scalar: the mean of :func:`cloning_errors` over the rows, in a third of the time."""
+    if kind == "nll":
+        return gaussian_nll(mean, log_std, actions).mean()
+    loss: th.Tensor | float = 0.0 if kind == "huber" else F.mse_loss(mean, actions) * (1.0 if kind == "mse" else MSE_WEIGHT)
+    if kind != "mse":
+        loss = loss + F.huber_loss(mean, actions, delta=HUBER_DELTA) / HUBER_DELTA
+    return th.as_tensor(loss)
+
+
 def value_loss(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, clip_range: float | None) -> th.Tensor:
     """The critic's loss, a scalar: Eq. 3.8 averaged over the rows, or plain mean squared error without ``clip_range``.
 

@@ -326,9 +326,11 @@ class DAgger(OnPolicyAlgorithm):
         for i, index in enumerate(critic_batches):
             observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
             mean, log_std = common.actor_mean(self.policy, observations), self.policy.log_std
-            bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
-            entropy_loss = -common.gaussian_entropy(log_std)
-            l2 = common.l2_loss(self.policy)
+            bc = common.cloning_loss(self.bc_loss, mean, log_std, expert_actions)
+            with th.set_grad_enabled(self.ent_coef != 0.0):  # what weighs nothing is only logged
+                entropy_loss = -common.gaussian_entropy(log_std)
+            with th.set_grad_enabled(self.l2_coef != 0.0):
+                l2 = common.l2_loss(self.policy)
 
             states, old, goals = (part[index].to(self.device) for part in (flown, old_values, returns))
             v_loss = common.value_loss(common.critic_values(self.policy, states), old, goals, clip_range_vf)

@@ -13,6 +13,7 @@ ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte o
 TILE = 16  # inputs at once: their rows stay in the first cache
 LINEAR, TANH, RELU = range(3)
 LEFT, DONE, CONTROL = 0, 16, 32  # places, each on a cache line of its own, and size of the control array
+ALIGNED = 16  # float32 numbers in a cache line: vectors that straddle two take a third longer
 PATIENCE = 20_000  # looks at a block that another thread still has, before that is let have the core
 _FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
 _END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
@@ -106,6 +107,12 @@ def _undo_activation(g, h, kind, db):
 
 
 @compiled
+def _aligned(address):
+    """The first place from ``address`` on where a cache line begins."""
+    return (address + 63) // 64 * 64
+
+
+@compiled
 def _load(rows, first, count, h):
     """Rows ``first`` to ``first + count`` of (n, size) into a block, (width, ROWS), zeros around them."""
     for k in range(h.shape[0]):
@@ -140,13 +147,13 @@ def forward(control, main, chunks, x, widths, kinds, parameters, kept, out):
     """
     n, total = len(x), widths.sum()
     blocks = (n + ROWS - 1) // ROWS
-    scratch = np.empty(0 if kept.size else total * ROWS, np.float32)
+    scratch = np.empty(0 if kept.size else total * ROWS + ALIGNED, np.float32)
     while True:
         number = chunks - atomic_add(control, LEFT, -1)
         if number >= chunks:
             return main and _finish(control, chunks, PATIENCE)
         for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
-            at = kept[block].ctypes.data if kept.size else scratch.ctypes.data
+            at = kept[block].ctypes.data if kept.size else _aligned(scratch.ctypes.data)
             first = block * ROWS
             h = carray(pointer(at), (widths[0], ROWS), np.float32)
             _load(x, first, min(ROWS, n - first), h)
@@ -175,7 +182,9 @@ def backward(control, main, chunks, grad, widths, kinds, transposed, kept, sums)
     """
     n, total, last = len(grad), widths.sum(), len(widths) - 1
     blocks = (n + ROWS - 1) // ROWS
-    scratch = np.empty((2, widths.max() * ROWS), np.float32)
+    widest = widths.max() * ROWS
+    scratch = np.empty(2 * widest + ALIGNED, np.float32)
+    sides = _aligned(scratch.ctypes.data), _aligned(scratch.ctypes.data) + 4 * widest
     while True:
         number = chunks - atomic_add(control, LEFT, -1)
         if number >= chunks:
@@ -184,7 +193,7 @@ def backward(control, main, chunks, grad, widths, kinds, transposed, kept, sums)
         for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
             first = block * ROWS
             at = kept[block].ctypes.data + 4 * (total - widths[last]) * ROWS
-            g = carray(pointer(scratch[0].ctypes.data), (widths[last], ROWS), np.float32)
+            g = carray(pointer(sides[0]), (widths[last], ROWS), np.float32)
             _load(grad, first, min(ROWS, n - first), g)
             place = 4 * sums.shape[1]
             for layer in range(last, 0, -1):
@@ -197,7 +206,7 @@ def backward(control, main, chunks, grad, widths, kinds, transposed, kept, sums)
                 x = carray(pointer(at), (columns, ROWS), np.float32)
                 _add_products(g, x, carray(pointer(here), (rows, columns), np.float32))
                 if layer > 1:
-                    y = carray(pointer(scratch[(last - layer + 1) % 2].ctypes.data), (columns, ROWS), np.float32)
+                    y = carray(pointer(sides[(last - layer + 1) % 2]), (columns, ROWS), np.float32)
                     _multiply(carray(pointer(transposed.ctypes.data + place), (columns, rows), np.float32), g, y)
                     g = y
         atomic_add(control, DONE, 1)

@@ -1,5 +1,6 @@
 """A multilayer perceptron as one function of PyTorch, computed by :mod:`.kernel` on as many cores as are free."""
 
+import math
 import os
 import queue
 import threading
@@ -11,7 +12,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_quad.networks.kernel import CONTROL, LINEAR, RELU, ROWS, TANH, backward, forward
+from sb3_quad.networks.kernel import ALIGNED, CONTROL, LINEAR, RELU, ROWS, TANH, backward, forward
 
 CHUNKS = 8  # at most, of a mini-batch: what a thread takes at once
 WORTHWHILE = 4  # blocks; fewer are done before another thread has woken
@@ -48,7 +49,10 @@ def _forward(x: th.Tensor, kinds: list[int], parameters: Sequence[th.Tensor], ke
     widths = np.array([-(-size // 4) * 4 for size in (x.shape[1], *(len(bias) for _, bias in layers))])
     packed, transposed = _pack(layers, widths, keep)
     rows, blocks = x.detach().contiguous().numpy(), -(-len(x) // ROWS)
-    kept = np.empty((blocks if keep else 0, int(widths.sum()), ROWS), np.float32)
+    shape = blocks if keep else 0, int(widths.sum()), ROWS
+    buffer = np.empty(math.prod(shape) + ALIGNED, np.float32)
+    first = -buffer.ctypes.data % 64 // 4
+    kept = buffer[first : first + math.prod(shape)].reshape(shape)
     out = np.empty((len(rows), len(parameters[-1])), np.float32)
     _helpers.run(forward, blocks, rows, widths, np.array(kinds), packed, kept, out)
     return th.from_numpy(out), (layers, widths, np.array(kinds), transposed, kept)
