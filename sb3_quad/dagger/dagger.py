@@ -20,11 +20,12 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_quad import common, networks
-from sb3_quad.base.arrays import Float32Array
+from sb3_quad import common
+from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
+from sb3_quad.networks import shared_out
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
@@ -317,28 +318,16 @@ class DAgger(OnPolicyAlgorithm):
         n_rows = buffer.buffer_size * buffer.n_envs
         n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
         n_batches = min(n_batches, self.n_epochs * n_rows)  # a row at least for the critic in each
-        actor_batches = th.from_numpy(sample_rows(len(self.dataset), n_batches * self.batch_size, rng)).view(n_batches, -1)
-        critic_batches = th.from_numpy(sample_rows(n_rows, self.n_epochs * n_rows, rng)).tensor_split(n_batches)
-        flown = th.from_numpy(buffer.observations.reshape(n_rows, *buffer.obs_shape))
-        old_values, returns = th.from_numpy(buffer.values.reshape(-1)), th.from_numpy(buffer.returns.reshape(-1))
+        actor_batches = sample_rows(len(self.dataset), n_batches * self.batch_size, rng).reshape(n_batches, -1)
+        critic_batches = np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng), n_batches)
+        flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
+        values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
+        networks = common.perceptrons(self.policy)
         terms = np.empty((n_batches, 5))  # loss and its four terms
 
-        for i, index in enumerate(critic_batches):
-            observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
-            mean, log_std = common.actor_mean(self.policy, observations), self.policy.log_std
-            bc = common.cloning_loss(self.bc_loss, mean, log_std, expert_actions)
-            with th.set_grad_enabled(self.ent_coef != 0.0):  # what weighs nothing is only logged
-                entropy_loss = -common.gaussian_entropy(log_std)
-            with th.set_grad_enabled(self.l2_coef != 0.0):
-                l2 = common.l2_loss(self.policy)
-
-            states, old, goals = (part[index].to(self.device) for part in (flown, old_values, returns))
-            v_loss = common.value_loss(common.critic_values(self.policy, states), old, goals, clip_range_vf)
-
-            loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
-            terms[i] = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()
-            self.policy.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
+        for i, (for_actor, for_critic) in enumerate(zip(actor_batches, critic_batches, strict=True)):
+            step = (for_actor, flown, values, for_critic, clip_range_vf)
+            terms[i] = self._gradients(*step) if networks is None else self._compiled_gradients(networks, *step)
             limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
             norms = [th.nn.utils.clip_grad_norm_(group, limit) for group in groups.values()]
             if not np.isfinite(terms[i]).all() or not all(th.isfinite(norm) for norm in norms):
@@ -348,7 +337,7 @@ class DAgger(OnPolicyAlgorithm):
                     f"{terms[i, 2]:.3g}); lower learning_rate, or look for rewards and observations that are not finite"
                 )
             self.policy.optimizer.step()
-            log_std.data.clamp_(min=self.log_std_min)
+            self.policy.log_std.data.clamp_(min=self.log_std_min)
             self._n_updates += 1
 
         names = ("loss", "bc_loss", "value_loss", "entropy_loss", "l2_loss")
@@ -359,6 +348,52 @@ class DAgger(OnPolicyAlgorithm):
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _gradients(
+        self,
+        for_actor: IntArray,
+        flown: npt.NDArray[Any],
+        values: Float32Array,
+        for_critic: IntArray,
+        clip_range_vf: float | None,
+    ) -> Float32Array:
+        """Set the gradient of Eq. 4.3 for rows of the dataset, and of the rollout just flown.
+
+        :param flown: its observations (n, ...); :param values: V when it was flown, and the returns, (n, 2).
+        :return: the loss, then its terms of cloning, value, entropy and weights.
+        """
+        policy = self.policy
+        observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(for_actor)))
+        mean, log_std = common.actor_mean(policy, observations), policy.log_std
+        bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
+        entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
+        states, (old, goals) = th.as_tensor(flown[for_critic], device=self.device), values[for_critic].T
+        bounds = (th.as_tensor(part, device=self.device) for part in (old.copy(), goals.copy()))
+        v_loss = common.value_loss(common.critic_values(policy, states), *bounds, clip_range_vf)
+        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
+        policy.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        terms: Float32Array = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()
+        return terms
+
+    def _compiled_gradients(
+        self,
+        networks: common.Perceptrons,
+        for_actor: IntArray,
+        flown: npt.NDArray[Any],
+        values: Float32Array,
+        for_critic: IntArray,
+        clip_range_vf: float | None,
+    ) -> Float32Array:
+        """The same by compiled code."""
+        observations, expert_actions, rows = self.dataset.arrays(for_actor)
+        loss = common.actor_terms(self.bc_loss, 1.0)
+        (bc, *_) = networks.actor.gradient(observations, rows, expert_actions, loss, networks.log_std) / len(rows)
+        loss = common.critic_terms(self.vf_coef, clip_range_vf)
+        (v_loss, *_) = networks.critic.gradient(flown.reshape(len(flown), -1), for_critic, values, loss) / len(for_critic)
+        entropy_loss, l2 = common.add_penalties(self.policy, self.ent_coef, self.l2_coef)
+        total = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
+        return np.array([total, bc, v_loss, entropy_loss, l2], dtype=np.float32)
 
     def learn(
         self,
@@ -376,7 +411,7 @@ class DAgger(OnPolicyAlgorithm):
         self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        with networks.shared_out(common.is_compiled(self.policy)):
+        with shared_out(common.perceptrons(self.policy) is not None):
             return super().learn(
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
             )

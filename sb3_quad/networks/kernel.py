@@ -7,6 +7,7 @@ Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a ro
 import numpy as np
 from numba import carray, float32
 
+from sb3_quad.networks.losses import actor_loss, critic_loss
 from sb3_quad.simulation.engine.lowlevel import atomic_add, atomic_get, compiled, give_way, pointer
 
 ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
@@ -113,100 +114,127 @@ def _aligned(address):
 
 
 @compiled
-def _load(rows, first, count, h):
-    """Rows ``first`` to ``first + count`` of (n, size) into a block, (width, ROWS), zeros around them."""
+def _load(rows, index, first, count, h):
+    """Rows of (m, size) into a block, (width, ROWS), zeros around them: the ``count`` from ``first`` on in ``index``."""
     for k in range(h.shape[0]):
         filled = count if k < rows.shape[1] else 0
         for i in range(filled):
-            h[k, i] = rows[first + i, k]
+            h[k, i] = rows[index[first + i], k]
         for i in range(filled, ROWS):
             h[k, i] = 0.0
 
 
 @compiled
-def _finish(control, chunks, patience):
-    """Wait for the chunks that other threads still have; whether that took more than ``patience`` looks."""
-    looks = 0
-    while atomic_get(control, DONE) < chunks:
-        looks += 1
-        if looks > patience:
-            give_way()
-    return looks > patience
+def _through(at, widths, kinds, parameters):
+    """All layers of a block, which lie behind one another from ``at`` on, the inputs first; where the outputs begin."""
+    place = parameters.ctypes.data
+    for layer in range(1, len(widths)):
+        rows, columns = widths[layer], widths[layer - 1]
+        x = carray(pointer(at), (columns, ROWS), np.float32)
+        at += 4 * columns * ROWS
+        h = carray(pointer(at), (rows, ROWS), np.float32)
+        _multiply(carray(pointer(place), (rows, columns), np.float32), x, h)
+        _activate(h, carray(pointer(place + 4 * rows * columns), (rows,), np.float32), kinds[layer - 1])
+        place += 4 * rows * (columns + 1)
+    return at
 
 
 @compiled
-def forward(control, main, chunks, x, widths, kinds, parameters, kept, out):
-    """Take chunks of blocks as long as there are any; ``main`` then waits until all are done.
+def _back(at, widths, kinds, transposed, sums, sides):
+    """The gradient by the parameters, added to ``sums``, of a block whose outputs' gradient lies in the first of ``sides``.
+
+    :param at: where the block's outputs begin; :param transposed: weights as (inputs, outputs).
+    """
+    last, place = len(widths) - 1, 4 * len(sums)
+    g = carray(pointer(sides[0]), (widths[last], ROWS), np.float32)
+    for layer in range(last, 0, -1):
+        rows, columns = widths[layer], widths[layer - 1]
+        h = carray(pointer(at), (rows, ROWS), np.float32)
+        at -= 4 * columns * ROWS
+        x = carray(pointer(at), (columns, ROWS), np.float32)
+        place -= 4 * rows * (columns + 1)
+        here = sums.ctypes.data + place
+        _undo_activation(g, h, kinds[layer - 1], carray(pointer(here + 4 * rows * columns), (rows,), np.float32))
+        _add_products(g, x, carray(pointer(here), (rows, columns), np.float32))
+        if layer > 1:
+            y = carray(pointer(sides[(last - layer + 1) % 2]), (columns, ROWS), np.float32)
+            _multiply(carray(pointer(transposed.ctypes.data + place), (columns, rows), np.float32), g, y)
+            g = y
+
+
+@compiled
+def _finish(control, chunks):
+    """Wait for the chunks that other threads still have; whether that took more than ``PATIENCE`` looks."""
+    looks = 0
+    while atomic_get(control, DONE) < chunks:
+        looks += 1
+        if looks > PATIENCE:
+            give_way()
+    return looks > PATIENCE
+
+
+@compiled
+def forward(control, main, chunks, x, widths, kinds, parameters, out):
+    """The outputs of all rows of x (n, inputs), into ``out`` (n, outputs).
+
+    Takes chunks of blocks as long as there are any; ``main`` then waits until all are done.
 
     :param control: int64 (CONTROL,): chunks left and done, shared by all threads.
-    :param x: (n, inputs).
     :param widths: of all layers, the inputs first, padded; :param kinds: the activation of each but the first.
-    :param kept: (blocks, sum of widths, ROWS), where :func:`backward` finds all layers; of size 0 if it is not to come.
-    :param out: (n, outputs).
     :return: whether ``main`` had to wait.
     """
-    n, total = len(x), widths.sum()
-    blocks = (n + ROWS - 1) // ROWS
-    scratch = np.empty(0 if kept.size else total * ROWS + ALIGNED, np.float32)
+    n = len(x)
+    blocks, index = (n + ROWS - 1) // ROWS, np.arange(n)
+    scratch = np.empty(widths.sum() * ROWS + ALIGNED, np.float32)
     while True:
         number = chunks - atomic_add(control, LEFT, -1)
         if number >= chunks:
-            return main and _finish(control, chunks, PATIENCE)
+            return main and _finish(control, chunks)
         for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
-            at = kept[block].ctypes.data if kept.size else _aligned(scratch.ctypes.data)
-            first = block * ROWS
-            h = carray(pointer(at), (widths[0], ROWS), np.float32)
-            _load(x, first, min(ROWS, n - first), h)
-            place = parameters.ctypes.data
-            for layer in range(1, len(widths)):
-                rows, columns = widths[layer], widths[layer - 1]
-                at += 4 * columns * ROWS
-                y = carray(pointer(at), (rows, ROWS), np.float32)
-                _multiply(carray(pointer(place), (rows, columns), np.float32), h, y)
-                _activate(y, carray(pointer(place + 4 * rows * columns), (rows,), np.float32), kinds[layer - 1])
-                place += 4 * rows * (columns + 1)
-                h = y
-            for i in range(min(ROWS, n - first)):
+            first, begin = block * ROWS, _aligned(scratch.ctypes.data)
+            count = min(ROWS, n - first)
+            _load(x, index, first, count, carray(pointer(begin), (widths[0], ROWS), np.float32))
+            at = _through(begin, widths, kinds, parameters)
+            h = carray(pointer(at), (out.shape[1], ROWS), np.float32)
+            for i in range(count):
                 for j in range(out.shape[1]):
                     out[first + i, j] = h[j, i]
         atomic_add(control, DONE, 1)
 
 
 @compiled
-def backward(control, main, chunks, grad, widths, kinds, transposed, kept, sums):
-    """As :func:`forward`, for the gradient by the parameters.
+def gradient(control, main, chunks, x, index, widths, kinds, parameters, transposed, targets, loss, log_std, sums, terms):
+    """The gradient of a loss (:mod:`.losses`) by all parameters; a block stays in the cache for its way forth and back.
 
-    :param grad: (n, outputs), by the outputs.
+    :param x: (m, inputs), and :param targets: (m, columns) of the loss, of which the rows ``index`` (n,) are meant.
     :param transposed: the parameters with each layer's weights as (inputs, outputs).
-    :param sums: (chunks, parameters): the gradient's part of each chunk, so that threads do not change what their sum is.
+    :param log_std: of the actions, (a,); of size 0 for a critic.
+    :param sums: (chunks, parameters + a): the part of each chunk, so that threads do not change what their sum is.
+    :param terms: float64 (chunks, TERMS), likewise, what the loss adds up for the log.
     """
-    n, total, last = len(grad), widths.sum(), len(widths) - 1
-    blocks = (n + ROWS - 1) // ROWS
-    widest = widths.max() * ROWS
-    scratch = np.empty(2 * widest + ALIGNED, np.float32)
-    sides = _aligned(scratch.ctypes.data), _aligned(scratch.ctypes.data) + 4 * widest
+    n, size = len(index), len(transposed)
+    blocks, widest = (n + ROWS - 1) // ROWS, widths.max() * ROWS
+    scratch = np.empty((widths.sum() * ROWS) + 2 * widest + ALIGNED, np.float32)
+    begin = _aligned(scratch.ctypes.data)
+    first_side = begin + 4 * widths.sum() * ROWS
+    sides = first_side, first_side + 4 * widest
     while True:
         number = chunks - atomic_add(control, LEFT, -1)
         if number >= chunks:
-            return main and _finish(control, chunks, PATIENCE)
+            return main and _finish(control, chunks)
         sums[number, :] = 0.0
+        terms[number, :] = 0.0
         for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
             first = block * ROWS
-            at = kept[block].ctypes.data + 4 * (total - widths[last]) * ROWS
-            g = carray(pointer(sides[0]), (widths[last], ROWS), np.float32)
-            _load(grad, first, min(ROWS, n - first), g)
-            place = 4 * sums.shape[1]
-            for layer in range(last, 0, -1):
-                rows, columns = widths[layer], widths[layer - 1]
-                h = carray(pointer(at), (rows, ROWS), np.float32)
-                at -= 4 * columns * ROWS
-                place -= 4 * rows * (columns + 1)
-                here = sums[number].ctypes.data + place
-                _undo_activation(g, h, kinds[layer - 1], carray(pointer(here + 4 * rows * columns), (rows,), np.float32))
-                x = carray(pointer(at), (columns, ROWS), np.float32)
-                _add_products(g, x, carray(pointer(here), (rows, columns), np.float32))
-                if layer > 1:
-                    y = carray(pointer(sides[(last - layer + 1) % 2]), (columns, ROWS), np.float32)
-                    _multiply(carray(pointer(transposed.ctypes.data + place), (columns, rows), np.float32), g, y)
-                    g = y
+            count = min(ROWS, n - first)
+            _load(x, index, first, count, carray(pointer(begin), (widths[0], ROWS), np.float32))
+            at = _through(begin, widths, kinds, parameters)
+            y = carray(pointer(at), (widths[-1], ROWS), np.float32)
+            g = carray(pointer(sides[0]), (widths[-1], ROWS), np.float32)
+            g[:, :] = 0.0
+            if len(log_std) > 0:
+                actor_loss(y, index, first, count, targets, loss, log_std, g, sums[number, size:], terms[number])
+            else:
+                critic_loss(y, index, first, count, targets, loss, g, terms[number])
+            _back(at, widths, kinds, transposed, sums[number, :size], sides)
         atomic_add(control, DONE, 1)

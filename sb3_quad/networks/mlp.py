@@ -1,6 +1,5 @@
-"""A multilayer perceptron as one function of PyTorch, computed by :mod:`.kernel` on as many cores as are free."""
+"""A multilayer perceptron and its gradients, computed by :mod:`.kernel` on as many cores as are free."""
 
-import math
 import os
 import queue
 import threading
@@ -9,91 +8,105 @@ from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import torch as th
 from torch import nn
 
-from sb3_quad.networks.kernel import ALIGNED, CONTROL, LINEAR, RELU, ROWS, TANH, backward, forward
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.networks.kernel import CONTROL, LINEAR, RELU, ROWS, TANH, forward, gradient
+from sb3_quad.networks.losses import TERMS
 
 CHUNKS = 8  # at most, of a mini-batch: what a thread takes at once
 WORTHWHILE = 4  # blocks; fewer are done before another thread has woken
 REST = 100  # calls without helpers after one kept a call waiting: its core is busy with something else
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
+_NO_ONE = np.empty(0)
 
 
-def fits(modules: Sequence[nn.Module]) -> bool:
-    """Whether these are linear layers with tanh or ReLU between them, in float32 on the CPU, and nobody listens to them."""
-    linear, between = modules[::2], modules[1::2]
-    return (
-        len(modules) % 2 == 1
-        and all(type(each) is nn.Linear and each.bias is not None for each in linear)
-        and all(each.weight.dtype == th.float32 and each.weight.device.type == "cpu" for each in linear)
-        and all(type(each) in _ACTIVATIONS for each in between)
-        and not any(each._forward_hooks or each._forward_pre_hooks or each._backward_hooks for each in modules)
-    )
+class Perceptron:
+    """Linear layers with tanh or ReLU between them, whose parameters stay PyTorch's.
 
+    :param modules: see :meth:`fits`.
+    """
 
-def apply(modules: Sequence[nn.Module], x: th.Tensor) -> th.Tensor:
-    """The output, (n, outputs), of modules that :func:`fits`, for x (n, inputs), by which there is no gradient."""
-    linear = modules[::2]
-    kinds = [*(_ACTIVATIONS[type(each)] for each in modules[1::2]), LINEAR]  # type: ignore[index]
-    parameters = [parameter for each in linear for parameter in (each.weight, each.bias)]
-    if not th.is_grad_enabled():
-        return _forward(x, kinds, parameters, keep=False)[0]
-    result: th.Tensor = _Mlp.apply(x, kinds, *parameters)  # type: ignore[no-untyped-call]
-    return result
+    def __init__(self, modules: Sequence[nn.Module]) -> None:
+        self._layers: list[Any] = [*modules[::2]]
+        self._kinds = np.array([*(_ACTIVATIONS[type(each)] for each in modules[1::2]), LINEAR])
+        sizes = [self._layers[0].in_features, *(each.out_features for each in self._layers)]
+        self._widths = np.array([-(-size // 4) * 4 for size in sizes])
+        self._size = int((self._widths[1:] * (self._widths[:-1] + 1)).sum())
 
-
-def _forward(x: th.Tensor, kinds: list[int], parameters: Sequence[th.Tensor], keep: bool) -> tuple[th.Tensor, Any]:
-    """The output, and what :meth:`_Mlp.backward` needs if it is to ``keep`` that."""
-    layers = list(zip(parameters[::2], parameters[1::2], strict=True))
-    widths = np.array([-(-size // 4) * 4 for size in (x.shape[1], *(len(bias) for _, bias in layers))])
-    packed, transposed = _pack(layers, widths, keep)
-    rows, blocks = x.detach().contiguous().numpy(), -(-len(x) // ROWS)
-    shape = blocks if keep else 0, int(widths.sum()), ROWS
-    buffer = np.empty(math.prod(shape) + ALIGNED, np.float32)
-    first = -buffer.ctypes.data % 64 // 4
-    kept = buffer[first : first + math.prod(shape)].reshape(shape)
-    out = np.empty((len(rows), len(parameters[-1])), np.float32)
-    _helpers.run(forward, blocks, rows, widths, np.array(kinds), packed, kept, out)
-    return th.from_numpy(out), (layers, widths, np.array(kinds), transposed, kept)
-
-
-class _Mlp(th.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: th.Tensor, kinds: list[int], *parameters: th.Tensor) -> th.Tensor:
-        out, ctx.held = _forward(x, kinds, parameters, keep=True)
+    def fits(modules: Sequence[nn.Module]) -> bool:
+        """Whether these are linear layers and activations in turn, in float32 on the CPU, and nobody listens to them."""
+        linear = modules[::2]
+        return (
+            len(modules) % 2 == 1
+            and all(type(each) is nn.Linear and each.bias is not None for each in linear)
+            and all(each.weight.dtype == th.float32 and each.weight.device.type == "cpu" for each in linear)
+            and all(type(each) in _ACTIVATIONS for each in modules[1::2])
+            and not any(each._forward_hooks or each._forward_pre_hooks or each._backward_hooks for each in modules)
+        )
+
+    def __call__(self, x: Float32Array) -> Float32Array:
+        """The outputs (n, outputs) for x (n, inputs)."""
+        out = np.empty((len(x), self._layers[-1].out_features), np.float32)
+        _helpers.run(forward, len(x), x, self._widths, self._kinds, self._packed(transposed=False), out)
         return out
 
-    @staticmethod
-    def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor | None, ...]:
-        layers, widths, kinds, transposed, kept = ctx.held
-        sums = np.empty((min(CHUNKS, len(kept)), len(transposed)), np.float32)
-        _helpers.run(backward, len(kept), gradients[0].contiguous().numpy(), widths, kinds, transposed, kept, sums)
-        flat = th.from_numpy(sums).sum(0)
-        result: list[th.Tensor | None] = [None, None]
+    def gradient(
+        self, x: Float32Array, index: IntArray, targets: Float32Array, loss: Any, log_std: th.Tensor | None = None
+    ) -> FloatArray:
+        """Set the gradient of a loss over the rows ``index`` of x and ``targets`` as ``.grad`` of all parameters.
+
+        The number of threads changes no bit of it.
+
+        :param loss: of dtype ``LOSS``, (1,).
+        :param log_std: of an actor, (a,); its gradient is set, too.
+        :return: the terms of the loss, sums over the rows.
+        """
+        stds = _NO_ONE if log_std is None else log_std.detach().double().numpy()
+        chunks = _chunks(len(index))
+        sums, terms = np.empty((chunks, self._size + len(stds)), np.float32), np.empty((chunks, TERMS))
+        arrays = self._packed(transposed=False), self._packed(transposed=True)
+        _helpers.run(gradient, len(index), x, index, self._widths, self._kinds, *arrays, targets, loss, stds, sums, terms)
+        total = th.from_numpy(sums.sum(axis=0))
+        for layer, at, rows, columns in self._places():
+            middle = at + rows * columns
+            of_weights = total[at:middle].view(rows, columns)[: layer.out_features, : layer.in_features]
+            layer.weight.grad = of_weights.contiguous()
+            layer.bias.grad = total[middle : middle + layer.out_features]
+        if log_std is not None:
+            log_std.grad = total[self._size :]
+        result: FloatArray = terms.sum(axis=0)
+        return result
+
+    def _places(self) -> Iterator[tuple[Any, int, int, int]]:
+        """Of each layer where its parameters begin, and its padded outputs and inputs."""
         at = 0
-        for (weight, bias), rows, columns in zip(layers, widths[1:].tolist(), widths[:-1].tolist(), strict=True):
-            middle, end = at + rows * columns, at + rows * (columns + 1)
-            result.append(flat[at:middle].view(rows, columns)[: weight.shape[0], : weight.shape[1]])
-            result.append(flat[middle : middle + len(bias)])
-            at = end
-        return tuple(result)
+        for layer, columns, rows in zip(self._layers, self._widths.tolist(), self._widths[1:].tolist(), strict=False):
+            yield layer, at, rows, columns
+            at += rows * (columns + 1)
+
+    def _packed(self, transposed: bool) -> Float32Array:
+        packed = np.zeros(self._size, np.float32)
+        for layer, at, rows, columns in self._places():
+            weight, end = layer.weight.detach().numpy(), at + rows * columns
+            block, weight = (
+                (packed[at:end].reshape(columns, rows), weight.T)
+                if transposed
+                else (
+                    packed[at:end].reshape(rows, columns),
+                    weight,
+                )
+            )
+            block[: weight.shape[0], : weight.shape[1]] = weight
+            packed[end : end + layer.out_features] = layer.bias.detach().numpy()
+        return packed
 
 
-def _pack(layers: Sequence[tuple[th.Tensor, th.Tensor]], widths: Any, for_backward: bool) -> tuple[Any, Any]:
-    """The parameters behind one another, padded; and with the weights transposed, or None."""
-    size = int((widths[1:] * (widths[:-1] + 1)).sum())
-    packed = np.zeros(size, np.float32)
-    transposed = np.zeros(size, np.float32) if for_backward else None
-    at = 0
-    for (weight, bias), rows, columns in zip(layers, widths[1:].tolist(), widths[:-1].tolist(), strict=True):
-        w, end = weight.detach().numpy(), at + rows * columns
-        packed[at:end].reshape(rows, columns)[: w.shape[0], : w.shape[1]] = w
-        packed[end : end + len(bias)] = bias.detach().numpy()
-        if transposed is not None:
-            transposed[at:end].reshape(columns, rows)[: w.shape[1], : w.shape[0]] = w.T
-        at = end + rows
-    return packed, transposed
+def _chunks(n: int) -> int:
+    return min(CHUNKS, -(-n // ROWS))
 
 
 class _Helpers:
@@ -105,11 +118,12 @@ class _Helpers:
         self._resting = 0
         self._calls: queue.SimpleQueue[tuple[Callable[..., bool], Any]] = queue.SimpleQueue()
 
-    def run(self, function: Callable[..., bool], blocks: int, *arguments: Any) -> None:
-        chunks = min(CHUNKS, blocks)
+    def run(self, function: Callable[..., bool], n: int, *arguments: npt.NDArray[Any]) -> None:
+        """Call a function of :mod:`.kernel` for n rows."""
+        chunks = _chunks(n)
         control = np.zeros(CONTROL, dtype=np.int64)
         control[0] = chunks
-        count = min(self.threads, chunks) - 1 if blocks >= WORTHWHILE else 0
+        count = min(self.threads, chunks) - 1 if n > (WORTHWHILE - 1) * ROWS else 0
         if self._resting > 0:
             self._resting -= 1
             count = 0
@@ -142,12 +156,12 @@ if hasattr(os, "register_at_fork"):
 
 @contextmanager
 def shared_out(compiled: bool) -> Iterator[None]:
-    """Within the block PyTorch has one thread, and as many as it had before take part in :func:`apply`.
+    """Within the block PyTorch has one thread, and as many as it had before share the work of every :class:`Perceptron`.
 
     PyTorch's own threads wait for one another at every operation: on a machine that does something else beside they are up to
     ten times slower than one.
 
-    :param compiled: whether the policy's networks are :func:`apply`'s; else nothing is changed.
+    :param compiled: whether there is such work; else nothing is changed.
     """
     before = th.get_num_threads(), _helpers.threads
     if compiled and before[1] == 1:
