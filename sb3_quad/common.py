@@ -14,6 +14,7 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from torch.nn import functional as F
 
+from sb3_quad.base.arrays import Float32Array
 from sb3_quad.networks import LOSS, Perceptron
 
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
@@ -88,11 +89,24 @@ def perceptrons(policy: ActorCriticPolicy) -> Perceptrons | None:
     if type(extractor) is not MlpExtractor or type(policy.action_dist) is not DiagGaussianDistribution:
         return None
     actor, critic = [*extractor.policy_net, policy.action_net], [*extractor.value_net, policy.value_net]
-    plain = type(policy.features_extractor) is FlattenExtractor and policy.observation_space.dtype in (np.float32, np.float64)
+    plain = type(policy.features_extractor) is FlattenExtractor and policy.observation_space.dtype == np.float32
     n_parameters = 2 * sum(type(layer) is th.nn.Linear for layer in (*actor, *critic)) + 1
     if not (plain and Perceptron.fits(actor) and Perceptron.fits(critic) and n_parameters == len([*policy.parameters()])):
         return None
     return Perceptrons(Perceptron(actor), Perceptron(critic), policy.log_std)
+
+
+def outputs(
+    networks: Perceptrons | None, policy: ActorCriticPolicy, part: Literal["actor", "critic"], observations: Any
+) -> Float32Array:
+    """What :func:`actor_mean` or :func:`critic_values` give, without gradients; by the policy's ``networks`` if there are any."""
+    if networks is not None:
+        given = np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)
+        return networks.actor(given) if part == "actor" else networks.critic(given)[:, 0]
+    with th.no_grad():
+        tensor = th.as_tensor(observations, device=policy.device)
+        result = actor_mean(policy, tensor) if part == "actor" else critic_values(policy, tensor)
+        return np.asarray(result.cpu().numpy())
 
 
 def actor_terms(kind: CloningLoss, cloning: float, **ppo: float) -> Any:

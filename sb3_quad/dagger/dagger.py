@@ -235,7 +235,7 @@ class DAgger(OnPolicyAlgorithm):
         whole rollout at the end, since it does not change before.
         """
         self.policy.set_training_mode(False)
-        labeller, rng = Controller.for_env(self.expert, env), self._generator(0)
+        labeller, rng, networks = Controller.for_env(self.expert, env), self._generator(0), common.perceptrons(self.policy)
         beta = self.current_beta
         n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
@@ -251,8 +251,7 @@ class DAgger(OnPolicyAlgorithm):
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
             labels[step] = labeller.labels(observations)  # of the state before the step
-            with th.no_grad():
-                means = common.actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
+            means = common.outputs(networks, self.policy, "actor", observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta
             actions = np.where(by_expert[:, None], labels[step], sampled)
@@ -295,11 +294,11 @@ class DAgger(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _values(self, observations: Any) -> Float32Array:
+    def _values(self, observations: npt.NDArray[Any]) -> Float32Array:
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
-        with th.no_grad():
-            chunks = th.split(th.as_tensor(observations, device=self.device), _VALUE_CHUNK)
-            return np.asarray(th.cat([common.critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
+        networks, chunks = common.perceptrons(self.policy), range(0, len(observations), _VALUE_CHUNK)
+        parts = (observations[first : first + _VALUE_CHUNK] for first in chunks)
+        return np.concatenate([common.outputs(networks, self.policy, "critic", part) for part in parts])
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.

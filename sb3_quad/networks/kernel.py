@@ -15,7 +15,8 @@ TILE = 16  # inputs at once: their rows stay in the first cache
 LINEAR, TANH, RELU = range(3)
 LEFT, DONE, CONTROL = 0, 16, 32  # places, each on a cache line of its own, and size of the control array
 ALIGNED = 16  # float32 numbers in a cache line: vectors that straddle two take a third longer
-PATIENCE = 20_000  # looks at a block that another thread still has, before that is let have the core
+SPIN = 20_000  # looks at a chunk that another thread still has, before that is let have the core: some 30 microseconds
+LATE = SPIN + 5_000  # looks, with that: longer than a chunk takes
 _FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
 _END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
 
@@ -114,14 +115,25 @@ def _aligned(address):
 
 
 @compiled
+def _touch(rows, index, first, count):
+    """Have rows brought into the cache, many at a time; where they lie far apart, each would else be waited for."""
+    total = float32(0.0)
+    for i in range(first, first + count):
+        total += rows[index[i], 0] + rows[index[i], rows.shape[1] - 1]
+    return total
+
+
+@compiled
 def _load(rows, index, first, count, h):
     """Rows of (m, size) into a block, (width, ROWS), zeros around them: the ``count`` from ``first`` on in ``index``."""
+    h[0, 0] = _touch(rows, index, first, count)
     for k in range(h.shape[0]):
-        filled = count if k < rows.shape[1] else 0
-        for i in range(filled):
-            h[k, i] = rows[index[first + i], k]
-        for i in range(filled, ROWS):
+        for i in range(count if k < rows.shape[1] else 0, ROWS):
             h[k, i] = 0.0
+    for i in range(count):
+        row = rows[index[first + i]]
+        for k in range(rows.shape[1]):
+            h[k, i] = row[k]
 
 
 @compiled
@@ -164,13 +176,13 @@ def _back(at, widths, kinds, transposed, sums, sides):
 
 @compiled
 def _finish(control, chunks):
-    """Wait for the chunks that other threads still have; whether that took more than ``PATIENCE`` looks."""
+    """Wait for the chunks that other threads still have; whether one of them has lost its core meanwhile."""
     looks = 0
     while atomic_get(control, DONE) < chunks:
         looks += 1
-        if looks > PATIENCE:
+        if looks > SPIN:
             give_way()
-    return looks > PATIENCE
+    return looks > LATE
 
 
 @compiled
@@ -232,6 +244,7 @@ def gradient(control, main, chunks, x, index, widths, kinds, parameters, transpo
             y = carray(pointer(at), (widths[-1], ROWS), np.float32)
             g = carray(pointer(sides[0]), (widths[-1], ROWS), np.float32)
             g[:, :] = 0.0
+            g[0, 0] = 0.0 * _touch(targets, index, first, count)
             if len(log_std) > 0:
                 actor_loss(y, index, first, count, targets, loss, log_std, g, sums[number, size:], terms[number])
             else:

@@ -16,7 +16,7 @@ from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.networks.kernel import CONTROL, LINEAR, RELU, ROWS, TANH, forward, gradient
 from sb3_quad.networks.losses import TERMS
 
-CHUNKS = 8  # at most, of a mini-batch: what a thread takes at once
+CHUNKS = 16  # at most, of a mini-batch: what a thread takes at once
 WORTHWHILE = 4  # blocks; fewer are done before another thread has woken
 REST = 100  # calls without helpers after one kept a call waiting: its core is busy with something else
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
@@ -35,6 +35,14 @@ class Perceptron:
         sizes = [self._layers[0].in_features, *(each.out_features for each in self._layers)]
         self._widths = np.array([-(-size // 4) * 4 for size in sizes])
         self._size = int((self._widths[1:] * (self._widths[:-1] + 1)).sum())
+        self._packed = np.zeros((2, self._size), np.float32)  # with the weights as they are, and transposed
+        self._copies: list[tuple[Float32Array, Float32Array]] = []  # from PyTorch's memory into these
+        for layer, at, rows, columns in self._places():
+            weight, bias, middle = layer.weight.detach().numpy(), layer.bias.detach().numpy(), at + rows * columns
+            plain, transposed = self._packed[0, at:middle].reshape(rows, -1), self._packed[1, at:middle].reshape(columns, -1)
+            self._copies.append((plain[: weight.shape[0], : weight.shape[1]], weight))
+            self._copies.append((transposed[: weight.shape[1], : weight.shape[0]], weight.T))
+            self._copies.append((self._packed[:, middle : middle + len(bias)], bias))
 
     @staticmethod
     def fits(modules: Sequence[nn.Module]) -> bool:
@@ -51,7 +59,7 @@ class Perceptron:
     def __call__(self, x: Float32Array) -> Float32Array:
         """The outputs (n, outputs) for x (n, inputs)."""
         out = np.empty((len(x), self._layers[-1].out_features), np.float32)
-        _helpers.run(forward, len(x), x, self._widths, self._kinds, self._packed(transposed=False), out)
+        _helpers.run(forward, len(x), x, self._widths, self._kinds, self._pack()[0], out)
         return out
 
     def gradient(
@@ -68,8 +76,7 @@ class Perceptron:
         stds = _NO_ONE if log_std is None else log_std.detach().double().numpy()
         chunks = _chunks(len(index))
         sums, terms = np.empty((chunks, self._size + len(stds)), np.float32), np.empty((chunks, TERMS))
-        arrays = self._packed(transposed=False), self._packed(transposed=True)
-        _helpers.run(gradient, len(index), x, index, self._widths, self._kinds, *arrays, targets, loss, stds, sums, terms)
+        _helpers.run(gradient, len(index), x, index, self._widths, self._kinds, *self._pack(), targets, loss, stds, sums, terms)
         total = th.from_numpy(sums.sum(axis=0))
         for layer, at, rows, columns in self._places():
             middle = at + rows * columns
@@ -88,21 +95,10 @@ class Perceptron:
             yield layer, at, rows, columns
             at += rows * (columns + 1)
 
-    def _packed(self, transposed: bool) -> Float32Array:
-        packed = np.zeros(self._size, np.float32)
-        for layer, at, rows, columns in self._places():
-            weight, end = layer.weight.detach().numpy(), at + rows * columns
-            block, weight = (
-                (packed[at:end].reshape(columns, rows), weight.T)
-                if transposed
-                else (
-                    packed[at:end].reshape(rows, columns),
-                    weight,
-                )
-            )
-            block[: weight.shape[0], : weight.shape[1]] = weight
-            packed[end : end + layer.out_features] = layer.bias.detach().numpy()
-        return packed
+    def _pack(self) -> Float32Array:
+        for there, here in self._copies:
+            there[...] = here
+        return self._packed
 
 
 def _chunks(n: int) -> int:
