@@ -99,7 +99,7 @@ def perceptrons(policy: ActorCriticPolicy) -> Perceptrons | None:
 def outputs(
     networks: Perceptrons | None, policy: ActorCriticPolicy, part: Literal["actor", "critic"], observations: Any
 ) -> Float32Array:
-    """What :func:`actor_mean` or :func:`critic_values` give, without gradients; by the policy's ``networks`` if there are any."""
+    """What :func:`actor_mean` or :func:`critic_values` give, without gradients; by the ``networks`` if there are any."""
     if networks is not None:
         given = np.ascontiguousarray(observations, dtype=np.float32).reshape(len(observations), -1)
         return networks.actor(given) if part == "actor" else networks.critic(given)[:, 0]

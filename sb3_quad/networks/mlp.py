@@ -76,7 +76,9 @@ class Perceptron:
         stds = _NO_ONE if log_std is None else log_std.detach().double().numpy()
         chunks = _chunks(len(index))
         sums, terms = np.empty((chunks, self._size + len(stds)), np.float32), np.empty((chunks, TERMS))
-        _helpers.run(gradient, len(index), x, index, self._widths, self._kinds, *self._pack(), targets, loss, stds, sums, terms)
+        _helpers.run(
+            gradient, len(index), x, index, self._widths, self._kinds, *self._pack(), targets, loss, stds, sums, terms
+        )
         total = th.from_numpy(sums.sum(axis=0))
         for layer, at, rows, columns in self._places():
             middle = at + rows * columns
@@ -87,6 +89,10 @@ class Perceptron:
             log_std.grad = total[self._size :]
         result: FloatArray = terms.sum(axis=0)
         return result
+
+    def parameters(self) -> Iterator[nn.Parameter]:
+        """PyTorch's, by layers."""
+        return (parameter for layer in self._layers for parameter in (layer.weight, layer.bias))
 
     def _places(self) -> Iterator[tuple[Any, int, int, int]]:
         """Of each layer where its parameters begin, and its padded outputs and inputs."""
