@@ -19,6 +19,7 @@ from sb3_quad.networks import LOSS, Perceptron
 
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
+PARTS: tuple[Literal["actor", "critic"], ...] = ("actor", "critic")
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
 MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
 
@@ -107,6 +108,18 @@ def outputs(
         tensor = th.as_tensor(observations, device=policy.device)
         result = actor_mean(policy, tensor) if part == "actor" else critic_values(policy, tensor)
         return np.asarray(result.cpu().numpy())
+
+
+def act(
+    networks: Perceptrons, policy: ActorCriticPolicy, observations: th.Tensor, deterministic: bool = False
+) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+    """``policy.forward`` in less time: actions (b, a), values (b, 1), log-probabilities (b,); the same random numbers."""
+    given = observations.numpy()
+    mean, values = (th.from_numpy(outputs(networks, policy, part, given)) for part in PARTS)
+    noise = th.zeros_like(mean) if deterministic else th.normal(th.zeros_like(mean), th.ones_like(mean))
+    actions = mean + th.exp(policy.log_std.detach()) * noise
+    log_prob = -gaussian_nll(mean, policy.log_std.detach(), actions)
+    return actions.reshape(-1, *(policy.action_space.shape or ())), values[:, None], log_prob
 
 
 def actor_terms(kind: CloningLoss, cloning: float, **ppo: float) -> Any:

@@ -5,18 +5,19 @@ Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a ro
 """
 
 import numpy as np
-from numba import carray, float32
+from numba import carray, float32, uint64
 
 from sb3_quad.networks.losses import actor_loss, critic_loss
 from sb3_quad.simulation.engine.lowlevel import atomic_add, atomic_get, compiled, give_way, pointer
 
 ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
-TILE = 16  # inputs at once: their rows stay in the first cache
 LINEAR, TANH, RELU = range(3)
 LEFT, DONE, CONTROL = 0, 16, 32  # places, each on a cache line of its own, and size of the control array
 ALIGNED = 16  # float32 numbers in a cache line: vectors that straddle two take a third longer
 SPIN = 20_000  # looks at a chunk that another thread still has, before that is let have the core: some 30 microseconds
 LATE = SPIN + 5_000  # looks, with that: longer than a chunk takes
+_0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
+_TILE = np.uint64(16)  # inputs at once: their rows stay in the first cache
 _FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
 _END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
 
@@ -24,32 +25,35 @@ _END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
 @compiled(fastmath=_FAST)
 def _multiply(w, x, h):
     """h = w x; w (rows, columns), x (columns, ROWS), h (rows, ROWS)."""
-    for tile in range(0, w.shape[1], TILE):
-        for j in range(0, w.shape[0], 2):
-            for k in range(tile, min(w.shape[1], tile + TILE), 4):
-                a0, a1, a2, a3 = w[j, k], w[j, k + 1], w[j, k + 2], w[j, k + 3]
-                b0, b1, b2, b3 = w[j + 1, k], w[j + 1, k + 1], w[j + 1, k + 2], w[j + 1, k + 3]
-                if k == 0:
+    rows, columns = uint64(w.shape[0]), uint64(w.shape[1])  # unsigned: Python's indices from the end would cost a third
+    for tile in range(_0, columns, _TILE):
+        for j in range(_0, rows, _2):
+            for k in range(tile, min(columns, tile + _TILE), _4):
+                a0, a1, a2, a3 = w[j, k], w[j, k + _1], w[j, k + _2], w[j, k + _3]
+                b0, b1, b2, b3 = w[j + _1, k], w[j + _1, k + _1], w[j + _1, k + _2], w[j + _1, k + _3]
+                if k == _0:
                     for i in range(ROWS):
-                        x0, x1, x2, x3 = x[k, i], x[k + 1, i], x[k + 2, i], x[k + 3, i]
+                        x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
                         h[j, i] = a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                        h[j + 1, i] = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                        h[j + _1, i] = b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
                 else:
                     for i in range(ROWS):
-                        x0, x1, x2, x3 = x[k, i], x[k + 1, i], x[k + 2, i], x[k + 3, i]
+                        x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
                         h[j, i] += a0 * x0 + a1 * x1 + a2 * x2 + a3 * x3
-                        h[j + 1, i] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
+                        h[j + _1, i] += b0 * x0 + b1 * x1 + b2 * x2 + b3 * x3
 
 
 @compiled(fastmath=_FAST)
 def _add_products(g, x, dw):
     """dw += g xᵀ; g (rows, ROWS), x (columns, ROWS), dw (rows, columns)."""
-    for tile in range(0, dw.shape[1], TILE):
-        for j in range(0, dw.shape[0], 2):
-            for k in range(tile, min(dw.shape[1], tile + TILE), 4):
+    rows, columns = uint64(dw.shape[0]), uint64(dw.shape[1])
+    for tile in range(_0, columns, _TILE):
+        for j in range(_0, rows, _2):
+            for k in range(tile, min(columns, tile + _TILE), _4):
                 a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = float32(0.0)
                 for i in range(ROWS):
-                    x0, x1, x2, x3, g0, g1 = x[k, i], x[k + 1, i], x[k + 2, i], x[k + 3, i], g[j, i], g[j + 1, i]
+                    x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
+                    g0, g1 = g[j, i], g[j + _1, i]
                     a0 += g0 * x0
                     a1 += g0 * x1
                     a2 += g0 * x2
@@ -58,11 +62,11 @@ def _add_products(g, x, dw):
                     b1 += g1 * x1
                     b2 += g1 * x2
                     b3 += g1 * x3
-                for row, sums in ((j, (a0, a1, a2, a3)), (j + 1, (b0, b1, b2, b3))):
+                for row, sums in ((j, (a0, a1, a2, a3)), (j + _1, (b0, b1, b2, b3))):
                     dw[row, k] += sums[0]
-                    dw[row, k + 1] += sums[1]
-                    dw[row, k + 2] += sums[2]
-                    dw[row, k + 3] += sums[3]
+                    dw[row, k + _1] += sums[1]
+                    dw[row, k + _2] += sums[2]
+                    dw[row, k + _3] += sums[3]
 
 
 @compiled(fastmath=_FAST)

@@ -1,8 +1,10 @@
 """PPO with a weighted behavioural-cloning loss towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
+import functools
 import inspect
 from collections.abc import Callable, Generator, Mapping
 from typing import Any, cast
+from unittest.mock import patch
 
 import numpy as np
 import torch as th
@@ -162,7 +164,11 @@ class PPOBC(PPO):
                 buffer.expert_actions[buffer.pos] = labeller.labels(observation)
 
             env = _BeforeStep(env, label)
-        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        networks = common.perceptrons(self.policy) if self._rollout_bc_coef != 0.0 else None  # else as PPO, bit for bit
+        if networks is None:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        with patch.object(self.policy, "forward", functools.partial(common.act, networks, self.policy)):
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
         """One update on the rollout just flown: PPO's loop, with what is added to it marked by ``+``."""
