@@ -294,7 +294,7 @@ class DAgger(OnPolicyAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def _values(self, observations: npt.NDArray[Any]) -> Float32Array:
+    def _values(self, observations: Any) -> Float32Array:
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
         networks, chunks = common.perceptrons(self.policy), range(0, len(observations), _VALUE_CHUNK)
         parts = (observations[first : first + _VALUE_CHUNK] for first in chunks)
@@ -366,9 +366,8 @@ class DAgger(OnPolicyAlgorithm):
         mean, log_std = common.actor_mean(policy, observations), policy.log_std
         bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
         entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
-        states, (old, goals) = th.as_tensor(flown[for_critic], device=self.device), values[for_critic].T
-        bounds = (th.as_tensor(part, device=self.device) for part in (old.copy(), goals.copy()))
-        v_loss = common.value_loss(common.critic_values(policy, states), *bounds, clip_range_vf)
+        states, bounds = (th.as_tensor(part[for_critic], device=self.device) for part in (flown, values))
+        v_loss = common.value_loss(common.critic_values(policy, states), bounds[:, 0], bounds[:, 1], clip_range_vf)
         loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
         policy.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
