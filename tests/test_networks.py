@@ -106,7 +106,7 @@ PPO_BC = [
 ]
 DAGGER = [
     {"bc_loss": "mse"},
-    {"bc_loss": "huber", "dataset_capacity": 2000},
+    {"bc_loss": "huber", "dataset_capacity": 2000, "gradient_steps": 30},
     {"bc_loss": "huber_mse", "l2_coef": 1e-3, "ent_coef": 1e-3},
     {"bc_loss": "nll", "clip_range_vf": 0.2, "max_grad_norm": None},
 ]
