@@ -69,8 +69,8 @@ class DAgger(OnPolicyAlgorithm):
     :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a
         large error of the critic does not hold up the actor. None: no clipping
     :param gradient_steps: Optimiser steps after each rollout, at most one for each row of ``n_epochs`` passes over it. Each
-        takes ``batch_size`` pairs of the dataset. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The critic takes part in as many of them as that, or in
-        all if there are fewer, each with an equal share of its passes
+        takes ``batch_size`` pairs of the dataset. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The
+        critic takes part in as many of them as that, or in all if there are fewer, each with an equal share of its passes
     :param beta: β of the first rollout, from 0 to 1
     :param beta_decay: What β loses with every rollout
     :param beta_final: Where β stops falling

@@ -16,7 +16,7 @@ FILTERS = ("none", "negative_advantage", "agreement")
 LOSS = np.dtype(
     [
         *(("kind", "i8"), ("filter", "i8")),  # of the cloning term, a row of the tuples above
-        ("cloning", "f8"),  # its weight, 0 for none
+        *(("cloning", "f8"), ("labelled", "?")),  # its weight, 0 for none; and whether there are labels, even so
         *(("delta", "f8"), ("mse_weight", "f8"), ("agreement", "f8")),  # constants of it
         *(("policy", "f8"), ("clip_range", "f8")),  # weight of PPO's term, 0 for none; ε of an actor or a critic, inf for none
         *(("shift", "f8"), ("scale", "f8")),  # what normalises advantages: (advantage - shift) * scale
@@ -37,7 +37,7 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
     :param mean: (a, ROWS), and so is ``g``; :param loss: of dtype LOSS, (1,).
     """
     c, n, a = loss[0], len(index), len(log_std)
-    flown = a if c.cloning != 0.0 else 0
+    flown = a if c.labelled else 0
     for i in range(count):
         target = targets[index[first + i]]
         if c.cloning != 0.0:

@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Float32Array, IntArray
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
 from sb3_quad.networks import shared_out
@@ -195,10 +195,11 @@ class PPOBC(PPO):
         for epoch in range(self.n_epochs):
             first = len(monitored)
             for index in buffer.indices(self.batch_size):
-                if networks is not None and monitored:  # + the first is for grad_norms, too
+                if networks is not None:  # +
                     targets = targets or buffer.targets(labelled=bc_coef != 0.0)
                     coefs = (bc_coef, clip_range, clip_range_vf)
-                    monitored.append(self._compiled_gradients(networks, targets, index, *coefs, warming_up))
+                    norms = None if monitored else grad_norms
+                    monitored.append(self._compiled_gradients(networks, targets, index, *coefs, warming_up, norms))
                     if not self._take_step(monitored[-1], parameters, epoch):
                         continue_training = False
                         break
@@ -311,29 +312,47 @@ class PPOBC(PPO):
         clip_range: float,
         clip_range_vf: float | None,
         warming_up: bool,
+        norms: dict[str, float] | None,
     ) -> dict[str, th.Tensor]:
         """Set the gradients of Eq. 4.4 for rows of the rollout, by compiled code; returns what the logger gets.
 
         :param targets: see :meth:`ExpertRolloutBuffer.targets`.
+        :param norms: gets the norm of each term's own gradient, as :func:`_gradient_norms` gives it.
         """
         observations, for_actor, for_critic = targets
         shift, scale = 0.0, 1.0
         if self.normalize_advantage and len(index) > 1:
             advantages = for_actor[index, -1]
             shift, scale = float(advantages.mean()), 1.0 / (float(advantages.std(ddof=1)) + 1e-8)
-        rows = {"policy": 1.0, "clip_range": clip_range, "shift": shift, "scale": scale}
+        rows: dict[str, float] = {"clip_range": clip_range, "shift": shift, "scale": scale}
         rows |= {"filter": BC_FILTERS.index(self.bc_filter), "agreement": AGREEMENT}
         n_actions = len(networks.log_std) if self.bc_loss == "nll" else 1  # a mean over them
-        actor = common.actor_terms(self.bc_loss, bc_coef / n_actions, **rows)
-        sums = networks.actor.gradient(observations, index, for_actor, actor, networks.log_std) / len(index)
+
+        def of_actor(cloning: float, policy: float) -> FloatArray:
+            terms = common.actor_terms(self.bc_loss, cloning, policy=policy, labelled=bc_coef != 0.0, **rows)
+            return networks.actor.gradient(observations, index, for_actor, terms, networks.log_std) / len(index)
+
+        own = [*networks.actor.parameters(), networks.log_std]
+        if norms is not None:
+            for name, weights in {"policy": (0.0, 1.0), "bc": (bc_coef / n_actions, 0.0)}.items():
+                if any(weights):
+                    of_actor(*weights)
+                    norms[name] = _norm(own)
+        sums = of_actor(bc_coef / n_actions, 1.0)
         critic = common.critic_terms(self.vf_coef, clip_range_vf, self.max_clipped_value)
         value = networks.critic.gradient(observations, index, for_critic, critic)[0] / len(index)
+        if norms is not None:
+            norms["value"] = _norm([*networks.critic.parameters()])
         if warming_up:
-            for parameter in (*networks.actor.parameters(), networks.log_std):
+            for parameter in own:
                 parameter.grad = None
         entropy, l2 = common.add_penalties(
             self.policy, 0.0 if warming_up else self.ent_coef, 0.0 if warming_up else self.l2_coef
         )
+        if norms is not None and self.ent_coef != 0.0:
+            norms["entropy"] = abs(self.ent_coef) * len(networks.log_std) ** 0.5
+        if norms is not None and self.l2_coef > 0.0:
+            norms["l2"] = self.l2_coef * (2.0 * l2) ** 0.5
         bc, policy, kl, clipped = sums[:4]
         logged = {"policy_gradient_loss": policy, "value_loss": value, "entropy_loss": entropy}
         logged |= {"approx_kl": kl, "clip_fraction": clipped}
@@ -456,6 +475,10 @@ def _gradient_norms(terms: Mapping[str, th.Tensor], parameters: list[th.nn.Param
         squares = [gradient.square().sum() for gradient in gradients if gradient is not None]
         norms[name] = float(th.stack(squares).sum().sqrt()) if squares else 0.0
     return norms
+
+
+def _norm(parameters: list[th.nn.Parameter]) -> float:
+    return float(th.stack([each.grad.norm() for each in parameters if each.grad is not None]).norm())
 
 
 def _full_signature() -> inspect.Signature:
