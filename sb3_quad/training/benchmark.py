@@ -25,6 +25,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 import sb3_quad
 from sb3_quad import common
 from sb3_quad.experts.controller import Controller
+from sb3_quad.networks import Perceptron
 from sb3_quad.settings.config import TrainingConfig, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
@@ -35,9 +36,9 @@ TRAINED = "QuadStateRecovery-v0"  # by train without arguments
 REPETITIONS = 5
 PARTS = (
     *("rollout: environment", "rollout: labels", "rollout: forward", "rollout"),
-    *("update: forward", "update: backward", "update: optimiser", "update"),
+    *("update: forward and backward", "update: optimiser", "update"),
 )
-"""Of a training loop; the last of a rollout is what remains of it, such as its buffer, that of an update its loss."""
+"""Of a training loop; the last of a rollout, and of an update, is what remains of it, such as its buffer or its mini-batches."""
 NAMES = {"batch": "batch", "dummy": "PyBullet, DummyVecEnv", "subproc": "PyBullet, SubprocVecEnv"}
 PACKAGES = ("stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 
@@ -128,7 +129,7 @@ class _Clock(BaseCallback):
             outer, self._within = self._within, 0.0
             if part in ("rollout", "update"):
                 self._phase = part
-            name = part if part in PARTS else f"{self._phase}: {part}"
+            name = next((each for each in PARTS if each.startswith(f"{self._phase}: {part}")), part)
             start = time.perf_counter()
             try:
                 return function(*args, **kwargs)
@@ -143,13 +144,14 @@ class _Clock(BaseCallback):
     def parts_of(self, model: OnPolicyAlgorithm) -> Iterator[None]:
         """Within the block, time what the model calls."""
         env, optimizer = model.get_env(), model.policy.optimizer
-        of_forward = ("actor_mean", "critic_values", "evaluate_actions")
+        forward = ("outputs", "act", "actor_mean", "critic_values", "evaluate_actions")
         places = [
             *((model, "collect_rollouts", "rollout"), (model, "train", "update")),
             *((env, "step_async", "environment"), (env, "step_wait", "environment")),
             *((Controller, "labels", "labels"), (model.policy, "forward", "forward")),
-            *((common, name, "forward") for name in of_forward),
-            *((torch.Tensor, "backward", "backward"), (torch.nn.utils, "clip_grad_norm_", "optimiser")),
+            *((common, name, "forward") for name in forward),
+            *((torch.Tensor, "backward", "forward"), (Perceptron, "gradient", "forward")),
+            (torch.nn.utils, "clip_grad_norm_", "optimiser"),
             *((optimizer, "step", "optimiser"), (optimizer, "zero_grad", "optimiser")),
         ]
         with ExitStack() as stack:
