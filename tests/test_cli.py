@@ -413,7 +413,8 @@ def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
 
 
 def test_the_benchmark_says_where_the_time_of_a_training_goes(tmp_path, capsys):
-    (tmp_path / "tiny.yml").write_text(f"{TRAINED}: {{n_timesteps: 100, n_envs: 4, n_steps: 10, batch_size: 20, n_epochs: 1}}")
+    sizes = "n_timesteps: 100, n_envs: 4, n_steps: 10, batch_size: 20, n_epochs: 1"
+    (tmp_path / "tiny.yml").write_text(f"QuadStateRecovery-v0: {{{sizes}}}")
     arguments = ["benchmark", "--training", "--conf-file", str(tmp_path / "tiny.yml"), "--output", str(tmp_path / "out.json")]
     assert main(arguments) == 0
     content = json.loads((tmp_path / "out.json").read_text())

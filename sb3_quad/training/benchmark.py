@@ -38,7 +38,7 @@ PARTS = (
     *("rollout: environment", "rollout: labels", "rollout: forward", "rollout"),
     *("update: forward and backward", "update: optimiser", "update"),
 )
-"""Of a training loop; the last of a rollout, and of an update, is what remains of it, such as its buffer or its mini-batches."""
+"""Of a training loop; the last of a rollout, and of an update, is what remains of it, such as buffers and mini-batches."""
 NAMES = {"batch": "batch", "dummy": "PyBullet, DummyVecEnv", "subproc": "PyBullet, SubprocVecEnv"}
 PACKAGES = ("stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 
