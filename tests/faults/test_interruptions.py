@@ -57,6 +57,11 @@ def job(folder, at=1000, **changes):
     return TrainingJob(config=config, log_folder=str(folder), **more)
 
 
+@pytest.fixture(autouse=True)
+def every_rollout_gets_a_snapshot(monkeypatch):
+    monkeypatch.setattr(snapshots, "SHARE", np.inf)  # however long one takes
+
+
 def quiet(line):
     pass
 
