@@ -1,8 +1,9 @@
-"""Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and a training loop.
+"""Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and training loops.
 
 examples:
   sb3-quad benchmark                                   everything, about a minute
   sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
+  sb3-quad benchmark --training                        where the time of a training goes
   sb3-quad benchmark --algo ppo_bc --conf-file pid/ppo_bc.yml --output benchmark.json
 """
 
