@@ -156,22 +156,28 @@ if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew)
 
 
-@contextmanager
-def shared_out(compiled: bool) -> Iterator[None]:
-    """Within the block PyTorch has one thread, and as many as it had before share the work of every :class:`Perceptron`.
+def share_out() -> None:
+    """From now on PyTorch has one thread, and as many as it had share the work of every :class:`Perceptron`.
 
     PyTorch's own threads wait for one another at every operation: on a machine that does something else beside they are up to
     ten times slower than one.
+    """
+    if _helpers.threads == 1:
+        _helpers.threads = th.get_num_threads()
+        th.set_num_threads(1)
 
-    :param compiled: whether there is such work; else nothing is changed.
+
+@contextmanager
+def shared_out(compiled: bool) -> Iterator[None]:
+    """:func:`share_out` within the block.
+
+    :param compiled: whether there is work for perceptrons; else nothing is changed.
     """
     before = th.get_num_threads(), _helpers.threads
-    if compiled and before[1] == 1:
-        th.set_num_threads(1)
-        _helpers.threads = before[0]
+    if compiled:
+        share_out()
     try:
         yield
     finally:
-        if compiled and before[1] == 1:
-            th.set_num_threads(before[0])
-            _helpers.threads = 1
+        th.set_num_threads(before[0])
+        _helpers.threads = before[1]
