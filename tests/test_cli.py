@@ -412,6 +412,21 @@ def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
     assert f"{content['results'][-1]['rate']:,.0f}" in capsys.readouterr().out
 
 
+def test_the_benchmark_says_where_the_time_of_a_training_goes(tmp_path, capsys):
+    sizes = "n_timesteps: 100, n_envs: 4, n_steps: 10, batch_size: 20, n_epochs: 1"
+    (tmp_path / "tiny.yml").write_text(f"QuadStateRecovery-v0: {{{sizes}}}")
+    arguments = ["benchmark", "--training", "--conf-file", str(tmp_path / "tiny.yml"), "--output", str(tmp_path / "out.json")]
+    assert main(arguments) == 0
+    content = json.loads((tmp_path / "out.json").read_text())
+    assert [entry["name"] for entry in content["results"]][::3] == ["dagger, whole loop", "ppo_bc, whole loop"]
+    for algorithm, parts in content["seconds"].items():
+        assert all(seconds > 0.0 for seconds in parts.values()), (algorithm, parts)
+        whole = sum(parts.values())
+        rates = next(entry["rates"] for entry in content["results"] if entry["name"] == f"{algorithm}, whole loop")
+        assert whole == pytest.approx(sum(40 / rate for rate in rates) / len(rates), rel=0.2)
+    assert "update: optimiser" in capsys.readouterr().out
+
+
 def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with(monkeypatch):
     monkeypatch.setattr(compare, "FRESH_EPISODES", 4)
     scaling = {"noise": 0.0, "observation_mean": [5.0] * 18, "observation_std": [2.0] * 18}

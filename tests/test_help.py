@@ -33,7 +33,7 @@ def test_examples_are_taken(name):
         options = make_parser().parse_args(arguments)  # raises on a flag that there is not, or a bad value
         assert options.command in COMMANDS
         if getattr(options, "algo", None) is not None:
-            assert options.algo in ALGORITHMS
+            assert {*([options.algo] if isinstance(options.algo, str) else options.algo)} <= {*ALGORITHMS}
         if getattr(options, "env", None) is not None:
             assert options.env in (*ENVIRONMENTS, "Pendulum-v1")
         if getattr(options, "conf_file", None) is not None:

@@ -21,10 +21,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Float32Array
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
+from sb3_quad.networks import shared_out
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
@@ -67,9 +68,9 @@ class DAgger(OnPolicyAlgorithm):
     :param ent_coef: Entropy coefficient c_H
     :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a
         large error of the critic does not hold up the actor. None: no clipping
-    :param gradient_steps: Optimiser steps after each rollout, at most one for each row of the critic's ``n_epochs`` passes.
-        Each takes ``batch_size`` pairs of the dataset and an equal share of these passes. None:
-        ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO
+    :param gradient_steps: Optimiser steps after each rollout, at most one for each row of ``n_epochs`` passes over it. Each
+        takes ``batch_size`` pairs of the dataset. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The
+        critic takes part in as many of them as that, or in all if there are fewer, each with an equal share of its passes
     :param beta: β of the first rollout, from 0 to 1
     :param beta_decay: What β loses with every rollout
     :param beta_final: Where β stops falling
@@ -234,7 +235,7 @@ class DAgger(OnPolicyAlgorithm):
         whole rollout at the end, since it does not change before.
         """
         self.policy.set_training_mode(False)
-        labeller, rng = Controller.for_env(self.expert, env), self._generator(0)
+        labeller, rng, networks = Controller.for_env(self.expert, env), self._generator(0), common.perceptrons(self.policy)
         beta = self.current_beta
         n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
@@ -250,8 +251,7 @@ class DAgger(OnPolicyAlgorithm):
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
             labels[step] = labeller.labels(observations)  # of the state before the step
-            with th.no_grad():
-                means = common.actor_mean(self.policy, th.as_tensor(observations, device=self.device)).cpu().numpy()
+            means = common.outputs(networks, self.policy, "actor", observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta
             actions = np.where(by_expert[:, None], labels[step], sampled)
@@ -296,9 +296,9 @@ class DAgger(OnPolicyAlgorithm):
 
     def _values(self, observations: Any) -> Float32Array:
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
-        with th.no_grad():
-            chunks = th.split(th.as_tensor(observations, device=self.device), _VALUE_CHUNK)
-            return np.asarray(th.cat([common.critic_values(self.policy, chunk) for chunk in chunks]).cpu().numpy())
+        networks, chunks = common.perceptrons(self.policy), range(0, len(observations), _VALUE_CHUNK)
+        parts = (observations[first : first + _VALUE_CHUNK] for first in chunks)
+        return np.concatenate([common.outputs(networks, self.policy, "critic", part) for part in parts])
 
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
@@ -316,47 +316,91 @@ class DAgger(OnPolicyAlgorithm):
         buffer = self.rollout_buffer
         n_rows = buffer.buffer_size * buffer.n_envs
         n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
-        n_batches = min(n_batches, self.n_epochs * n_rows)  # a row at least for the critic in each
-        actor_batches = th.from_numpy(sample_rows(len(self.dataset), n_batches * self.batch_size, rng)).view(n_batches, -1)
-        critic_batches = th.from_numpy(sample_rows(n_rows, self.n_epochs * n_rows, rng)).tensor_split(n_batches)
-        flown = th.from_numpy(buffer.observations.reshape(n_rows, *buffer.obs_shape))
-        old_values, returns = th.from_numpy(buffer.values.reshape(-1)), th.from_numpy(buffer.returns.reshape(-1))
-        terms = np.empty((n_batches, 5))  # loss and its four terms
+        n_batches = min(n_batches, self.n_epochs * n_rows)
+        actor_batches = sample_rows(len(self.dataset), n_batches * self.batch_size, rng).reshape(n_batches, -1)
+        n_critic = min(self.n_epochs * -(-n_rows // self.batch_size), n_batches)  # steps in which the critic takes part
+        critic_batches = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng), n_critic))
+        flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
+        values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
+        networks = common.perceptrons(self.policy)
+        terms = np.empty((n_batches, 4))  # of the loss; where the critic takes no part, its one is 0
+        limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
 
-        for i, index in enumerate(critic_batches):
-            observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(actor_batches[i]))
-            mean, log_std = common.actor_mean(self.policy, observations), self.policy.log_std
-            bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
-            entropy_loss = -common.gaussian_entropy(log_std)
-            l2 = common.l2_loss(self.policy)
-
-            states, old, goals = (part[index].to(self.device) for part in (flown, old_values, returns))
-            v_loss = common.value_loss(common.critic_values(self.policy, states), old, goals, clip_range_vf)
-
-            loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss  # Eq. 4.3
-            terms[i] = th.stack([loss, bc, v_loss, entropy_loss, l2]).detach().cpu().numpy()
-            self.policy.optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
-            norms = [th.nn.utils.clip_grad_norm_(group, limit) for group in groups.values()]
+        for i, for_actor in enumerate(actor_batches):
+            due = (i + 1) * n_critic // n_batches > i * n_critic // n_batches
+            step = (for_actor, flown, values, next(critic_batches) if due else None, clip_range_vf)
+            terms[i] = self._gradients(*step) if networks is None else self._compiled_gradients(networks, *step)
+            for parameter in groups[True] if not due else ():
+                parameter.grad = None
+            norms = [th.nn.utils.clip_grad_norm_(groups[part], limit) for part in (False, True)[: 1 + due]]
             if not np.isfinite(terms[i]).all() or not all(th.isfinite(norm) for norm in norms):
                 self.policy.optimizer.zero_grad()
                 raise TrainingError(
-                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms[i, 1]:.3g}, value loss "
-                    f"{terms[i, 2]:.3g}); lower learning_rate, or look for rewards and observations that are not finite"
+                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms[i, 0]:.3g}, value loss "
+                    f"{terms[i, 1]:.3g}); lower learning_rate, or look for rewards and observations that are not finite"
                 )
             self.policy.optimizer.step()
-            log_std.data.clamp_(min=self.log_std_min)
+            self.policy.log_std.data.clamp_(min=self.log_std_min)
             self._n_updates += 1
 
-        names = ("loss", "bc_loss", "value_loss", "entropy_loss", "l2_loss")
-        for name, average in zip(names, terms.mean(axis=0), strict=True):
+        bc, v_loss, entropy_loss, l2 = terms.sum(axis=0) / (n_batches, n_critic, n_batches, n_batches)
+        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
+        averages = {"loss": loss, "bc_loss": bc, "value_loss": v_loss, "entropy_loss": entropy_loss, "l2_loss": l2}
+        for name, average in averages.items():
             self.logger.record(f"train/{name}", float(average))
         self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         self.logger.record("train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _gradients(
+        self,
+        for_actor: IntArray,
+        flown: npt.NDArray[Any],
+        values: Float32Array,
+        for_critic: IntArray | None,
+        clip_range_vf: float | None,
+    ) -> FloatArray:
+        """Set the gradient of Eq. 4.3 for rows of the dataset, and of the rollout just flown.
+
+        :param flown: its observations (n, ...); :param values: V when it was flown, and the returns, (n, 2).
+        :param for_critic: None: the critic takes no part.
+        :return: the terms of cloning, value, entropy and weights.
+        """
+        policy = self.policy
+        observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(for_actor)))
+        mean, log_std = common.actor_mean(policy, observations), policy.log_std
+        bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
+        entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
+        v_loss = th.zeros(())
+        if for_critic is not None:
+            states, bounds = (th.as_tensor(part[for_critic], device=self.device) for part in (flown, values))
+            v_loss = common.value_loss(common.critic_values(policy, states), bounds[:, 0], bounds[:, 1], clip_range_vf)
+        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
+        policy.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        return np.array([float(term.detach()) for term in (bc, v_loss, entropy_loss, l2)])
+
+    def _compiled_gradients(
+        self,
+        networks: common.Perceptrons,
+        for_actor: IntArray,
+        flown: npt.NDArray[Any],
+        values: Float32Array,
+        for_critic: IntArray | None,
+        clip_range_vf: float | None,
+    ) -> FloatArray:
+        """The same by compiled code."""
+        observations, expert_actions, rows = self.dataset.arrays(for_actor)
+        loss = common.actor_terms(self.bc_loss, 1.0)
+        (bc, *_) = networks.actor.gradient(observations, rows, expert_actions, loss, networks.log_std) / len(rows)
+        v_loss = 0.0
+        if for_critic is not None:
+            loss = common.critic_terms(self.vf_coef, clip_range_vf)
+            sums = networks.critic.gradient(flown.reshape(len(flown), -1), for_critic, values, loss)
+            v_loss = sums[0] / len(for_critic)
+        return np.array([bc, v_loss, *common.add_penalties(self.policy, self.ent_coef, self.l2_coef)])
 
     def learn(
         self,
@@ -374,9 +418,10 @@ class DAgger(OnPolicyAlgorithm):
         self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
-        )
+        with shared_out(common.perceptrons(self.policy) is not None):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+            )
 
     def save_dataset(self, path: str | Path) -> None:
         """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""

@@ -55,6 +55,11 @@ class AggregatedDataset:
             rows = (rows + self.added) % self.capacity
         return self._observations.index_select(0, rows), self._actions.index_select(0, rows)
 
+    def arrays(self, rows: IntArray) -> tuple[npt.NDArray[Any], Float32Array, IntArray]:
+        """Where ``rows`` are in all that there is room for, which comes before: observations and actions, (capacity, size)."""
+        places = (rows + self.added) % self.capacity if self.added > self.capacity else rows
+        return self._observations.numpy().reshape(self.capacity, -1), self._actions.numpy(), places
+
     def save(self, path: str | Path) -> None:
         """Write every pair, oldest first, to an .npz file, whole or not at all; ``.npz`` is added to a name without a suffix.
 

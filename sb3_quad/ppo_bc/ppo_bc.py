@@ -1,8 +1,10 @@
 """PPO with a weighted behavioural-cloning loss towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
+import functools
 import inspect
 from collections.abc import Callable, Generator, Mapping
 from typing import Any, cast
+from unittest.mock import patch
 
 import numpy as np
 import torch as th
@@ -18,9 +20,10 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Float32Array, IntArray
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
+from sb3_quad.networks import shared_out
 
 BC_FILTERS = ("none", "negative_advantage", "agreement")
 AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
@@ -36,7 +39,7 @@ class PPOBC(PPO):
 
     All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. An update that adds nothing (a cloning
     weight and an ``l2_coef`` of 0, no ``critic_warmup``, and either no ``clip_range_vf`` or ``max_clipped_value=False``) is
-    PPO's, bit for bit; any other is equal to PPO's to rounding, plus what is added, and takes two thirds of the time. A saved
+    PPO's, bit for bit; any other is equal to PPO's to rounding, plus what is added, in less time (docs/results.md). A saved
     model loads with ``PPO.load``, even where this package is not installed.
 
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
@@ -161,7 +164,11 @@ class PPOBC(PPO):
                 buffer.expert_actions[buffer.pos] = labeller.labels(observation)
 
             env = _BeforeStep(env, label)
-        return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        networks = common.perceptrons(self.policy) if self._rollout_bc_coef != 0.0 else None  # else as PPO, bit for bit
+        if networks is None:
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
+        with patch.object(self.policy, "forward", functools.partial(common.act, networks, self.policy)):
+            return super().collect_rollouts(env, callback, rollout_buffer, n_rollout_steps)
 
     def train(self) -> None:
         """One update on the rollout just flown: PPO's loop, with what is added to it marked by ``+``."""
@@ -175,6 +182,11 @@ class PPOBC(PPO):
         own_value_loss = clip_range_vf is not None and self.max_clipped_value
         adds = bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
 
+        # + Perceptrons get most gradients from compiled code, which takes half the time of PyTorch's layers.
+        buffer = cast(ExpertRolloutBuffer, self.rollout_buffer)
+        networks = common.perceptrons(self.policy) if adds and type(buffer) is ExpertRolloutBuffer else None
+        targets: tuple[Float32Array, Float32Array, Float32Array] | None = None
+
         parameters = list(self.policy.parameters())
         monitored: list[dict[str, th.Tensor]] = []  # by mini-batch: scalars for the logger, under SB3's names
         grad_norms: dict[str, float] = {}
@@ -182,7 +194,17 @@ class PPOBC(PPO):
 
         for epoch in range(self.n_epochs):
             first = len(monitored)
-            for samples, expert_actions in cast(ExpertRolloutBuffer, self.rollout_buffer).get(self.batch_size):
+            for index in buffer.indices(self.batch_size):
+                if networks is not None:  # +
+                    targets = targets or buffer.targets(labelled=bc_coef != 0.0)
+                    coefs = (bc_coef, clip_range, clip_range_vf)
+                    norms = None if monitored else grad_norms
+                    monitored.append(self._compiled_gradients(networks, targets, index, *coefs, warming_up, norms))
+                    if not self._take_step(monitored[-1], parameters, epoch):
+                        continue_training = False
+                        break
+                    continue
+                samples, expert_actions = buffer.samples(index)
                 actions = samples.actions
                 if isinstance(self.action_space, spaces.Discrete):
                     actions = actions.long().flatten()
@@ -241,19 +263,11 @@ class PPOBC(PPO):
                 if adds and not grad_norms:  # +
                     grad_norms = _gradient_norms(terms, parameters)
 
-                if self.target_kl is not None and approx_kl > 1.5 * self.target_kl:
-                    continue_training = False
-                    if self.verbose >= 1:
-                        print(f"Early stopping at step {epoch} due to reaching max kl: {approx_kl:.2f}")
-                    break
-
                 self.policy.optimizer.zero_grad()
                 loss.backward()  # type: ignore[no-untyped-call]
-                norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
-                if not (th.isfinite(loss) and th.isfinite(norm)):  # +
-                    parts = f"policy {policy_loss.item():.3g}, value {value_loss.item():.3g}, gradient {norm.item():.3g}"
-                    raise self._diverged(f"the loss is {loss.item():.3g} ({parts})")
-                self.policy.optimizer.step()
+                if not self._take_step(monitored[-1], parameters, epoch):
+                    continue_training = False
+                    break
 
             self._n_updates += 1
             if not continue_training:
@@ -274,6 +288,82 @@ class PPOBC(PPO):
         self.logger.record("train/bc_coef", bc_coef)  # +
         for name, value in grad_norms.items():  # +
             self.logger.record(f"train/grad_norm_{name}", value)
+
+    def _take_step(self, monitored: Mapping[str, th.Tensor], parameters: list[th.nn.Parameter], epoch: int) -> bool:
+        """Clip the gradients and let the optimiser take its step, unless ``target_kl`` ends the update; whether it goes on."""
+        if self.target_kl is not None and monitored["approx_kl"] > 1.5 * self.target_kl:
+            if self.verbose >= 1:
+                print(f"Early stopping at step {epoch} due to reaching max kl: {monitored['approx_kl']:.2f}")
+            return False
+        norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        if not (th.isfinite(monitored["loss"]) and th.isfinite(norm)):  # +
+            policy, value = (monitored[name].item() for name in ("policy_gradient_loss", "value_loss"))
+            parts = f"policy {policy:.3g}, value {value:.3g}, gradient {norm.item():.3g}"
+            raise self._diverged(f"the loss is {monitored['loss'].item():.3g} ({parts})")
+        self.policy.optimizer.step()
+        return True
+
+    def _compiled_gradients(
+        self,
+        networks: common.Perceptrons,
+        targets: tuple[Float32Array, Float32Array, Float32Array],
+        index: IntArray,
+        bc_coef: float,
+        clip_range: float,
+        clip_range_vf: float | None,
+        warming_up: bool,
+        norms: dict[str, float] | None,
+    ) -> dict[str, th.Tensor]:
+        """Set the gradients of Eq. 4.4 for rows of the rollout, by compiled code; returns what the logger gets.
+
+        :param targets: see :meth:`ExpertRolloutBuffer.targets`.
+        :param norms: gets the norm of each term's own gradient, as :func:`_gradient_norms` gives it.
+        """
+        observations, for_actor, for_critic = targets
+        shift, scale = 0.0, 1.0
+        if self.normalize_advantage and len(index) > 1:
+            advantages = for_actor[index, -1]
+            shift, scale = float(advantages.mean()), 1.0 / (float(advantages.std(ddof=1)) + 1e-8)
+        rows: dict[str, float] = {"clip_range": clip_range, "shift": shift, "scale": scale}
+        rows |= {"filter": BC_FILTERS.index(self.bc_filter), "agreement": AGREEMENT}
+        n_actions = len(networks.log_std) if self.bc_loss == "nll" else 1  # a mean over them
+
+        def of_actor(cloning: float, policy: float) -> FloatArray:
+            terms = common.actor_terms(self.bc_loss, cloning, policy=policy, labelled=bc_coef != 0.0, **rows)
+            return networks.actor.gradient(observations, index, for_actor, terms, networks.log_std) / len(index)
+
+        own = [*networks.actor.parameters(), networks.log_std]
+        if norms is not None:
+            for name, weights in {"policy": (0.0, 1.0), "bc": (bc_coef / n_actions, 0.0)}.items():
+                if any(weights):
+                    of_actor(*weights)
+                    norms[name] = _norm(own)
+        sums = of_actor(bc_coef / n_actions, 1.0)
+        critic = common.critic_terms(self.vf_coef, clip_range_vf, self.max_clipped_value)
+        value = networks.critic.gradient(observations, index, for_critic, critic)[0] / len(index)
+        if norms is not None:
+            norms["value"] = _norm([*networks.critic.parameters()])
+        if warming_up:
+            for parameter in own:
+                parameter.grad = None
+        entropy, l2 = common.add_penalties(
+            self.policy, 0.0 if warming_up else self.ent_coef, 0.0 if warming_up else self.l2_coef
+        )
+        if norms is not None and self.ent_coef != 0.0:
+            norms["entropy"] = abs(self.ent_coef) * len(networks.log_std) ** 0.5
+        if norms is not None and self.l2_coef > 0.0:
+            norms["l2"] = self.l2_coef * (2.0 * l2) ** 0.5
+        bc, policy, kl, clipped = sums[:4]
+        logged = {"policy_gradient_loss": policy, "value_loss": value, "entropy_loss": entropy}
+        logged |= {"approx_kl": kl, "clip_fraction": clipped}
+        loss = self.vf_coef * value
+        if bc_coef != 0.0:
+            logged["bc_loss"] = bc / n_actions
+        if self.l2_coef > 0.0:
+            logged["l2_loss"] = l2
+        if not warming_up:
+            loss += policy + self.ent_coef * entropy + bc_coef * bc / n_actions + self.l2_coef * l2
+        return {name: th.tensor(number, dtype=th.float32) for name, number in {"loss": loss, **logged}.items()}
 
     def _diverged(self, what: str) -> TrainingError:
         advice = "try a smaller learning_rate or bc_coef, and check the expert's actions"
@@ -306,9 +396,10 @@ class PPOBC(PPO):
         """As ``PPO.learn``; see the class for what it raises."""
         if self.will_clone():
             self._check_cloning()
-        return super().learn(
-            total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
-        )
+        with shared_out(common.perceptrons(self.policy) is not None):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+            )
 
 
 class ExpertRolloutBuffer(RolloutBuffer):
@@ -325,17 +416,34 @@ class ExpertRolloutBuffer(RolloutBuffer):
         super().reset()
 
     def get(self, batch_size: int | None = None) -> Generator[Samples, None, None]:  # type: ignore[override]
+        for index in self.indices(batch_size):
+            yield self.samples(index)
+
+    def indices(self, batch_size: int | None = None) -> Generator[IntArray, None, None]:
+        """The rows of each mini-batch of :meth:`get`."""
         if not self.generator_ready:
             self.expert_actions = self.swap_and_flatten(self.expert_actions)
         yield from super().get(batch_size)  # type: ignore[misc]
 
-    def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> Samples:  # type: ignore[override]
+    def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> IntArray:  # type: ignore[override]
+        return batch_inds
+
+    def samples(self, index: IntArray) -> Samples:
         """SB3's samples and the labels, gathered by PyTorch: in a third of the time of NumPy's indexing and a copy."""
-        rows = th.from_numpy(batch_inds)
+        rows = th.from_numpy(index)
         columns = (self.values, self.log_probs, self.advantages, self.returns)
         arrays = (self.observations, self.actions.astype(np.float32, copy=False), self.expert_actions, *columns)
         states, actions, labels, *others = (th.from_numpy(array).index_select(0, rows).to(self.device) for array in arrays)
         return RolloutBufferSamples(states, actions, *(each.flatten() for each in others)), labels
+
+    def targets(self, labelled: bool) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """After :meth:`indices`: observations, and the targets of actor and critic as :mod:`sb3_quad.networks` takes them.
+
+        :param labelled: whether the expert's actions are among them.
+        """
+        labels = [self.expert_actions] if labelled else []
+        for_actor = np.hstack([*labels, self.actions, self.log_probs, self.advantages], dtype=np.float32)
+        return self.observations.reshape(len(for_actor), -1), for_actor, np.hstack([self.values, self.returns])
 
 
 class _BeforeStep(VecEnvWrapper):
@@ -367,6 +475,10 @@ def _gradient_norms(terms: Mapping[str, th.Tensor], parameters: list[th.nn.Param
         squares = [gradient.square().sum() for gradient in gradients if gradient is not None]
         norms[name] = float(th.stack(squares).sum().sqrt()) if squares else 0.0
     return norms
+
+
+def _norm(parameters: list[th.nn.Parameter]) -> float:
+    return float(th.stack([each.grad.norm() for each in parameters if each.grad is not None]).norm())
 
 
 def _full_signature() -> inspect.Signature:

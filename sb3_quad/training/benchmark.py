@@ -5,13 +5,14 @@ import os
 import platform
 import re
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from timeit import Timer
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium
 import numba
@@ -19,15 +20,25 @@ import numpy as np
 import torch
 from gymnasium.wrappers import Autoreset
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad
+from sb3_quad import common
+from sb3_quad.experts.controller import Controller
+from sb3_quad.networks import Perceptron
 from sb3_quad.settings.config import TrainingConfig, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import build_model
 
 ENV_ID = "QuadTargetTracking-v0"
+TRAINED = "QuadStateRecovery-v0"  # by train without arguments
 REPETITIONS = 5
+PARTS = (
+    *("rollout: environment", "rollout: labels", "rollout: forward", "rollout"),
+    *("update: forward and backward", "update: optimiser", "update"),
+)
+"""Of a training loop; the last of a rollout, and of an update, is what remains of it, such as buffers and mini-batches."""
 NAMES = {"batch": "batch", "dummy": "PyBullet, DummyVecEnv", "subproc": "PyBullet, SubprocVecEnv"}
 PACKAGES = ("stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 
@@ -73,34 +84,81 @@ def _measure(name: str, n_envs: int, step: Callable[[Any], Any], shape: tuple[in
     return Measurement(name, n_envs, float(np.median(rates)), rates)
 
 
-def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> list[Measurement]:
-    """A whole SB3 training loop with the settings' own sizes: all of it, its rollouts, its updates; the first left out."""
+def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[list[Measurement], dict[str, float]]:
+    """A whole SB3 training loop with the settings' own sizes; the first rollout and update, which compile, are left out.
+
+    :return: the rates of all of it, of its rollouts and of its updates; and the seconds that each of its ``PARTS`` takes, per
+        rollout and update.
+    """
     with closing(make_environments(config, config.n_envs, 0)) as env:
         model, clock = build_model(TrainingJob(config=config), env), _Clock()
         steps = model.n_steps * config.n_envs
-        model.learn(steps * (rollouts + 1), callback=clock)
+        with clock.parts_of(model):
+            model.learn(steps * (rollouts + 1), callback=clock)
     rollout, update = np.diff(clock.times).reshape(-1, 2)[1:].T
-    parts = {"whole loop": rollout + update, "rollout": rollout, "update": update}
-    return [
+    whole = {"whole loop": rollout + update, "rollout": rollout, "update": update}
+    rates = [
         Measurement(f"{config.algo}, {part}", config.n_envs, float(np.median(steps / seconds)), (steps / seconds).tolist())
-        for part, seconds in parts.items()
+        for part, seconds in whole.items()
     ]
+    return rates, {part: clock.seconds[part] / rollouts for part in PARTS}
 
 
 class _Clock(BaseCallback):
-    """When rollouts begin and end; an update is what lies between two of them."""
+    """When rollouts begin and end; an update is what lies between two of them. And how long the parts of both take."""
 
     def __init__(self) -> None:
         super().__init__()
         self.times: list[float] = []
+        self.seconds: dict[str, float] = {}
+        self._phase = "rollout"
+        self._within = 0.0  # seconds of the parts that the part under way has called
 
     def _note(self) -> None:
         self.times.append(time.perf_counter())
+        if len(self.times) == 3:  # the second rollout
+            self.seconds = dict.fromkeys(PARTS, 0.0)
 
     _on_rollout_start = _on_rollout_end = _on_training_end = _note
 
     def _on_step(self) -> bool:
         return True
+
+    def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            outer, self._within = self._within, 0.0
+            if part in ("rollout", "update"):
+                self._phase = part
+            name = next((each for each in PARTS if each.startswith(f"{self._phase}: {part}")), part)
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                took = time.perf_counter() - start
+                self.seconds[name] = self.seconds.get(name, 0.0) + took - self._within
+                self._within = outer + took
+
+        return call
+
+    @contextmanager
+    def parts_of(self, model: OnPolicyAlgorithm) -> Iterator[None]:
+        """Within the block, time what the model calls."""
+        env, optimizer = model.get_env(), model.policy.optimizer
+        forward = ("outputs", "act", "actor_mean", "critic_values", "evaluate_actions")
+        places = [
+            *((model, "collect_rollouts", "rollout"), (model, "train", "update")),
+            *((env, "step_async", "environment"), (env, "step_wait", "environment")),
+            *((Controller, "labels", "labels"), (model.policy, "forward", "forward")),
+            *((common, name, "forward") for name in forward),
+            *((torch.Tensor, "backward", "forward"), (Perceptron, "gradient", "forward")),
+            (torch.nn.utils, "clip_grad_norm_", "optimiser"),
+            *((optimizer, "step", "optimiser"), (optimizer, "zero_grad", "optimiser")),
+        ]
+        with ExitStack() as stack:
+            for owner, name, part in places:
+                function = getattr(owner, name)
+                stack.enter_context(patch.object(owner, name, self._timed(part, function)))
+            yield
 
 
 def machine() -> dict[str, Any]:

@@ -50,20 +50,29 @@ def command(kind: str, folder: Path) -> list[str]:
     return ["train", *single, "--conf-file", str(settings), "-f", str(folder / "logs"), *more, "--no-progress"]
 
 
+def forked(arguments: list[str], log: Path, folder: str | Path = ".", seconds: int = 0) -> int:
+    """The process of a command that begins in ``folder``, reads nothing, and is ended after so many seconds, if any."""
+    child = os.fork()
+    if child > 0:
+        return child
+    with log.open("a") as stream, open(os.devnull) as nothing:
+        for number, file in enumerate((nothing, stream, stream)):
+            os.dup2(file.fileno(), number)
+    os.chdir(folder)
+    torch.set_num_threads(1)
+    signal.alarm(seconds)
+    code = 70
+    try:
+        code = main(arguments)
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
 def run(arguments: list[str], log: Path, kill_after: float | None = None) -> int | None:
     """The command's exit code; None if it was killed after so many seconds."""
-    child = os.fork()
-    if child == 0:
-        with log.open("a") as stream:
-            os.dup2(stream.fileno(), 1)
-            os.dup2(stream.fileno(), 2)
-        torch.set_num_threads(1)
-        code = 70
-        try:
-            code = main(arguments)
-        finally:
-            sys.stdout.flush()
-            os._exit(code)
+    child = forked(arguments, log)
     end = np.inf if kill_after is None else time.monotonic() + kill_after
     while True:
         ended, status = os.waitpid(child, os.WNOHANG)

@@ -13,17 +13,15 @@ import os
 import random
 import resource
 import shutil
-import signal
 import sys
 import time
 from pathlib import Path
 from typing import Any
 
-import torch
 import yaml
+from campaign import forked
 
 import sb3_quad.cli.commands.train
-from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS, make_parser
 from sb3_quad.dagger.dagger import DAgger
 from sb3_quad.scenarios.scenario import Scenario
@@ -112,22 +110,7 @@ def attempt(case: Case, folder: Path) -> str:
     for name, text in files.items():
         (place / name).write_text(text, encoding="utf-8", errors="surrogateescape")
     start, log = time.monotonic(), folder / "log.txt"
-    child = os.fork()
-    if child == 0:
-        os.chdir(place)
-        with log.open("w") as stream, open(os.devnull) as nothing:
-            for number, file in enumerate((nothing, stream, stream)):
-                os.dup2(file.fileno(), number)
-        torch.set_num_threads(1)
-        signal.alarm(int(SECONDS))
-        code = 70
-        try:
-            code = main(command)
-        finally:
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(code)
-    _, status, usage = os.wait4(child, 0)
+    _, status, usage = os.wait4(forked(command, log, place, int(SECONDS)), 0)
     code, text = os.waitstatus_to_exitcode(status), log.read_text(errors="replace")
     last = text.splitlines()[-1] if text else ""
     strange = {

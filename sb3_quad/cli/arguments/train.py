@@ -57,7 +57,7 @@ def add_settings(parser: Parser) -> None:
     add("-P", "--progress", action=argparse.BooleanOptionalAction, help="progress bar (in a terminal: yes)")
     add("--trust", action="store_true", help=TRUST)
     add("--device", help="cpu (default), cuda or auto")
-    add("--num-threads", type=positive, metavar="N", help="threads of PyTorch (PyTorch's choice)")
+    add("--num-threads", type=positive, metavar="N", help="threads (the cores; one where PyTorch computes)")
 
 
 def add_arguments(parser: Parser) -> None:

@@ -8,28 +8,37 @@ from sb3_quad.base.files import write_text
 from sb3_quad.cli.output import console
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.settings.config import load_config
-from sb3_quad.training.benchmark import ENV_ID, machine, single, training_loop, vectorised
+from sb3_quad.training.benchmark import PARTS, TRAINED, machine, single, training_loop, vectorised
+
+
+def _share(seconds: dict[str, float], part: str) -> str:
+    return f"{1000 * seconds[part]:,.1f}  ({seconds[part] / sum(seconds.values()):.0%})"
 
 
 def run(options: argparse.Namespace) -> int:
     """Measure, print, write. Returns the exit code."""
     screen = console()
-    config = load_config(options.algo, ENV_ID, options.conf_file) if options.training else None
-    measurements = []
-    with screen.status("one PyBullet environment"):
-        measurements.append(single(options.seconds))
-    kinds = [("dummy", options.n_envs), ("subproc", options.n_envs), *(("batch", size) for size in options.sizes)]
-    for kind, n_envs in kinds:
-        with screen.status(f"{kind}, {n_envs}"):
-            measurements.append(vectorised(kind, n_envs, options.seconds))
-    if config is not None:
+    loops = [] if options.training is False else [load_config(algo, TRAINED, options.conf_file) for algo in options.algo]
+    measurements, parts = [], {}
+    if options.training is not True:
+        with screen.status("one PyBullet environment"):
+            measurements.append(single(options.seconds))
+        kinds = [("dummy", options.n_envs), ("subproc", options.n_envs), *(("batch", size) for size in options.sizes)]
+        for kind, n_envs in kinds:
+            with screen.status(f"{kind}, {n_envs}"):
+                measurements.append(vectorised(kind, n_envs, options.seconds))
+    for config in loops:
         with screen.status(f"training loop of {config.algo}"):
-            measurements.extend(training_loop(config))
+            rates, parts[config.algo] = training_loop(config)
+            measurements.extend(rates)
     first = measurements[0].rate
-    rows = ((each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements)
+    rows = [(each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements]
     screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
+    if parts:
+        shares = [(part, *(_share(seconds, part) for seconds in parts.values())) for part in PARTS]
+        screen.print(text_table("a rollout and its update, ms", ("", *parts), shares))
     if options.output is not None:
-        content = {"machine": machine(), "results": [asdict(each) for each in measurements]}
+        content = {"machine": machine(), "results": [asdict(each) for each in measurements], "seconds": parts}
         write_text(options.output, json.dumps(content, indent=2) + "\n")
         print(f"written to {options.output}")
     return 0

@@ -1,7 +1,6 @@
 """``publish``: a trained policy as a small zip for stock PPO, with a card that says what it can and where it comes from."""
 
 import argparse
-import html
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -69,4 +68,4 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
     facts["environment"] = f"`{_plain(arguments.get('env', run.name))}`"
     if settings.get("expert"):
         facts["expert"] = f"`{_plain(settings['expert'])}`"
-    return command, facts | {name: html.escape(_plain(arguments.get(name, UNKNOWN))) for name in ("seed", *MADE_WITH)}
+    return command, facts | {name: _plain(arguments.get(name, UNKNOWN)) for name in ("seed", *MADE_WITH)}

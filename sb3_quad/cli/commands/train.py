@@ -18,6 +18,7 @@ from sb3_quad.cli.output import console, shows_progress
 from sb3_quad.cli.parser import given
 from sb3_quad.experts.models import load_model
 from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
+from sb3_quad.networks import share_out
 from sb3_quad.settings.config import TrainingConfig, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import (
@@ -79,7 +80,9 @@ def prepare(options: argparse.Namespace) -> None:
             importlib.import_module(package)
         except (Exception, SystemExit) as error:  # whatever the module does when it is imported
             raise ConfigError(f"--gym-packages {package}: cannot be imported ({type(error).__name__}: {error})") from None
-    if options.num_threads is not None:
+    if options.num_threads is None:
+        share_out()
+    else:
         torch.set_num_threads(options.num_threads)
 
 

@@ -36,7 +36,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 
 def _source_stamp() -> tuple[tuple[str, float, int], ...]:
     package = Path(__file__).resolve().parents[2]
-    folders = ("base", "vehicles", "simulation", "experts")
+    folders = ("base", "vehicles", "simulation", "experts", "networks")
     files = sorted(path for folder in folders for path in (package / folder).rglob("*.py"))
     return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in files)
 
