@@ -165,7 +165,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         self.batch = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._ready = False
-        self.observation_space, self.action_space = quadcopter_spaces()
+        self.observation_space, self.action_space = quadcopter_spaces(self.batch.memory.size)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height
@@ -194,6 +194,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
+        self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
         self._ready = True
         if self._renderer is not None:
@@ -217,13 +218,14 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         batch, wrenches = self.batch, self._wrenches
         step = self.vehicle.physics_step
         with batch.lock:
-            kind = rotor_wrenches(batch.state, batch.queue, array, batch.wrench, batch.vehicles, step, wrenches)
+            wrench = batch.total_wrench()
+            kind = rotor_wrenches(batch.state, batch.queue, array, wrench, batch.vehicles, step, wrenches)
             if kind == NOT_FINITE:
                 raise ValueError(f"action {array.tolist()}: every number must be finite")
-            world = np.stack([self.wrench[FORCE_WORLD], self.wrench[TORQUE_WORLD]]) if kind == WORLD_FRAME_TOO else None
+            world = np.stack([wrench[FORCE_WORLD, 0], wrench[TORQUE_WORLD, 0]]) if kind == WORLD_FRAME_TOO else None
             self._body.fly(wrenches, world)
             self._body.read(batch.state)
-            observations, _, _ = batch.score()
+            observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":
             self._draw()
         info = self._info()

@@ -45,8 +45,8 @@ class ControllerSpec:
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with the agent wherever it flies: ``observation_mean`` and ``observation_std`` of its environment."""
-        return (self.own or FlightSettings()).model_dump(include={"observation_mean", "observation_std"})
+        """What goes with the agent wherever it flies, see :attr:`FlightSettings.observed`."""
+        return (self.own or FlightSettings()).observed
 
     def notice(self, vehicle: str | Path | Vehicle) -> str:
         """What is to be known of an agent that flies ``vehicle``, in a line: that it knows another, or says none; or empty."""

@@ -130,7 +130,7 @@ def fly_settings(
 def _fly_fleet(
     fleet: Fleet, controller: Any, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
 ) -> Flights:
-    asked = Controller(controller, ACTIONS, OBSERVATIONS, fleet.true_state)
+    asked = Controller(controller, ACTIONS, quadcopter_spaces(fleet.observation_size)[0], fleet.true_state)
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()

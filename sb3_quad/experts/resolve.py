@@ -12,6 +12,7 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
+    "told_geometric": "sb3_quad.experts.geometric:told_geometric",
 }
 DEFAULT_EXPERT = "geometric"
 """Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
@@ -20,16 +21,18 @@ DEFAULT_EXPERT = "geometric"
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
+    :param spec: ``"pid"``, ``"geometric"`` or ``"told_geometric"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
         with the package (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)`` returns an
         expert; or an expert itself, returned as it is.
-    :param vehicle: what a named expert is designed for.
+    :param vehicle: what a named expert is designed for; of several, the first.
     :param kind: what messages call it.
     :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be imported.
     :raises ExpertError: a factory that fails.
     """
     if not isinstance(spec, (str, Path)):
         return spec
+    if isinstance(vehicle, (list, tuple)):
+        vehicle = vehicle[0]
     text = str(spec)
     path = agent_path(text)
     if path.endswith(".zip"):

@@ -12,8 +12,15 @@ TURN = 2.0 * math.pi
 
 
 @compiled
+def count_episode(i, streams):
+    """Row i's stream goes on to its next episode, in place."""
+    streams[EPISODE, i] += np.uint32(1)
+    streams[STEP, i] = np.uint32(0)
+
+
+@compiled
 def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights):
-    """Begin the next episode of row i, in place: its stream's next, with a task, state and target sampled from it.
+    """Begin the episode that row i's stream has come to, in place: a task, state and target sampled from it.
 
     Targets are never below ground.
 
@@ -25,8 +32,6 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     :param tasks: float64 (K, columns), :meth:`sb3_quad.simulation.tasks.Task.parameters` of each task.
     :param weights: float64 (K,), cumulative.
     """
-    streams[EPISODE, i] += np.uint32(1)
-    streams[STEP, i] = np.uint32(0)
     u = uniforms(streams, i, 7, EPISODE_START)
     choice, height, azimuth = u[0], u[1], TURN * u[2]
     k = 0

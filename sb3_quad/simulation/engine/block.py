@@ -13,16 +13,17 @@ from numba import carray
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled, pointer
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH_SIZE
+from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE
 from sb3_quad.simulation.tasks import SCORED, TASK
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 X = first_rows(STATE)
 T = first_rows(TASK)
 P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
+W = first_rows(WRENCH)
 _SCORED = tuple(getattr(T, name) for name in SCORED)
-_WORDS = -(-OBSERVATION_SIZE // 4) * 4
-_NORMALS = -(-OBSERVATION_SIZE // 2) * 2
+NORMALS = OBSERVATION_SIZE + 3  # at most, in a control step: observation noise, then a gust
+_WORDS = -(-NORMALS // 4) * 4
 
 # Of every lane: the kind of numbers, and how many or of what shape.
 _CONTENTS: dict[str, tuple[str, Any]] = {
@@ -40,6 +41,7 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "thrust_middle": ("f8", ()),  # divided by kF, as is the next
     "thrust_half_range": ("f8", ()),
     "radius": ("f8", ()),  # of the collision sphere
+    "delay": ("i8", ()),  # control steps
     "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
     "reward": ("f8", ()),
     "distance": ("f8", ()),
@@ -47,7 +49,7 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
     "noise_level": ("f4", ()),
-    "noise": ("f4", _NORMALS),
+    "noise": ("f4", _WORDS),
     "feature": ("f4", OBSERVATION_SIZE),
     "word": ("u4", _WORDS),  # random
     "stream": ("u4", 4),
@@ -107,6 +109,7 @@ def load_vehicles(b, vehicles, first, count, physics_step):
         b.thrust_middle[lane] = vehicles[P.thrust_middle, i] / lift
         b.thrust_half_range[lane] = vehicles[P.thrust_half_range, i] / lift
         b.radius[lane] = vehicles[P.collision_radius, i]
+        b.delay[lane] = int(vehicles[P.delay, i])
 
 
 @compiled(fastmath=True)
@@ -140,7 +143,19 @@ def load_commands(b, actions, queue, first, count):
             for lane in range(count):
                 queue[late, k, first + lane] = queue[late + 1, k, first + lane]
         for lane in range(count):
-            queue[delay - 1, k, first + lane] = command[k, lane]
+            if b.delay[lane] > 0:
+                queue[b.delay[lane] - 1, k, first + lane] = command[k, lane]
+        for lane in range(LANES):
+            if b.delay[lane] == 0:
+                wanted[k, lane] = command[k, lane]
+
+
+@compiled
+def add_gusts(b, gust, first, count):
+    """The present gusts of a block to its wrench."""
+    for axis in range(3):
+        for lane in range(LANES):
+            b.wrench[W.force_world + axis, lane] += gust[axis, first + min(lane, count - 1)]
 
 
 @compiled
@@ -170,7 +185,7 @@ def load_scaling(b, mean, std, noise_level, first, count):
 
 @compiled
 def store_observations(b, out, first, count):
-    """The observations of a block to rows of ``out``, float32 (n, OBSERVATION_SIZE)."""
+    """The observations of a block, features alone, to rows of ``out``, float32 (n, OBSERVATION_SIZE)."""
     feature = b.feature
     for lane in range(count):
         for k in range(feature.shape[0]):
