@@ -12,6 +12,7 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.geometric import GeometricExpert, told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.engine.block import P, W
+from sb3_quad.simulation.state import QUATERNION
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 WORLDS = {
@@ -69,7 +70,9 @@ def test_a_row_and_pybullet_fly_the_same_world(seed, names, task, frame, remembe
     single = QuadcopterEnv(**keywords)
     for row, own in enumerate(row_seeds(seed, n)):
         state, observation, reward = episode(single, own, actions[:, row])
-        np.testing.assert_allclose(np.array(states)[: len(state), :, row], state, rtol=1e-9, atol=1e-9)
+        ours = np.array(states)[: len(state), :, row]
+        ours[:, QUATERNION] *= np.sign((ours[:, QUATERNION] * state[:, QUATERNION]).sum(axis=1))[:, None]  # q is -q
+        np.testing.assert_allclose(ours, state, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(np.array(rewards)[: len(reward), row], reward, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(np.array(observations)[: len(observation), row], observation, atol=5e-5)
     single.close()

@@ -63,7 +63,7 @@ class _Told:
     def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
         self._control_step = vehicle.control_step
         nominal = vehicle.parameters()[:, None]
-        self._seen = np.full_like(nominal, np.nan)
+        self._seen = np.empty(0)
         self._scale = gains.values()[:, None] / self._gains(nominal)
 
     def _lag(self, v: FloatArray) -> FloatArray:
