@@ -13,6 +13,7 @@ EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
     "told_geometric": "sb3_quad.experts.geometric:told_geometric",
+    "raptor": "sb3_quad.experts.raptor:Raptor",
 }
 DEFAULT_EXPERT = "geometric"
 """Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
@@ -21,7 +22,7 @@ DEFAULT_EXPERT = "geometric"
 def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: ``"pid"``, ``"geometric"`` or ``"told_geometric"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
+    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
         with the package (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)`` returns an
         expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for; of several, the first.
@@ -49,7 +50,7 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
 def import_factory(text: str, kind: str = "expert") -> Any:
     """What makes the expert of a name, or is at ``package.module:factory``.
 
-    :raises ConfigError: an unknown name, or a factory that cannot be imported.
+    :raises ConfigError: an unknown name, or a factory that cannot be imported; :class:`MissingExtra` where it needs one.
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:
@@ -57,5 +58,7 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
     try:
         return pkgutil.resolve_name(location)
+    except SB3QuadError:
+        raise
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported
         raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error

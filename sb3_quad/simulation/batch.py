@@ -136,7 +136,7 @@ class QuadcopterBatch:
         for each in {id(each): each for each in vehicles}.values():
             self.randomize.check(each)
         worlds = np.stack([self.randomize.numbers(each) for each in vehicles], axis=1)
-        flying = np.ascontiguousarray(np.broadcast_to(self.nominal, (len(self.nominal), self.n)))
+        flying = np.array(np.broadcast_to(self.nominal, (len(self.nominal), self.n)), order="C")
         return flying, worlds, np.zeros((GUST_SIZE, self.n))
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
