@@ -29,7 +29,7 @@ class RememberingNetwork(Network):
         self.examples = EXAMPLE, th.zeros(len(EXAMPLE), state_size)
         kept = [f"{name} {value}" for name, value in memory.model_dump(mode="json").items() if value]
         rule = "zeros begin a flight, then it is the next_state of the call before; in C a struct, which NAME_reset begins"
-        self.facts = {"state": f"{rule}; of {', '.join(kept)}", "state_size": f"{state_size}"}
+        self.facts = {"state": f"{rule}. It remembers {', '.join(kept)}", "state_size": f"{state_size}"}
 
     def forward(self, observation: th.Tensor, state: th.Tensor) -> Any:  # type: ignore[override]
         """Rotor thrusts or speeds, (batch, 4), and the next state, of observations, (batch, 18), and the present state."""
