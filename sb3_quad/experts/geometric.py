@@ -32,7 +32,7 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
     least, most = vehicle.thrust_limits
     able = Authority(vehicle)
     derived = _derived(float(able.accelerations[:2].min()), able.command_lag, vehicle.gravity, least, most)
-    return GeometricGains(**{name: float(value) for name, value in derived.items()})
+    return GeometricGains.model_validate({name: float(value) for name, value in derived.items()})
 
 
 def _derived(turn: Any, lag: Any, gravity: Any, least: Any, most: Any) -> dict[str, Any]:
@@ -58,7 +58,7 @@ def _derived(turn: Any, lag: Any, gravity: Any, least: Any, most: Any) -> dict[s
 
 
 class _Told:
-    """What the law needs of n vehicles whose true parameters are known; columns that did not change are not worked out anew."""
+    """What the law needs of n vehicles whose true parameters are known; of those that changed it is worked out anew."""
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
         self._control_step = vehicle.control_step
@@ -67,7 +67,7 @@ class _Told:
         self._scale = gains.values()[:, None] / self._gains(nominal)
 
     def _lag(self, v: FloatArray) -> FloatArray:
-        return (v[P.delay] + 0.5) * self._control_step + 1.0 / v[P.motor_gain]
+        return np.asarray((v[P.delay] + 0.5) * self._control_step + 1.0 / v[P.motor_gain])
 
     def _gains(self, v: FloatArray) -> FloatArray:
         moments = np.abs(v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)).sum(axis=1) * v[P.thrust_half_range]
@@ -133,11 +133,10 @@ class GeometricExpert(Expert):
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
         moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
-        constants, wrench = self._constants, _NO_WRENCH
+        wrench = _NO_WRENCH if self._told is None or state.wrench is None else state.wrench
+        constants: tuple[FloatArray, ...] = self._constants
         if self._told is not None and state.vehicles is not None:
             constants = self._told.constants(state.vehicles)
-        if self._told is not None and state.wrench is not None:
-            wrench = state.wrench
         _geometric(*moving, *constants, wrench, actions)
         return actions
 

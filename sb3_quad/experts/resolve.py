@@ -1,6 +1,7 @@
 """Experts by name, as YAML and the command line give them."""
 
 import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ DEFAULT_EXPERT = "geometric"
 """Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
 
 
-def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:
+def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "itm", kind: str = "expert") -> Any:
     """The expert that ``spec`` names.
 
     :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
@@ -32,15 +33,14 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
     """
     if not isinstance(spec, (str, Path)):
         return spec
-    if isinstance(vehicle, (list, tuple)):
-        vehicle = vehicle[0]
+    known = vehicle if isinstance(vehicle, (str, Path, Vehicle)) else vehicle[0]
     text = str(spec)
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)
     factory = import_factory(text, kind)
     try:
-        return factory(load_vehicle(vehicle))
+        return factory(load_vehicle(known))
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:

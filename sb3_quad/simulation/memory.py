@@ -19,7 +19,7 @@ MAX_AGE = 1000  # control steps
 
 
 class PositionIntegral(Frozen):
-    """s += ``gain`` e dt while \\|e\\| < ``distance`` and \\|v\\| < ``speed``, each of its components within ±``limit``.
+    """s += ``gain`` e dt where e is shorter than ``distance`` and v than ``speed``; each component stays within ±``limit``.
 
     e is the observed position relative to the target, v the observed velocity; s is zero at an episode's start. The policy
     sees e + s in place of e, also in the frames it remembers: it flies to where that is zero, so that a constant force or a

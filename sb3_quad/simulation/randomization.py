@@ -54,7 +54,7 @@ class Range(Frozen):
 
 
 class Factor(Range):
-    """A factor, from ``low`` to ``high``, between 0.1 and 10; its logarithm is uniform unless ``distribution`` says otherwise."""
+    """A factor, from ``low`` to ``high``, of 0.1 to 10; its logarithm is uniform unless ``distribution`` says otherwise."""
 
     low: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the least factor")
     high: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the greatest factor, at least low")
@@ -175,8 +175,8 @@ class Randomization(Frozen):
         mass, thrust = self.mass.high if self.mass else 1.0, self.thrust.low if self.thrust else 1.0
         if thrust * vehicle.thrust_limits[1] <= mass:
             raise ConfigError(
-                f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover; its rotors"
-                f" lift {vehicle.thrust_limits[1]:g} times its weight"
+                f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
+                f" its rotors lift {vehicle.thrust_limits[1]:g} times its weight"
             )
         gain = vehicle.motor_gain * (self.motor_gain.high if self.motor_gain else 1.0)
         if gain * vehicle.physics_step > 1.0:

@@ -92,7 +92,8 @@ class QuadcopterState:
 
     def copy(self) -> "QuadcopterState":
         """A state of its own memory, unaffected by later flight."""
-        return QuadcopterState(*(each if each is None else each.copy() for each in (self.array, self.vehicles, self.wrench)))
+        vehicles, wrench = (each if each is None else each.copy() for each in (self.vehicles, self.wrench))
+        return QuadcopterState(self.array.copy(), vehicles, wrench)
 
     def rows(self, rows: slice) -> "QuadcopterState":
         """Some of the vehicles, views."""

@@ -15,9 +15,12 @@ from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 _RANGES = ("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay")
 _VECTOR = {"": 3, "_unit": 1, "_in_body": 1, "_direction": 3, "_axes": 3}
 WORLD = {
-    **{"share": 1, "wrench_share": 1, **dict.fromkeys(_RANGES, 3)},
+    "share": 1,
+    "wrench_share": 1,
+    **dict.fromkeys(_RANGES, 3),
     **{f"{name}{part}": size for name in ("force", "torque") for part, size in _VECTOR.items()},
-    **{"gust_std": 3, "gust_keeps": 1},
+    "gust_std": 3,
+    "gust_keeps": 1,
 }
 """Numbers of :meth:`~sb3_quad.simulation.randomization.Randomization.numbers`; a range is low, high and how to sample."""
 WORLD_SIZE = sum(WORLD.values())
