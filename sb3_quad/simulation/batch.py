@@ -10,6 +10,7 @@ from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, In
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
+from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run
@@ -18,11 +19,11 @@ from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATI
 from sb3_quad.simulation.randomization import resolve_randomization
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
-from sb3_quad.simulation.worlds import GUST_SIZE, WORLD_SIZE
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.simulation.worlds import new_worlds
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 MAX_ROWS = 2**20
+COLUMNS = {"vehicle": "vehicles", "nominal": "nominal", "world": "worlds", "gust": "gust", "scaling": "mean"}
 _MEMORY = (  # all that future flight depends on
     *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
     *("vehicles", "gust", "frames", "integral"),
@@ -99,7 +100,7 @@ class QuadcopterBatch:
         self.nominal = np.stack([each.parameters() for each in columns], axis=1)
         self.randomize = resolve_randomization(randomize)
         self.memory = resolve_memory(last_action=last_action, history=history, position_integral=position_integral)
-        self.vehicles, self.worlds, self.gust = self._worlds(columns)
+        self.vehicles, self.worlds, self.gust = new_worlds(self.randomize, columns, n)
         self.frames = new_frames(self.memory, n)
         self.ages = np.array(self.memory.ages, dtype=np.int64)
         integral = self.memory.position_integral
@@ -109,8 +110,7 @@ class QuadcopterBatch:
         self.task, self.task_kwargs = task, dict(task_kwargs or {})
         self.task_index = np.zeros(n, dtype=np.int64)
         self.state = np.zeros((STATE_SIZE, n))
-        longest = 0 if self.randomize is None else self.randomize.longest_delay
-        self.queue = np.zeros((max(longest, *(each.delay for each in columns), 0), 4, n))
+        self.queue = np.zeros((max(self.randomize.longest_delay, *(each.delay for each in columns), 0), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         # One column serves all rows until rows are set apart.
@@ -128,16 +128,6 @@ class QuadcopterBatch:
         with compilation_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
-
-    def _worlds(self, vehicles: Sequence[Vehicle]) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Arrays of the vehicles that fly, of what is random in their worlds, and of gusts."""
-        if self.randomize is None:
-            return self.nominal.copy(), np.zeros((WORLD_SIZE, 0)), np.zeros((GUST_SIZE, 0))
-        for each in {id(each): each for each in vehicles}.values():
-            self.randomize.check(each)
-        worlds = np.stack([self.randomize.numbers(each) for each in vehicles], axis=1)
-        flying = np.array(np.broadcast_to(self.nominal, (len(self.nominal), self.n)), order="C")
-        return flying, worlds, np.zeros((GUST_SIZE, self.n))
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""
@@ -214,7 +204,7 @@ class QuadcopterBatch:
 
     def total_wrench(self) -> FloatArray:
         """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and gusts."""
-        if self.randomize is None or self.randomize.gusts is None:
+        if self.randomize.gusts is None:
             return self.wrench
         total = self.wrench.copy()
         total[FORCE_WORLD] += self.gust[:3]
@@ -334,16 +324,13 @@ class QuadcopterBatch:
                 "physics_step": first.physics_step,
                 "max_steps": values["max_episode_steps"],
                 "tasks": table.weights.size,
-                "vehicle_columns": values["vehicles"].shape[1],
-                "nominal_columns": self.nominal.shape[1],
-                "world_columns": self.worlds.shape[1],
-                "gust_columns": self.gust.shape[1],
-                "scaling_columns": values["mean"].shape[1],
-                "gusts": self.randomize is not None and self.randomize.gusts is not None,
-                "sets_wrench": self.randomize is not None and self.randomize.sets_wrench,
+                **{f"{name}_columns": values[array].shape[1] for name, array in COLUMNS.items()},
+                "gusts": self.randomize.gusts is not None,
+                "sets_vehicle": self.randomize.sets_vehicle,
+                "sets_wrench": self.randomize.sets_wrench,
+                "mixed_delays": self.randomize.delay is not None or bool((self.nominal[P.delay] != len(self.queue)).any()),
                 "width": self.memory.size,
-                "depth": self.frames.shape[1],
-                "frame": self.frames.shape[2],
+                **dict(zip(("depth", "frame"), self.frames.shape[1:], strict=True)),
                 "ages": self.ages.size,
                 "integrals": len(self.integral),
                 "autoreset": self.autoreset,

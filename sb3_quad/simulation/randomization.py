@@ -158,6 +158,12 @@ class Randomization(Frozen):
         return self
 
     @property
+    def sets_vehicle(self) -> bool:
+        """Whether an episode begins with a vehicle of its own."""
+        changes = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self.delay)
+        return any(each is not None for each in changes)
+
+    @property
     def sets_wrench(self) -> bool:
         """Whether an episode begins with a wrench of its own, none included."""
         return self.force is not None or self.torque is not None
@@ -203,11 +209,9 @@ def _gusts(gusts: Gusts, vehicle: Vehicle) -> list[float]:
     return [*gusts.std.numbers(), math.exp(-vehicle.control_step / gusts.time_constant)]
 
 
-def resolve_randomization(given: Any) -> Randomization | None:
+def resolve_randomization(given: Any) -> Randomization:
     """A :class:`Randomization`, or a mapping of its fields; None: nothing is random.
 
     :raises ConfigError: an unknown field, or a value that does not fit.
     """
-    if given is None or isinstance(given, Randomization):
-        return given
-    return validate(Randomization, given, "randomize")
+    return given if isinstance(given, Randomization) else validate(Randomization, {} if given is None else given, "randomize")

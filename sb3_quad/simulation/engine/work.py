@@ -36,7 +36,7 @@ from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import TASK, S
-from sb3_quad.simulation.worlds import GUST_SIZE, WORLD_SIZE, advance_gust, sample_world
+from sb3_quad.simulation.worlds import GUST_SIZE, WORLD_SIZE, advance_gusts, sample_gust, sample_vehicle, sample_wrench
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 LOOK, SCORE, FLY = range(3)
@@ -61,20 +61,9 @@ OUTCOME = np.dtype(
 # Columns of vehicles, random worlds and scaling: 1 where one serves all rows; none of worlds where all are nominal. Control
 # steps of an episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
 SIZES = (
-    *("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "nominal_columns", "world_columns"),
-    *(
-        "gust_columns",
-        "scaling_columns",
-        "gusts",
-        "sets_wrench",
-        "width",
-        "depth",
-        "frame",
-        "ages",
-        "integrals",
-        "mode",
-        "autoreset",
-    ),
+    *("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "nominal_columns", "world_columns", "gust_columns"),
+    *("scaling_columns", "mixed_delays", "gusts", "sets_wrench", "sets_vehicle", "width", "depth", "frame", "ages"),
+    *("integrals", "mode", "autoreset"),
 )
 _PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
 ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and shape, of which a name is one of the sizes
@@ -202,7 +191,7 @@ def run_block(job, number, b, fresh):
             load_rows(wrench, first, count, b.wrench)
             if job.gusts:
                 add_gusts(b, gust, first, count)
-            load_commands(b, actions, queue, first, count)
+            load_commands(b, actions, queue, job.mixed_delays, first, count)
             fly_block(b, job.physics_step, job.substeps)
             store_state(b, state, first, count)
         score(b)
@@ -211,9 +200,7 @@ def run_block(job, number, b, fresh):
         load_rows(streams, first, count, b.stream)
         observe(b, normals)
         if job.gusts:
-            for lane in range(count):
-                k = OBSERVATION_SIZE
-                advance_gust(first + lane, gust, b.noise[k, lane], b.noise[k + 1, lane], b.noise[k + 2, lane])
+            advance_gusts(b, gust, first, count)
         if job.depth > 0:
             numbers = carray(pointer(job.integral_numbers_at), (4,), np.float64)
             for lane in range(count):
@@ -261,8 +248,12 @@ def run_block(job, number, b, fresh):
         if dones[i]:
             returns[i], limits[i] = 0.0, job.max_steps
             count_episode(i, streams)
-            if job.world_columns > 0:
-                sample_world(i, streams, nominal, worlds, job.sets_wrench, vehicles, wrench, gust)
+            if job.sets_vehicle:
+                sample_vehicle(i, streams, nominal, worlds, vehicles)
+            if job.sets_wrench:
+                sample_wrench(i, streams, worlds, wrench)
+            if job.gusts:
+                sample_gust(i, streams, worlds, gust)
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
             if job.depth > 0:
                 forget(i, frames, integral)
