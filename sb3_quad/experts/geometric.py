@@ -19,6 +19,9 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
+_TOLD_YAW = (
+    4.0  # times the yaw gain: an agent's error of the moment that it takes from a torque becomes 1 / gain of a yaw rate
+)
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
@@ -65,6 +68,7 @@ class _Told:
         nominal = vehicle.parameters()[:, None]
         self._seen = np.empty(0)
         self._scale = gains.values()[:, None] / self._gains(nominal)
+        self._scale[G.yaw_rate] *= _TOLD_YAW
 
     def _lag(self, v: FloatArray) -> FloatArray:
         return np.asarray((v[P.delay] + 0.5) * self._control_step + 1.0 / v[P.motor_gain])

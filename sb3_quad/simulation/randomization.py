@@ -142,7 +142,10 @@ class Randomization(Frozen):
     thrust: Factor | None = Field(default=None, description="factor of the thrust of a command, as a tired battery has it")
     arm: Factor | None = Field(default=None, description="factor of the rotors' distances from the centre of mass")
     center_of_mass: Range | None = Field(default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]")
-    delay: Range | None = Field(default=None, description="whole control steps from a command to its effect, such as [0, 3]")
+    delay: Range | None = Field(
+        default=None,
+        description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
+    )
     wrench_share: Share = Field(default=1.0, description="of the episodes with force, torque and gusts")
     force: Force | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, world frame, N")
     torque: Torque | None = Field(
@@ -190,11 +193,15 @@ class Randomization(Frozen):
                 f"randomize: motor_gain of {vehicle.name} may reach {gain:g}; times physics_step it may not exceed 1"
             )
 
+    def _delay(self) -> Range | None:
+        """Of which the whole part is the delay."""
+        return self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})
+
     def numbers(self, vehicle: Vehicle) -> FloatArray:
         """What :mod:`.worlds` reads for rows of a vehicle, in the order of ``WORLD``."""
         weight = vehicle.mass * vehicle.gravity
         vectors = (self.force, weight), (self.torque, weight * vehicle.arm_length)
-        ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self.delay)
+        ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self._delay())
         gusts = [*Gusts(std=Range(low=0, high=0)).std.numbers(), 0.0] if self.gusts is None else _gusts(self.gusts, vehicle)
         parts = [
             *([self.share], [self.wrench_share]),

@@ -84,6 +84,14 @@ TASKS: Mapping[str, Task] = {
         body_rates_std=4.0,
     ),
     "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
+    "hit_recovery": Task(  # as a hit leaves a vehicle, on its way
+        name="hit_recovery",
+        target_distance=25.0,
+        nearest_target=0.0,
+        random_attitude=True,
+        velocity_std=3.0,
+        body_rates_std=25.0,
+    ),
 }
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 

@@ -87,8 +87,7 @@ def sample_vehicle(i, streams, nominal, table, vehicles):
         vehicles[P.roll_arm_0 + rotor, i] = arm * vehicles[P.roll_arm_0 + rotor, i] - y
         vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
     if table[R.delay + 2, column] != FIXED:
-        steps = table[R.delay + 1, column] - table[R.delay, column] + 1.0
-        vehicles[P.delay, i] = table[R.delay, column] + min(math.floor(steps * u[10]), steps - 1.0)
+        vehicles[P.delay, i] = min(math.floor(_between(table, R.delay, column, u[10], 0.0)), table[R.delay + 1, column] - 1.0)
 
 
 @compiled
