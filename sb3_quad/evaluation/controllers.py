@@ -121,6 +121,8 @@ def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | 
     controller = resolve_expert(spec.spec, vehicle, "controller")
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
+    if spec.own is not None and spec.own.is_needed:
+        raise ConfigError(f"{spec.label}: adaptive scaling is for agents that see the 18 features alone; this one remembers")
     return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0), spec.observed["observation_std"])
 
 

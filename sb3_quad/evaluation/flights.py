@@ -25,7 +25,7 @@ from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-OBSERVATIONS, ACTIONS = quadcopter_spaces()
+ACTIONS = quadcopter_spaces()[1]
 
 
 @dataclass(frozen=True, eq=False)

@@ -47,7 +47,7 @@ class FlightSettings(Memory):
     def observed(self) -> dict[str, Any]:
         """What goes with an agent wherever it flies: how its observations are scaled, and what it remembers."""
         scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
-        return {**scaling, **self.model_dump(mode="json", include=set(Memory.model_fields), exclude_defaults=True)}
+        return {**scaling, **self.model_dump(mode="json", include=set(Memory.model_fields))}
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed.
