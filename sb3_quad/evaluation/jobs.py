@@ -63,7 +63,7 @@ class Job:
         parts: list[Any] = [self.scenario_key, self.record.content, self.record.scaling, self.record.offset]
         if self.spec.own is not None:  # a zip holds it, or what lies beside it
             vehicle = load_vehicle(self.spec.own.vehicle) if self.scenario.vehicle is None else None
-            observed = {key: value for key, value in self.spec.observed.items() if value or key not in Memory.model_fields}
+            observed = {key: value for key, value in self.spec.observed.items() if key not in Memory.model_fields or value}
             parts += [observed, vehicle and vehicle.model_dump(mode="json")]  # a memory is younger than results and their keys
         return _digest(parts)
 
