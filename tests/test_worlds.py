@@ -9,6 +9,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.experts import geometric
 from sb3_quad.experts.geometric import GeometricExpert, told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.engine.block import P, W
@@ -156,7 +157,9 @@ def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
 def test_who_is_told_of_a_nominal_world_flies_as_the_others():
     batch = QuadcopterBatch(240, "state_recovery", seed=0)
     batch.reset()
-    plain, told = GeometricExpert(), told_geometric()
+    gains = GeometricExpert().gains
+    plain = GeometricExpert(gains=gains.model_copy(update={"yaw_rate": geometric._TOLD_YAW * gains.yaw_rate}))
+    told = told_geometric()
     for _ in range(100):
         state = batch.true_state()
         np.testing.assert_allclose(told.actions(state), plain.actions(state), atol=1e-5)

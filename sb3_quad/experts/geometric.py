@@ -19,9 +19,7 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
-_TOLD_YAW = (
-    4.0  # times the yaw gain: an agent's error of the moment that it takes from a torque becomes 1 / gain of a yaw rate
-)
+_TOLD_YAW = 4.0  # times the yaw gain: an agent's error in the moment that it sets against a torque becomes a yaw rate / gain
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
