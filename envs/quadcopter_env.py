@@ -56,8 +56,8 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     ## Observation Space
 
     `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every control step, then
-    `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`, `history` or `position_integral` an observation is
-    frames of these, `batch.memory.size` numbers.
+    `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`, `history` or `position_integral` it is made of
+    frames of these, in all `batch.memory.size` numbers.
 
     | Num | Feature | Frame | Unit | std |
     |-----|---------|-------|------|-----|
@@ -125,7 +125,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
     | `last_action` | `False` | whether a frame ends with the action before it, so that it has 22 numbers |
-    | `history` | `None` | ages of the frames in an observation, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |
+    | `history` | `None` | ages of the frames that are seen, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |
     | `position_integral` | `None` | fields of :class:`~sb3_quad.simulation.memory.PositionIntegral`, `{}` for its own |
     | `randomize` | `None` | fields of :class:`~sb3_quad.simulation.randomization.Randomization`: the world of each episode |
     | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |
