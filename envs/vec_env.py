@@ -126,7 +126,7 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
             self._follow(self._ended)
             elapsed = round(time.time() - self._start, 6)
             outcomes, last = self.batch.outcome[rows].tolist(), self.batch.last_observations[rows]  # copies
-            for row, outcome, observation in zip(self._ended, outcomes, last, strict=True):
+            for row, outcome, observation in zip(rows.tolist(), outcomes, last, strict=True):
                 total, _, length, distance, collision, out_of_range, truncated, success = outcome
                 self._infos[row] = {
                     "terminal_observation": observation,

@@ -156,9 +156,12 @@ class QuadcopterBatch:
         """
         return self._move(FLY, actions)
 
-    def score(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """As :meth:`step`, of a control step that another simulator has flown and written into ``state``."""
-        return self._move(SCORE, actions)
+    def score(self, actions: npt.NDArray[Any] | None = None) -> tuple[Float32Array, Float32Array, BoolArray]:
+        """As :meth:`step`, of a control step that another simulator has flown and written into ``state``.
+
+        :param actions: for those that a policy is to see; None: zeros.
+        """
+        return self._move(SCORE, np.zeros((self.n, 4), np.float32) if actions is None else actions)
 
     def _move(self, mode: int, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         array = np.ascontiguousarray(actions, dtype=np.float32)

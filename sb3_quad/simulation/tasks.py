@@ -84,9 +84,8 @@ TASKS: Mapping[str, Task] = {
         velocity_std=2.0,
         body_rates_std=4.0,
     ),
-    "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
-    "hit_recovery": Task(  # on its way when something hits it
-        name="hit_recovery",
+    "after_hit": Task(  # on its way when something hits it
+        name="after_hit",
         target_distance=25.0,
         nearest_target=0.0,
         random_attitude=True,
@@ -94,6 +93,7 @@ TASKS: Mapping[str, Task] = {
         body_rates_std=4.0,
         hit_rates_std=25.0,
     ),
+    "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
 }
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 
