@@ -18,8 +18,8 @@ SHOWN = (SUCCESS, SURVIVAL, REWARD, NEAR, MEDIAN, LARGEST)
 CARD = """# {name}
 
 A policy for the vehicle `{vehicle}`: it recovers from random attitudes, velocities and body rates, and flies
-to targets. It reads the 18 features of `sb3_quad`'s environments, scaled as there{memory}, and gives four actions in
-[-1, 1], the thrusts of the rotors.
+to targets. It reads the 18 features of `sb3_quad`'s environments, scaled as there, and gives four actions in
+[-1, 1], the thrusts of the rotors.{memory}
 
 ## Measured
 
@@ -82,7 +82,7 @@ def write_card(
     kept = ", ".join(f"{key}={value!r}" for key, value in remembered.model_dump(exclude_defaults=True).items())
     return CARD.format(
         name=name,
-        memory=f", and what they were before (`{kept}` of `env_kwargs`)" if kept else "",
+        memory=f" It also reads what they were before, as these `env_kwargs` say:\n`{kept}`." if kept else "",
         vehicle=settings["vehicle"],
         noise=100 * settings["noise"],
         recoveries=measured[RECOVERY].n,
