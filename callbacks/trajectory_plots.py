@@ -9,9 +9,10 @@ from stable_baselines3.common.logger import Figure
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.callbacks.every import EveryTimesteps
+from sb3_quad.envs.in_flight import quadcopter_spaces
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import ACTIONS, OBSERVATIONS, fly_settings
+from sb3_quad.evaluation.flights import ACTIONS, fly_settings
 from sb3_quad.experts.controller import Controller
 from sb3_quad.settings.flight import FlightSettings
 
@@ -54,7 +55,7 @@ class TrajectoryPlots(EveryTimesteps):
 
     def _on_training_start(self) -> None:
         super()._on_training_start()
-        Controller(self.model, ACTIONS, OBSERVATIONS, kind="TrajectoryPlots: policy")
+        Controller(self.model, ACTIONS, quadcopter_spaces(self._settings.size)[0], kind="TrajectoryPlots: policy")
 
     def _on_event(self) -> bool:
         recorder = Recorder(len(self._seeds))

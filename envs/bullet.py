@@ -15,6 +15,7 @@ from sb3_quad.drawing.camera import ChaseCamera
 from sb3_quad.drawing.models import rotor_turning
 from sb3_quad.drawing.scene import Pose, Scene
 from sb3_quad.drawing.window import disconnect, has_display, open_window, point_window, start_drawing
+from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.rotors import write_body
 from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -51,6 +52,13 @@ class BulletBody:
         inertia = {"localInertiaDiagonal": vehicle.inertia, "linearDamping": 0.0, "angularDamping": 0.0}
         p.changeDynamics(self.body, -1, **inertia, physicsClientId=self.client)
         p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=self.client)
+
+    def become(self, parameters: FloatArray) -> None:
+        """Have the mass and inertia that a vehicle's ``parameters()`` say."""
+        inertia = parameters[[P.ixx, P.iyy, P.izz]].tolist()
+        p.changeDynamics(
+            self.body, -1, mass=float(parameters[P.mass]), localInertiaDiagonal=inertia, physicsClientId=self.client
+        )
 
     @property
     def connected(self) -> bool:

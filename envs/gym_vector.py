@@ -60,7 +60,7 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
         self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords, autoreset=False)
         self.num_envs = self.batch.n
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step, or by the user
-        self.single_observation_space, self.single_action_space = quadcopter_spaces()
+        self.single_observation_space, self.single_action_space = quadcopter_spaces(self.batch.memory.size)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 

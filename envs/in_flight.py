@@ -29,9 +29,9 @@ def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[
     return call
 
 
-def quadcopter_spaces() -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
+def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
     """Observation and action space of one quadcopter; made anew, since each space has random numbers of its own."""
-    observations = spaces.Box(-np.inf, np.inf, (OBSERVATION_SIZE,), np.float32)
+    observations = spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return observations, spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 

@@ -56,7 +56,8 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     ## Observation Space
 
     `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every control step, then
-    `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2).
+    `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`, `history` or `position_integral` it is made of
+    frames of these, in all `batch.memory.size` numbers.
 
     | Num | Feature | Frame | Unit | std |
     |-----|---------|-------|------|-----|
@@ -123,6 +124,10 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.vehicles.vehicle.Vehicle` |
     | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
+    | `last_action` | `False` | whether a frame ends with the action before it, so that it has 22 numbers |
+    | `history` | `None` | ages of the frames that are seen, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |
+    | `position_integral` | `None` | fields of :class:`~sb3_quad.simulation.memory.PositionIntegral`, `{}` for its own |
+    | `randomize` | `None` | fields of :class:`~sb3_quad.simulation.randomization.Randomization`: the world of each episode |
     | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |
     | `render_width`, `render_height` | 640, 480 | size of pictures and window, pixels |
 
@@ -133,7 +138,8 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | Method | Sets |
     |--------|------|
     | `set_target(position)` | r_T, (3,), world frame, m |
-    | `set_wrench(force, torque, force_frame, torque_frame)` | an external force (N) and torque (N m) at the centre of mass |
+    | `set_wrench(force, torque, force_frame, torque_frame)` | an external force (N) and torque (N m) at the centre of mass; |
+    | | where `randomize` has some, the next episode brings its own |
     | `set_noise(level)` | the relative standard deviation of the observation noise |
     | `set_observation_scaling(mean, std)` | mean and std of Eq. 3.16, (18,) each; `None` leaves one as it is |
     | `set_task(task, task_kwargs)` | the task from the next reset on |
@@ -165,7 +171,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         self.batch = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._ready = False
-        self.observation_space, self.action_space = quadcopter_spaces()
+        self.observation_space, self.action_space = quadcopter_spaces(self.batch.memory.size)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height
@@ -194,6 +200,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
+        self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
         self._ready = True
         if self._renderer is not None:
@@ -217,13 +224,14 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         batch, wrenches = self.batch, self._wrenches
         step = self.vehicle.physics_step
         with batch.lock:
-            kind = rotor_wrenches(batch.state, batch.queue, array, batch.wrench, batch.vehicles, step, wrenches)
+            wrench = batch.total_wrench()
+            kind = rotor_wrenches(batch.state, batch.queue, array, wrench, batch.vehicles, step, wrenches)
             if kind == NOT_FINITE:
                 raise ValueError(f"action {array.tolist()}: every number must be finite")
-            world = np.stack([self.wrench[FORCE_WORLD], self.wrench[TORQUE_WORLD]]) if kind == WORLD_FRAME_TOO else None
+            world = np.stack([wrench[FORCE_WORLD, 0], wrench[TORQUE_WORLD, 0]]) if kind == WORLD_FRAME_TOO else None
             self._body.fly(wrenches, world)
             self._body.read(batch.state)
-            observations, _, _ = batch.score()
+            observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":
             self._draw()
         info = self._info()

@@ -19,7 +19,6 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.checks import check_size
-from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
 
 if TYPE_CHECKING:
@@ -83,7 +82,7 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
-        super().__init__(self.batch.n, *quadcopter_spaces())
+        super().__init__(self.batch.n, *quadcopter_spaces(self.batch.memory.size))
         fps: Any = round(1.0 / self.vehicle.control_step)  # SB3's type of it knows lists alone
         self.metadata["render_fps"] = fps
 
@@ -126,9 +125,9 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         if self._ended:
             self._follow(self._ended)
             elapsed = round(time.time() - self._start, 6)
-            outcomes = self.batch.outcome[rows].tolist()  # of a copy, so that the last observations are fresh
-            for row, outcome in zip(self._ended, outcomes, strict=True):
-                total, _, length, distance, collision, out_of_range, truncated, success, observation = outcome
+            outcomes, last = self.batch.outcome[rows].tolist(), self.batch.last_observations[rows]  # copies
+            for row, outcome, observation in zip(rows.tolist(), outcomes, last, strict=True):
+                total, _, length, distance, collision, out_of_range, truncated, success = outcome
                 self._infos[row] = {
                     "terminal_observation": observation,
                     "TimeLimit.truncated": truncated,
@@ -187,7 +186,8 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         """Call a method for the given rows; one result per row."""
         rows = self.batch.rows(indices)
         if method_name == "true_state":
-            return [QuadcopterState(self.batch.state[:, row : row + 1]) for row in rows]
+            state = self.true_state()
+            return [state.rows(slice(row, row + 1)) for row in rows]
         if method_name not in _METHODS:
             raise AttributeError(f"no method {method_name!r} of rows; there are: true_state, {', '.join(_METHODS)}")
         getattr(self, method_name)(*method_args, indices=indices, **method_kwargs)

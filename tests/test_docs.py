@@ -19,6 +19,7 @@ ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or b
     ("docs/experts.md", 1): "a module, flown below",
     ("docs/export.md", 0): "tests/test_export.py",
     ("docs/export.md", 1): "tests/test_export.py",
+    ("docs/export.md", 2): "tests/test_export.py",
 }
 
 

@@ -22,8 +22,11 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, policy
 from sb3_quad.export.check import FLAGS, Reference, load_header
+from sb3_quad.export.memory import RememberingNetwork
 from sb3_quad.export.network import build_network
 from sb3_quad.export.policy import FORMATS, export_policy
+from sb3_quad.pretrained_policies import pretrained
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
@@ -59,11 +62,126 @@ def zips(tmp_path_factory):
 def flight():
     """What an environment shows of random states, and the same in physical units, worked out from the true state."""
     env = QuadcopterVecEnv(300, "recovery_and_tracking", noise=0.0, seed=7)
-    scaled, state = env.reset(), env.true_state()
+    return env.reset(), in_physical_units(env)
+
+
+def in_physical_units(env):
+    """The 18 features of the true state."""
+    state = env.true_state()
     to_body = state.rotation.transpose(0, 2, 1)
     velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
     parts = (state.position - env.target, to_body.reshape(-1, 9), velocity, state.body_rates)
-    return scaled, np.concatenate(parts, axis=1).astype(np.float32)
+    return np.concatenate(parts, axis=1).astype(np.float32)
+
+
+SEES = {
+    "all": {"history": [0, 1, 2, 5], "last_action": True, "position_integral": {"gain": 2.0}},
+    "action": {"last_action": True},
+    "integral": {"position_integral": {}},
+    "frames": {"history": [0, 3]},
+}
+
+
+@pytest.fixture(scope="module")
+def remembering(tmp_path_factory):
+    """Zips of policies that hover, by the weights of one that came with the package, and react to all that they remember."""
+    folder, old = tmp_path_factory.mktemp("remembering"), PPO.load(pretrained("itm-recovery"), device="cpu").policy
+    torch.manual_seed(0)
+    for name, sees in SEES.items():
+        model = PPO("MlpPolicy", QuadcopterVecEnv(1, seed=0, **sees), policy_kwargs={"net_arch": [64, 64]}, device="cpu")
+        with torch.no_grad():
+            for new, known in zip(model.policy.parameters(), old.parameters(), strict=True):
+                if new.shape == known.shape:
+                    new.copy_(known)
+                elif new.dim() == 2:
+                    new.normal_(std=0.02)[:, :18] = known
+        FlightSettings(**sees).write_into(model)
+        model.save(folder / f"{name}.zip")
+    return folder
+
+
+def held(file_format, content, name):
+    """The file as a function of observations and of which flights begin, by what its users run it with."""
+    if file_format == "c":
+        return load_header(content, name)[0]
+    states = []
+    if file_format == "torchscript":
+        extra = {"metadata.json": ""}
+        module = torch.jit.load(io.BytesIO(content), _extra_files=extra)
+        size = int(json.loads(extra["metadata.json"])["state_size"])
+    else:
+        session = pytest.importorskip("onnxruntime").InferenceSession(content, providers=["CPUExecutionProvider"])
+        size = session.get_inputs()[1].shape[1]
+
+    def call(observations, begins):
+        state = np.zeros((len(observations), size), np.float32) if begins.all() else states.pop()
+        state[begins] = 0.0
+        if file_format == "onnx":
+            result, following = session.run(None, {"observation": observations, "state": state})
+        else:
+            result, following = (each.numpy() for each in module(torch.from_numpy(observations), torch.from_numpy(state)))
+        states.append(following)
+        return result
+
+    return call
+
+
+CASES = [(kind, "thrusts") for kind in SEES] + [("all", "speeds")]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize(("kind", "output"), CASES)
+@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
+def test_it_remembers_as_the_environment_does_in_whole_flights(remembering, file_format, kind, output):
+    path, sees = remembering / f"{kind}.zip", SEES[kind]
+    exported = export_policy(path, file_format, output, n_observations=3000)
+    assert 0 < exported.max_error < (1e-4 if output == "thrusts" else 1e-2)
+    assert "closed-loop flights of 1000 control steps, 3 side by side" in exported.metadata["check"]
+    file, policy = held(file_format, exported.content, kind), PPO.load(path, device="cpu")
+    near = {"target_distance": 1.5, "nearest_target": 0.3}
+    env = QuadcopterVecEnv(4, "target_tracking", near, noise=0.0, seed=5, max_episode_steps=1000, **sees)
+    seen, begins, flights, integrated = env.reset(), np.ones(4, bool), np.ones(4), 0
+    for step in range(1030):  # all fly 1,000 control steps, and begin anew
+        result, actions = file(in_physical_units(env), begins), policy.predict(seen, deterministic=True)[0]
+        thrusts = result if output == "thrusts" else ITM.thrust_coefficient * result**2
+        np.testing.assert_allclose(thrusts, ITM.action_to_thrust(actions), atol=1e-4, err_msg=f"step {step}")
+        seen, _, begins, _ = env.step(ITM.thrust_to_action(thrusts.astype(float)))
+        flights += begins
+        integrated = max(integrated, np.abs(env.batch.integral).max(initial=0.0))
+        assert begins.all() == begins.any() == (step == 999)
+    assert (flights == 2).all()
+    assert integrated > 0.05 if "position_integral" in sees else integrated == 0
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda reference, state: (reference, torch.cat([state[:, :4] * 0, state[:, 4:]], 1)),
+        lambda reference, state: (reference, torch.cat([state[:, :4], state[:, 4:7] * 0, state[:, 7:]], 1)),
+        lambda reference, state: (reference, torch.cat([state[:, :7], state[:, 7:8].clamp(min=1.0), state[:, 8:]], 1)),
+        lambda reference, state: (sees(reference, history=(0, 1, 3, 5)), state),
+        lambda reference, state: (sees(reference, position_integral={"gain": 2.02}), state),
+        lambda reference, state: (sees(reference, position_integral={"gain": 2.0, "distance": 0.99}), state),
+        lambda reference, state: (sees(reference, position_integral={"gain": 2.0, "speed": 1.4}), state),
+    ],
+    ids=["no action", "no integral", "begun at once", "another age", "gain", "distance", "speed"],
+)
+def test_a_file_that_remembers_something_else_is_refused(remembering, monkeypatch, wrong):
+    class Wrong(RememberingNetwork):
+        def __init__(self, layers, reference):
+            super().__init__(layers, wrong(reference, torch.zeros(1, 200))[0])
+
+        def forward(self, observation, state):
+            return super().forward(observation, wrong(Reference(None, ITM), state)[1])
+
+    monkeypatch.setattr(policy, "RememberingNetwork", Wrong)
+    with pytest.raises(ExportError, match="differs from the trained one"):
+        export_policy(remembering / "all.zip", "torchscript")
+
+
+def sees(reference, **changes):
+    return reference._replace(memory=type(reference.memory)(**{**dict(reference.memory), **changes}))
 
 
 def run(file_format, content, observations, name="tanh"):
@@ -179,6 +297,31 @@ def test_an_onnx_model_says_what_it_takes_and_gives(zips):
     assert {each.key: each.value for each in model.metadata_props} == exported.metadata
 
 
+def test_an_onnx_model_takes_a_state_and_gives_the_next(remembering):
+    onnx = pytest.importorskip("onnx")
+    exported = export_policy(remembering / "all.zip", "onnx", n_observations=1000)
+    graph = onnx.load_from_string(exported.content).graph
+    ports = [(each.name, *each.type.tensor_type.shape.dim) for each in (*graph.input, *graph.output)]
+    size = 4 + 4 + 5 * 22  # the last action, the integral, five frames
+    assert [(name, first.dim_param, second.dim_value) for name, first, second in ports] == [
+        ("observation", "batch", 18),
+        ("state", "batch", size),
+        ("thrust", "batch", 4),
+        ("next_state", "batch", size),
+    ]
+    assert exported.metadata["state_size"] == str(size) and "history [0, 1, 2, 5]" in exported.metadata["state"]
+    assert exported.metadata["observation"].startswith("18 numbers") and exported.metadata["network"].startswith("88-64")
+
+
+def test_settings_that_do_not_fit_the_policy_are_one_line(zips, tmp_path, capsys):
+    model = PPO.load(zips / "tanh.zip", device="cpu")
+    FlightSettings(history=[0, 1]).write_into(model)
+    model.save(tmp_path / "agent.zip")
+    assert main(["export", str(tmp_path / "agent.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 2
+    error = capsys.readouterr().err
+    assert "by its settings of shape (36,)" in error and error.count("\n") == 1
+
+
 @given(st.text(max_size=200))
 def test_any_file_name_makes_a_c_name_and_a_comment(text):
     assert re.fullmatch("[A-Za-z][A-Za-z0-9_]*", c_header.c_name(text))
@@ -240,16 +383,20 @@ def test_bad_input_is_one_line(zips, tmp_path, capsys, monkeypatch, arguments, m
 
 
 @needs_compiler
-def test_the_examples_of_the_docs_agree(zips, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize("remembers", [False, True])
+def test_the_examples_of_the_docs_agree(zips, remembering, tmp_path, monkeypatch, capsys, remembers):
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
+    path = remembering / "all.zip" if remembers else zips / "tanh.zip"
     for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
-        assert main(["export", str(zips / "tanh.zip"), "--format", file_format, "-o", file]) == 0
-    assert "µs per call" in capsys.readouterr().out
-    scope = {}
-    exec(DOCS.split("## Python")[1].split("```python")[1].split("```")[0], scope)
-    (tmp_path / "main.c").write_text(DOCS.split("```c\n")[1].split("```")[0])
+        assert main(["export", str(path), "--format", file_format, "-o", file]) == 0
+    printed = capsys.readouterr().out
+    assert "µs per call" in printed and ("state: zeros begin" in printed) == remembers
+    section, scope = DOCS.split("## A policy that remembers" if remembers else "## Python")[1], {}
+    exec(section.split("```python")[1].split("```")[0], scope)
+    (tmp_path / "main.c").write_text(section.split("```c\n")[1].split("```")[0])
     subprocess.run([COMPILER, *FLAGS, "main.c", "-lm", "-o", "main"], check=True)
-    printed = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
-    np.testing.assert_allclose([float(word) for word in printed], scope["thrust"][0], atol=1e-5)
-    assert "in 10000 observations" in capsys.readouterr().out
+    done = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
+    np.testing.assert_allclose([float(word) for word in done], np.ravel(scope["thrust"][:1]), atol=1e-5)
+    said = "closed-loop flights of 1000 control steps, 10" if remembers else "in 10000 observations"
+    assert said in printed + capsys.readouterr().out

@@ -48,9 +48,19 @@ def test_there_are_some_each_with_a_card_of_its_own():
 
 @pytest.mark.parametrize("name", pretrained_names())
 def test_each_flies_as_its_card_says(name):
-    vehicle = name.split("-")[0]
-    flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 240, 31_000_000, vehicle=vehicle)
+    own = {**FlightSettings.of(sb3_quad.pretrained(name))[0].in_any_task(), "vehicle": name.split("-")[0]}
+    flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 240, 31_000_000, **own)
     assert flights.success.mean() > 0.97
+
+
+def test_the_robust_one_ends_at_its_target_whatever_pushes():
+    own = FlightSettings.of(sb3_quad.pretrained("itm-robust"))[0].in_any_task()
+    force = {"magnitude": 27**0.5, "direction": [-1, -1, -1]}  # the thesis's
+    worlds = {"mass": [0.8, 1.2], "motor_gain": [0.7, 1.5], "force": {"magnitude": [0, 3]}}
+    for randomize, largest in (({"force": force}, 0.04), (worlds, 0.1)):
+        agent = sb3_quad.load_pretrained("itm-robust")
+        flights = fly(agent, "target_tracking", 240, 32_000_000, **{**own, "randomize": randomize})
+        assert flights.survival.mean() > 0.98 and np.quantile(flights.final_error[flights.survival], 0.95) < largest
 
 
 class Names(pickle.Unpickler):

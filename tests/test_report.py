@@ -64,6 +64,11 @@ scenarios:
     vary: {noise: [0, 0.1]}
     duration: 0.5
     episodes: 2
+  - name: drop
+    start: {position: [0, 0, 1.3], velocity: [0, 0, -1.5]}
+    vary: {vehicle_changes.delay: [0, 90]}
+    duration: 3
+    episodes: 2
   - name: starts
     start: {velocity: {magnitude: 0}, body_rates: {magnitude: 0}}
     vary: {start.attitude.tilt: [0, 90], start.body_rates.magnitude: [0, 4], start.velocity.magnitude: [0, 3]}
@@ -150,7 +155,7 @@ def test_every_plot_is_in_the_page_and_beside_it(folder, parts, page):
     names = [plot.name for plot in plots]
     assert len(set(names)) == len(names)
     kinds = {name.rpartition("_")[2] for name in names}
-    assert kinds == {"times", "paths", "error", "limit", "success"}
+    assert kinds == {"times", "paths", "error", "limit", "success", "families"}
     text = page.read_text(encoding="utf-8")
     data = json.loads(re.search(r'<script type="application/json" id="spaces">(.*?)</script>', text, re.DOTALL).group(1))
     assert sorted(data) == sorted(name for name in names if name.endswith("_paths"))
@@ -193,7 +198,7 @@ def test_controllers_targets_and_forces_have_colours_of_their_own(parts):
 
 def test_plots_are_narrow_enough_for_a_telephone_and_legends_cover_nothing(parts):
     for plot in (plot for section in parts.values() for plot in section.plots):
-        assert plot.space is not None or plot.figure.get_figwidth() == WIDTH
+        assert plot.space is not None or plot.name == "overview_families" or plot.figure.get_figwidth() == WIDTH
         legends_cover_nothing(plot.figure)
     assert plot_of(parts, "tracking", "times").figure.get_figheight() == HEIGHT
 
@@ -214,6 +219,21 @@ def test_isolated_survivals_beyond_the_first_loss_are_not_joined(folder):
     np.testing.assert_array_equal(joined.get_xydata(), [(1, 100), (2, 100), (3, 0)])
     np.testing.assert_array_equal(beyond.get_xydata(), [(4, 100), (5, 100), (6, 0)])
     assert beyond.get_linestyle() == "None" and beyond.get_markerfacecolor() != joined.get_markerfacecolor()
+
+
+def test_all_that_varies_alone_is_in_one_picture(folder, parts):
+    plot, results = plot_of(parts, "overview", "families"), load_results(folder)
+    panels = plot.figure.axes
+    assert [panel.get_title("left") for panel in panels[::2]] == ["Noise", "Drop"]
+    assert [panel.get_xlabel() for panel in panels[1::2]] == ["noise (relative std)", "delay (control steps)"]
+    for label in ("pid", LABEL):
+        success, error = ({line.get_label(): line for line in panel.lines}[label] for panel in panels[2:])
+        metrics = [results.entry(label, f"drop.{delay}").metrics for delay in (0, 90)]
+        np.testing.assert_allclose(success.get_ydata(), [100 * each.success.value for each in metrics])
+        assert metrics[1].survival.value == 0.0 and np.isnan(error.get_ydata()[1])  # where most are lost, there is no error
+        assert error.get_ydata()[0] == max(metrics[0].final_error_median, 1e-3)
+        np.testing.assert_allclose(success.get_xdata(), [0, 90], atol=3)
+    assert not plot.is_narrow and len(plot.figure.legends) == 1
 
 
 def test_controllers_stand_side_by_side_in_each_cell(folder, parts):

@@ -54,10 +54,13 @@ SIDE_HIT = (
 )
 
 
+GUSTS = "target: {distance: 3}, duration: 3, episodes: 3, randomize: {mass: [0.9, 1.1], gusts: {std: 2, time_constant: 0.5}}"
+
+
 @pytest.mark.parametrize(
     ("entry", "controller"),
-    [(MIXED, PIDExpert()), (MIXED, OnObservations()), (RECOVERY, PIDExpert()), (SIDE_HIT, PIDExpert())],
-    ids=["mixed", "mixed, on observations", "recovery", "side hit"],
+    [(MIXED, PIDExpert()), (MIXED, OnObservations()), (RECOVERY, PIDExpert()), (SIDE_HIT, PIDExpert()), (GUSTS, PIDExpert())],
+    ids=["mixed", "mixed, on observations", "recovery", "side hit", "gusts"],
 )
 def test_both_backends_fly_the_same(entry, controller):
     flown = [fly_scenario(controller, scenario(entry), backend, recorded=2) for backend in ("batch", "pybullet")]
@@ -71,6 +74,17 @@ def test_both_backends_fly_the_same(entry, controller):
     two["quaternion"] = two["quaternion"] * same
     for name, values in one.items():
         np.testing.assert_allclose(values, two[name], rtol=1e-3, atol=1e-4, err_msg=name)
+
+
+def test_gusts_push_and_the_suite_of_changes_flies():
+    calm, gusty = (
+        fly_scenario(PIDExpert(), scenario(f"randomize: {{gusts: {{std: {std}}}}}, duration: 4"))[0] for std in (0, 3)
+    )
+    assert calm.final_error.max() < 1e-3 and gusty.final_error.min() > 0.01
+    for each in load_suite("robustness").with_changes(episodes=2).scenarios:
+        if each.group != "starts":
+            flights, _ = fly_scenario(PIDExpert(), each.model_copy(update={"duration": 0.3, "wrenches": each.wrenches[:1]}))
+            assert flights.n == 2 and flights.survival.all()
 
 
 def test_episodes_are_those_of_the_task():

@@ -155,6 +155,24 @@ def test_wrenches_in_weights_grow_with_the_vehicle_and_change_no_others(name):
     assert "unit" not in each.wrenches[1].model_dump()  # results of earlier versions keep their hashes
 
 
+def test_what_is_random_in_a_scenario_is_part_of_it_and_changes_no_others():
+    gusty = scenario("randomize: {mass: [0.9, 1.1], gusts: {std: 1, time_constant: 0.5}}")
+    assert Scenario.model_validate(gusty.model_dump(mode="json")) == gusty and not gusty.is_fixed
+    plain = scenario("noise: 0.1")
+    assert plain.is_fixed and "randomize" not in plain.model_dump()  # results of earlier versions keep their hashes
+    assert "randomize" not in plain.model_dump(mode="json", exclude={"title"})
+    cells = suite("randomize: {gusts: {std: 0}}, vary: {randomize.gusts.std: [0, 2]}").scenarios
+    assert [cell.randomize.gusts.std.high for cell in cells] == [0, 2]
+    assert axis_label("randomize.gusts.std") == "gusts (std, N)"
+    for entry, message in (
+        ("randomize: {gust: {std: 1}}", "did you mean 'gusts'"),
+        ("randomize: {mass: [1, 2]}", "cannot hover"),
+        ("randomize: {force: [0, 1]}, wrenches: [{force: [1, 0, 0]}]", "do not go with wrenches"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            scenario(entry)
+
+
 @given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))
 def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"

@@ -438,7 +438,7 @@ def test_vehicles_by_row():
         ({"n_envs": 2, "observation_std": np.zeros(18)}, "observation_std"),
         ({"n_envs": 2, "observation_mean": np.zeros(17)}, r"observation_mean of shape \(17,\)"),
         ({"n_envs": 2, "max_episode_steps": 0}, "max_episode_steps 0"),
-        ({"n_envs": 2, "vehicle": ["itm"]}, "1 vehicles for 2"),
+        ({"n_envs": 2, "vehicle": ["itm"] * 3}, "3 vehicles for 2"),
         ({"n_envs": 2, "vehicle": "itn"}, "did you mean 'itm'"),
     ],
 )

@@ -45,8 +45,8 @@ class ControllerSpec:
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with the agent wherever it flies: ``observation_mean`` and ``observation_std`` of its environment."""
-        return (self.own or FlightSettings()).model_dump(include={"observation_mean", "observation_std"})
+        """What goes with the agent wherever it flies, see :attr:`FlightSettings.observed`."""
+        return (self.own or FlightSettings()).observed
 
     def notice(self, vehicle: str | Path | Vehicle) -> str:
         """What is to be known of an agent that flies ``vehicle``, in a line: that it knows another, or says none; or empty."""
@@ -121,6 +121,8 @@ def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | 
     controller = resolve_expert(spec.spec, vehicle, "controller")
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
+    if spec.own is not None and spec.own.is_needed:
+        raise ConfigError(f"{spec.label}: adaptive scaling is for agents that see the 18 features alone; this one remembers")
     return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0), spec.observed["observation_std"])
 
 

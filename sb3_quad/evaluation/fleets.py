@@ -20,7 +20,7 @@ ENDLESS = {"max_episode_steps": 2**62}  # who flies says when an episode is over
 class FleetStep(NamedTuple):
     """What a control step of n vehicles gives."""
 
-    observation: Float32Array  # (n, 18)
+    observation: Float32Array  # (n, 18), or what else the agent is to see
     reward: FloatArray  # (n,)
     lost: BoolArray  # (n,), on the ground or out of range
     collided: BoolArray  # (n,), on the ground
@@ -38,10 +38,10 @@ class BatchFleet:
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
         self._batch = QuadcopterBatch(len(seeds), **{**dict(settings), **ENDLESS}, autoreset=False)
         self._batch.seed(seeds)
-        self.vehicle = self._batch.vehicle_list[0]
+        self.vehicle, self.observation_size = self._batch.vehicle_list[0], self._batch.memory.size
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
-        """Begin; observations (n, 18).
+        """Begin; observations (n, observation_size).
 
         :param start: what replaces the episodes' own sample: any of position, velocity, body_rates, target (n, 3) and
             quaternion (n, 4).
@@ -59,7 +59,7 @@ class BatchFleet:
         return FleetStep(observation, reward.astype(np.float64), *ends)
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
-        """Move the targets of some rows, (len(rows), 3); all observations with the new targets, (n, 18)."""
+        """Move the targets of some rows, (len(rows), 3); all observations with the new targets."""
         self._batch.set_target(targets, rows)
         return self._batch.observe()
 
@@ -85,7 +85,7 @@ class PyBulletFleet:
             )
         self._seeds = seeds
         self._envs = [QuadcopterEnv(**{**dict(settings), **ENDLESS}) for _ in seeds]
-        self.vehicle = self._envs[0].vehicle
+        self.vehicle, self.observation_size = self._envs[0].vehicle, self._envs[0].batch.memory.size
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         for row, (env, seed) in enumerate(zip(self._envs, self._seeds, strict=True)):

@@ -25,7 +25,7 @@ from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
-OBSERVATIONS, ACTIONS = quadcopter_spaces()
+ACTIONS = quadcopter_spaces()[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,7 +130,7 @@ def fly_settings(
 def _fly_fleet(
     fleet: Fleet, controller: Any, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
 ) -> Flights:
-    asked = Controller(controller, ACTIONS, OBSERVATIONS, fleet.true_state)
+    asked = Controller(controller, ACTIONS, quadcopter_spaces(fleet.observation_size)[0], fleet.true_state)
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()

@@ -28,6 +28,7 @@ from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry,
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.scenarios.scenario import DEFAULT_VEHICLE, Scenario
+from sb3_quad.simulation.memory import Memory
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 _SILENT = {"title", "description", "reference", "group", "cell"}  # fields of a scenario that change no flight
@@ -62,7 +63,8 @@ class Job:
         parts: list[Any] = [self.scenario_key, self.record.content, self.record.scaling, self.record.offset]
         if self.spec.own is not None:  # a zip holds it, or what lies beside it
             vehicle = load_vehicle(self.spec.own.vehicle) if self.scenario.vehicle is None else None
-            parts += [self.spec.observed, vehicle and vehicle.model_dump(mode="json")]
+            observed = {key: value for key, value in self.spec.observed.items() if key not in Memory.model_fields or value}
+            parts += [observed, vehicle and vehicle.model_dump(mode="json")]  # a memory is younger than results and their keys
         return _digest(parts)
 
     @property

@@ -42,7 +42,7 @@ class AdaptiveScaling:
         self.policy, self.observation_space = policy, getattr(policy, "observation_space", None)
         self.mean = np.asarray(mean, dtype=np.float64)
         self.std = np.asarray(DEFAULT_STD if std is None else std, dtype=np.float64)[_POSITION]
-        self._ask = observation_function(policy)
+        self._ask = observation_function(policy, remembers=False)
 
     def __call__(self, observation: Float32Array) -> Any:
         position = observation[:, _POSITION] * self.std

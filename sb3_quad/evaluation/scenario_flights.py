@@ -55,8 +55,13 @@ def fly_scenario(
 
 def flown_as(scenario: Scenario) -> FlightSettings:
     """How the episodes of a scenario are flown."""
-    vehicle = scenario.flown_vehicle()
-    return FlightSettings(task=scenario.task, vehicle=vehicle, noise=scenario.noise, max_episode_steps=scenario.steps)
+    return FlightSettings(
+        task=scenario.task,
+        vehicle=scenario.flown_vehicle(),
+        noise=scenario.noise,
+        randomize=scenario.randomize,
+        max_episode_steps=scenario.steps,
+    )
 
 
 def find_limit(

@@ -24,7 +24,9 @@ class Controller:
     2. ``source.predict(observation)``, deterministic: an SB3 model, or an ``Expert`` of this package without a true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
-    2 and 3 get the observations that a policy sees. Controllers with a memory (recurrent policies) are not supported.
+    2 and 3 get the observations that a policy sees. What a ``predict`` remembers, the second thing that it returns as SB3's
+    recurrent policies do, it is given again when it is asked next: all rows of a new Controller begin an episode. An expert
+    that labels must remember nothing.
 
     :param source: the controller, as above.
     :param action_space: a Box.
@@ -60,7 +62,7 @@ class Controller:
         if self.needs_state and true_state is not None:
             self._ask: Ask = lambda observation: source.actions(true_state())
         elif hasattr(source, "predict") or callable(source):
-            self._ask = observation_function(source)
+            self._ask = observation_function(source, remembers=kind != "expert")
         elif hasattr(source, "actions"):
             raise error(f"{kind} {self.name}: needs the true state, and this environment has no true_state()")
         else:
@@ -127,11 +129,25 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     return None
 
 
-def observation_function(source: Any, deterministic: bool = True) -> Ask:
-    """A policy or a function as a function from observations (n, ...) to actions (n, ...).
+def observation_function(source: Any, deterministic: bool = True, remembers: bool = True) -> Ask:
+    """A policy or a function as a function from observations (n, ...) to actions (n, ...), for one flight of n rows.
 
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
+    :param remembers: whether what a policy remembers is kept; False: :class:`ExpertError` of one that does.
     """
-    if hasattr(source, "predict"):
-        return lambda observation: source.predict(observation, deterministic=deterministic)[0]
-    return source  # type: ignore[no-any-return]
+    if not hasattr(source, "predict"):
+        return source  # type: ignore[no-any-return]
+    memory: Any = None
+
+    def ask(observation: npt.NDArray[Any]) -> Any:
+        nonlocal memory
+        given: dict[str, Any] = {} if memory is None else {"state": memory}
+        answer = source.predict(observation, deterministic=deterministic, **given)
+        memory = answer[1]
+        if memory is not None and not remembers:
+            raise ExpertError(
+                f"{type(source).__name__}: has a memory, so it can be flown alone, but neither imitated nor scaled"
+            )
+        return answer[0]
+
+    return ask

@@ -1,20 +1,25 @@
 """A geometric controller for large angles: it recovers from nearly every attitude, spin and fall, and flies to targets."""
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.simulation.engine.block import P, W
 from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.rotation import rotation_rows
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
+_NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
+_TOLD_YAW = 4.0  # times the yaw gain: an agent's error in the moment that it sets against a torque becomes a yaw rate / gain
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
@@ -27,24 +32,67 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """
     least, most = vehicle.thrust_limits
     able = Authority(vehicle)
-    turn, lag = float(able.accelerations[:2].min()), able.command_lag
-    rate = min(1.0 / (lag + 1.0 / math.sqrt(turn)), 0.438 / lag)
-    sideways = math.sqrt(most**2 - 1.0)
-    return GeometricGains(
-        position=0.271 * rate,
-        velocity=0.458 * rate,
-        height_position=0.446 * rate,
-        height_velocity=0.748 * rate,
-        deceleration=0.571 * vehicle.gravity * sideways,
-        height_deceleration=0.822 * vehicle.gravity * (most - 1.0),
-        descent=vehicle.gravity * min(0.9, 1.56 * (1.0 - least)),
-        tilt=0.979 * sideways,
-        attitude=1.19 * rate,
-        angular_deceleration=1.81 * turn,
-        body_rates=0.685 / lag,
-        yaw_rate=0.110 / lag,
-        descent_deceleration=0.408 * vehicle.gravity * (most - 1.0),
-    )
+    derived = _derived(float(able.accelerations[:2].min()), able.command_lag, vehicle.gravity, least, most)
+    return GeometricGains.model_validate({name: float(value) for name, value in derived.items()})
+
+
+def _derived(turn: Any, lag: Any, gravity: Any, least: Any, most: Any) -> dict[str, Any]:
+    """The gains of :func:`derived_gains` by name, of one vehicle or of arrays of them."""
+    rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
+    sideways = np.sqrt(np.maximum(most, 1.01) ** 2 - 1.0)  # a tired vehicle may not even hover
+    upwards = gravity * (np.maximum(most, 1.01) - 1.0)
+    return {
+        "position": 0.271 * rate,
+        "velocity": 0.458 * rate,
+        "height_position": 0.446 * rate,
+        "height_velocity": 0.748 * rate,
+        "deceleration": 0.571 * gravity * sideways,
+        "height_deceleration": 0.822 * upwards,
+        "descent": gravity * np.minimum(0.9, 1.56 * (1.0 - least)),
+        "tilt": 0.979 * sideways,
+        "attitude": 1.19 * rate,
+        "angular_deceleration": 1.81 * turn,
+        "body_rates": 0.685 / lag,
+        "yaw_rate": 0.110 / lag,
+        "descent_deceleration": 0.408 * upwards,
+    }
+
+
+class _Told:
+    """What the law needs of n vehicles whose true parameters are known; of those that changed it is worked out anew."""
+
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
+        self._control_step = vehicle.control_step
+        nominal = vehicle.parameters()[:, None]
+        self._seen = np.empty(0)
+        self._scale = gains.values()[:, None] / self._gains(nominal)
+        self._scale[G.yaw_rate] *= _TOLD_YAW
+
+    def _lag(self, v: FloatArray) -> FloatArray:
+        return np.asarray((v[P.delay] + 0.5) * self._control_step + 1.0 / v[P.motor_gain])
+
+    def _gains(self, v: FloatArray) -> FloatArray:
+        moments = np.abs(v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)).sum(axis=1) * v[P.thrust_half_range]
+        limits = ((v[P.thrust_middle] + sign * v[P.thrust_half_range]) / v[P.hover_thrust] for sign in (-1.0, 1.0))
+        turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
+        return np.stack([*_derived(turn, self._lag(v), v[P.gravity], *limits).values()])
+
+    def constants(self, vehicles: FloatArray) -> tuple[FloatArray, ...]:
+        """Gains (gains, n), body (6, n), inverses of mixers (n, 4, 4) and thrust ranges (2, n)."""
+        if self._seen.shape != vehicles.shape:
+            self._seen = np.full_like(vehicles, np.nan)
+            n = vehicles.shape[1]
+            self._all = np.empty((len(self._scale), n)), np.empty((6, n)), np.empty((n, 4, 4)), np.empty((2, n))
+        new = np.flatnonzero((self._seen != vehicles).any(axis=0))
+        if new.size:
+            v = self._seen[:, new] = vehicles[:, new]
+            gains, body, inverses, ranges = self._all
+            gains[:, new] = self._scale * self._gains(v)
+            body[:, new] = np.stack([v[P.mass], v[P.gravity], v[P.ixx], v[P.iyy], v[P.izz], self._lag(v)])
+            arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
+            inverses[new] = np.linalg.inv(np.concatenate([np.ones((1, *arms.shape[1:])), arms]).transpose(2, 0, 1))
+            ranges[:, new] = v[P.thrust_middle] - v[P.thrust_half_range], v[P.thrust_middle] + v[P.thrust_half_range]
+        return self._all
 
 
 class GeometricExpert(Expert):
@@ -62,6 +110,9 @@ class GeometricExpert(Expert):
     :param vehicle: name, YAML path or Vehicle it is designed for.
     :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
         :func:`derived_gains` where it has none.
+    :param told: whether it flies each vehicle by its true parameters and takes from forces and moments what pushes it, as far
+        as a state says (``state.vehicles``, ``state.wrench``). Its gains then change from vehicle to vehicle as those of
+        :func:`derived_gains` do.
     """
 
     def __init__(
@@ -70,19 +121,31 @@ class GeometricExpert(Expert):
         gains: GeometricGains | None = None,
         observation_mean: npt.ArrayLike | None = None,
         observation_std: npt.ArrayLike | None = None,
+        told: bool = False,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
         body = np.array([v.mass, v.gravity, *v.inertia, Authority(v).command_lag])
-        self._constants = self.gains.values(), body, v.mixer_inverse, np.array(v.thrust_range)
+        designed = self.gains.values(), body, np.array(v.thrust_range)
+        self._constants = designed[0][:, None], body[:, None], v.mixer_inverse[None], designed[2][:, None]
+        self._told = _Told(v, self.gains) if told else None
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
         moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
-        _geometric(*moving, *self._constants, actions)
+        wrench = _NO_WRENCH if self._told is None or state.wrench is None else state.wrench
+        constants: tuple[FloatArray, ...] = self._constants
+        if self._told is not None and state.vehicles is not None:
+            constants = self._told.constants(state.vehicles)
+        _geometric(*moving, *constants, wrench, actions)
         return actions
+
+
+def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+    """A :class:`GeometricExpert` that is told the true vehicle and wrench."""
+    return GeometricExpert(vehicle, told=True)
 
 
 @compiled
@@ -92,8 +155,8 @@ def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-d
 
 
 @compiled
-def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped-def]
-    """Desired force per mass in the world frame, m/s²."""
+def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g):  # type: ignore[no-untyped-def]
+    """Desired force of the rotors per mass in the world frame, m/s², where something else accelerates by (ax, ay, az)."""
     distance = math.sqrt(ex * ex + ey * ey)
     speed = gains[G.position]  # per distance
     if distance > 0.0:
@@ -102,7 +165,8 @@ def _desired_force(ex, ey, ez, vx, vy, vz, gains, g):  # type: ignore[no-untyped
     deceleration = gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
     rise = math.copysign(_braking_profile(abs(ez), gains[G.height_position], deceleration), ez)
     climb = max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
-    fz = max(0.1 * g, g + climb)  # upwards, so that the force has a tilt
+    fx, fy = fx - ax, fy - ay
+    fz = max(0.1 * g, g + climb - az)  # upwards, so that the force has a tilt
     horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[G.tilt] * fz
     scale = limit / horizontal if horizontal > limit else 1.0
     return scale * fx, scale * fy, fz
@@ -167,20 +231,31 @@ def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: i
 
 
 @compiled
-def _geometric(position, quaternion, velocity, rates, target, gains, body, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
-    mass, g, _, _, izz, lag = body
-    low, high = limits
+def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies, inverses, limits, wrench, actions):  # type: ignore[no-untyped-def]
+    gains, body = np.empty(all_gains.shape[0]), np.empty(bodies.shape[0])
     for i in range(actions.shape[0]):
+        column, pushed = min(i, bodies.shape[1] - 1), min(i, wrench.shape[1] - 1)
+        gains[:], body[:] = all_gains[:, column], bodies[:, column]
+        mixer_inverse, low, high = inverses[column], limits[0, column], limits[1, column]
+        mass, g, _, _, izz, lag = body
         p, q, r = rates[0, i], rates[1, i], rates[2, i]
         ex, ey, ez = target[0, i] - position[0, i], target[1, i] - position[1, i], target[2, i] - position[2, i]
-        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], gains, g)
-        size = math.sqrt(fx * fx + fy * fy + fz * fz)
         (r11, r12, r13), (r21, r22, r23), (r31, r32, r33) = rotation_rows(
             quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
         )
+        ux, uy, uz = wrench[W.force_body, pushed], wrench[W.force_body + 1, pushed], wrench[W.force_body + 2, pushed]
+        ax = (wrench[W.force_world, pushed] + r11 * ux + r12 * uy + r13 * uz) / mass
+        ay = (wrench[W.force_world + 1, pushed] + r21 * ux + r22 * uy + r23 * uz) / mass
+        az = (wrench[W.force_world + 2, pushed] + r31 * ux + r32 * uy + r33 * uz) / mass
+        tx, ty, tz = wrench[W.torque_world, pushed], wrench[W.torque_world + 1, pushed], wrench[W.torque_world + 2, pushed]
+        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], ax, ay, az, gains, g)
+        size = math.sqrt(fx * fx + fy * fy + fz * fz)
         b1 = (r11 * fx + r21 * fy + r31 * fz) / size
         b2 = (r12 * fx + r22 * fy + r32 * fz) / size
         b3 = (r13 * fx + r23 * fy + r33 * fz) / size
         b1, b2, b3 = _rotated(b1, b2, b3, p, q, r, lag)
         mx, my = _turn_moments(b1, b2, b3, p, q, r, gains, body)
-        _allocate(mass * size * b3, mx, my, -gains[G.yaw_rate] * izz * r, mixer_inverse, low, high, actions[i])
+        mx -= wrench[W.torque_body, pushed] + r11 * tx + r21 * ty + r31 * tz
+        my -= wrench[W.torque_body + 1, pushed] + r12 * tx + r22 * ty + r32 * tz
+        mz = -gains[G.yaw_rate] * izz * r - (wrench[W.torque_body + 2, pushed] + r13 * tx + r23 * ty + r33 * tz)
+        _allocate(mass * size * b3, mx, my, mz, mixer_inverse, low, high, actions[i])

@@ -1,6 +1,7 @@
 """Experts by name, as YAML and the command line give them."""
 
 import pkgutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,31 +13,34 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
+    "told_geometric": "sb3_quad.experts.geometric:told_geometric",
+    "raptor": "sb3_quad.experts.raptor:Raptor",
 }
 DEFAULT_EXPERT = "geometric"
 """Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
 
 
-def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str = "expert") -> Any:
+def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "itm", kind: str = "expert") -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: ``"pid"`` or ``"geometric"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
+    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
         with the package (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)`` returns an
         expert; or an expert itself, returned as it is.
-    :param vehicle: what a named expert is designed for.
+    :param vehicle: what a named expert is designed for; of several, the first.
     :param kind: what messages call it.
     :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be imported.
     :raises ExpertError: a factory that fails.
     """
     if not isinstance(spec, (str, Path)):
         return spec
+    known = vehicle if isinstance(vehicle, (str, Path, Vehicle)) else vehicle[0]
     text = str(spec)
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)
     factory = import_factory(text, kind)
     try:
-        return factory(load_vehicle(vehicle))
+        return factory(load_vehicle(known))
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:
@@ -46,7 +50,7 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle = "itm", kind: str =
 def import_factory(text: str, kind: str = "expert") -> Any:
     """What makes the expert of a name, or is at ``package.module:factory``.
 
-    :raises ConfigError: an unknown name, or a factory that cannot be imported.
+    :raises ConfigError: an unknown name, or a factory that cannot be imported; :class:`MissingExtra` where it needs one.
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:
@@ -54,5 +58,7 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
     try:
         return pkgutil.resolve_name(location)
+    except SB3QuadError:
+        raise
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported
         raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error

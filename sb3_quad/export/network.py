@@ -14,7 +14,7 @@ from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.imports import require
-from sb3_quad.evaluation.flights import ACTIONS, OBSERVATIONS
+from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
@@ -38,11 +38,14 @@ class Network(th.nn.Module):
     inverse_std: th.Tensor
     middle: th.Tensor
     half_range: th.Tensor
+    examples: tuple[th.Tensor, ...] = (EXAMPLE,)
+    facts: Mapping[str, str] = {}  # for the file's metadata
 
     def __init__(self, layers: th.nn.Sequential, reference: Reference) -> None:
         super().__init__()
         self.output, vehicle = reference.output, reference.vehicle
         self.result, self.unit = OUTPUTS[self.output]
+        self.inputs, self.outputs = ["observation"], [self.result]
         low, high = np.array(vehicle.thrust_range) / (1.0 if self.output == "thrusts" else vehicle.thrust_coefficient)
         buffers = {"mean": reference.mean, "inverse_std": 1.0 / reference.std}
         buffers |= {"middle": (high + low) / 2, "half_range": (high - low) / 2}
@@ -53,7 +56,10 @@ class Network(th.nn.Module):
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
         """Rotor thrusts or speeds, (batch, 4), of observations, (batch, 18)."""
-        action = self.layers((observation - self.mean) * self.inverse_std).clamp(-1.0, 1.0)
+        return self.command(self.layers((observation - self.mean) * self.inverse_std).clamp(-1.0, 1.0))
+
+    def command(self, action: th.Tensor) -> th.Tensor:
+        """Rotor thrusts or speeds, (batch, 4), of actions."""
         value: th.Tensor = self.middle + self.half_range * action
         # Rounding may leave a rotor that can stand still a hair below zero.
         return value if self.output == "thrusts" else value.relu().sqrt()
@@ -77,8 +83,8 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     policy: Any = reference.model.policy
     check_policy(policy, where)
     seen, done = reference.model.observation_space, reference.model.action_space
-    if seen.shape != OBSERVATIONS.shape:
-        raise ConfigError(f"{where}: its observations are {seen}, the quadcopter's are of shape {OBSERVATIONS.shape}")
+    if seen.shape != (reference.memory.size,):
+        raise ConfigError(f"{where}: its observations are {seen}, by its settings of shape ({reference.memory.size},)")
     if done != ACTIONS:
         raise ConfigError(f"{where}: its actions are {done}, the quadcopter's are {ACTIONS}")
     # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
@@ -106,7 +112,7 @@ def check_policy(policy: Any, where: str) -> None:
 def write_torchscript(network: Network, metadata: Mapping[str, str]) -> bytes:
     """What ``torch.jit.load`` reads, in Python and in C++, with ``metadata`` as the extra file ``metadata.json``."""
     buffer = io.BytesIO()
-    traced = th.jit.trace(network, EXAMPLE)  # type: ignore[no-untyped-call]
+    traced = th.jit.trace(network, network.examples)  # type: ignore[no-untyped-call]
     th.jit.save(traced, buffer, _extra_files={"metadata.json": json.dumps(dict(metadata))})
     return buffer.getvalue()
 
@@ -114,16 +120,17 @@ def write_torchscript(network: Network, metadata: Mapping[str, str]) -> bytes:
 def write_onnx(network: Network, metadata: Mapping[str, str]) -> bytes:
     """The model: ``observation`` float32 (batch, 18) to ``thrust`` or ``rotor_speed``, float32 (batch, 4).
 
+    With a memory also ``state`` to ``next_state``, float32 (batch, state_size).
+
     :param metadata: stored as the model's ``metadata_props``.
     :raises ConfigError: onnx is not installed.
     """
     onnx = require("onnx", "export", "--format onnx")
     buffer: Any = io.BytesIO()
-    names = ["observation", network.result]
-    batch = {name: {0: "batch"} for name in names}
-    ports: dict[str, Any] = {"input_names": names[:1], "output_names": names[1:], "dynamic_axes": batch}
+    batch = {name: {0: "batch"} for name in (*network.inputs, *network.outputs)}
+    ports: dict[str, Any] = {"input_names": network.inputs, "output_names": network.outputs, "dynamic_axes": batch}
     # Any ONNX runtime since 2020 reads opset 13. The newer exporter (dynamo) needs onnxscript, and writes opset 18 or later.
-    th.onnx.export(network, (EXAMPLE,), buffer, opset_version=13, dynamo=False, **ports)
+    th.onnx.export(network, network.examples, buffer, opset_version=13, dynamo=False, **ports)
     model = onnx.load_from_string(buffer.getvalue())
     model.producer_name = "sb3_quad"
     onnx.helper.set_model_props(model, dict(metadata))

@@ -18,6 +18,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.export import check
 from sb3_quad.export.c_header import c_name, write_header
+from sb3_quad.export.memory import RememberingNetwork
 from sb3_quad.export.network import Network, build_network, check_policy, write_onnx, write_torchscript
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import QuadcopterBatch
@@ -50,14 +51,15 @@ def export_policy(
     """The policy of an on-policy SB3 zip (PPO, A2C, DAgger, PPOBC; ``MlpPolicy``) as a file that flies by itself.
 
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
-    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Vehicle and scaling that are not given are those
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. What else the policy sees, the file keeps in a state,
+    see ``metadata["state"]``. Vehicle and scaling that are not given are those
     that :meth:`FlightSettings.of` finds in or beside the zip, or else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
     :param observation_mean: μ of Eq. 3.16, (18,); ``observation_std`` σ, likewise.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
-    :param n_observations: of the check; even.
+    :param n_observations: of the check; even; of a policy with a memory, whole flights of ``check.FLIGHT_STEPS``.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are not the quadcopter's or
         whose policy is no ``MlpPolicy``; a package or a C compiler that is not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
@@ -77,16 +79,22 @@ def export_policy(
     changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
     row = QuadcopterBatch(1, **dict(settings), n_threads=1)  # it checks them
-    reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output)
+    reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.memory)
     network = build_network(reference, f"model {path}")
+    if reference.memory.is_needed:
+        network = RememberingNetwork(network.layers, reference)
     metadata = _describe(Path(path), algorithm, network, reference)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         call, by = load(write(network, metadata))
-        observations = reference.sample_observations(n_observations)
-        error = reference.largest_error(observations, call(observations), by)
-        metadata["check"] = f"largest error {error:.2g} {network.unit} in {len(observations)} observations ({by})"
+        if reference.memory.is_needed:
+            observations, error, extent = reference.fly(call, n_observations, by)
+        else:
+            observations = reference.sample_observations(n_observations)
+            error = reference.largest_error(reference.actions(observations), call(observations), by)
+            extent = f"{len(observations)} observations"
+        metadata["check"] = f"largest error {error:.2g} {network.unit} in {extent} ({by})"
         content = write(network, metadata)
     time = check.time_calls(call, observations, at_once=file_format == "c")
     return Export(content, metadata, error, network.unit, time, source)
@@ -97,7 +105,7 @@ def _describe(path: Path, algorithm: str, network: Network, reference: check.Ref
     vehicle = reference.vehicle
     low, high = reference.results([-1.0, 1.0])
     rotors = enumerate(zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True))
-    sizes = [len(network.mean), *(layer.out_features for layer, _ in network.steps)]
+    sizes = [network.steps[0][0].in_features, *(layer.out_features for layer, _ in network.steps)]
     hidden = ", ".join(activation for _, activation in network.steps[:-1]) or "none"
     n_parameters = sum(parameter.numel() for parameter in network.parameters())
     return {
@@ -108,6 +116,7 @@ def _describe(path: Path, algorithm: str, network: Network, reference: check.Ref
         "observation": "18 numbers, not scaled: 0-2 position minus target position, world frame, m; "
         "3-11 rotation matrix world to body (v_body = R v_world), row by row; "
         "12-14 linear velocity, body frame, m/s; 15-17 body rates, body frame, rad/s",
+        **network.facts,
         "result": f"4 numbers: the {network.output.removesuffix('s')} to command of each rotor, {network.unit}, "
         f"within {low:.6g} to {high:.6g}",
         "rotors": "; ".join(f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {sign:+d}"[:-1] for k, ((x, y), sign) in rotors),

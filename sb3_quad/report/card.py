@@ -9,6 +9,7 @@ from sb3_quad.evaluation.metric_tables import LARGEST, MEDIAN, REWARD, SUCCESS, 
 from sb3_quad.evaluation.records import Metrics
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
+from sb3_quad.simulation.memory import Memory
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 DISTANCES = (10.0, 15.0, 20.0)  # m
@@ -18,7 +19,7 @@ CARD = """# {name}
 
 A policy for the vehicle `{vehicle}`: it recovers from random attitudes, velocities and body rates, and flies
 to targets. It reads the 18 features of `sb3_quad`'s environments, scaled as there, and gives four actions in
-[-1, 1], the thrusts of the rotors.
+[-1, 1], the thrusts of the rotors.{memory}
 
 ## Measured
 
@@ -77,8 +78,11 @@ def write_card(
             cells[NEAR] = Cell(words="–")
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))
     columns = [Column(row.heading) for row in SHOWN]
+    remembered = Memory.model_validate({key: settings[key] for key in Memory.model_fields if key in settings})
+    kept = ", ".join(f"{key}={value!r}" for key, value in remembered.model_dump(exclude_defaults=True).items())
     return CARD.format(
         name=name,
+        memory=f" It also reads what they were before, as these `env_kwargs` say:\n`{kept}`." if kept else "",
         vehicle=settings["vehicle"],
         noise=100 * settings["noise"],
         recoveries=measured[RECOVERY].n,

@@ -1,9 +1,8 @@
-"""The plots of a report, drawn by matplotlib: bars, lines and heat maps of a scenario's results."""
+"""The plots of a report, drawn by matplotlib: how they look, and the bars and lines of a scenario's results."""
 
 import io
-import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Literal, NamedTuple
@@ -15,8 +14,7 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
-from sb3_quad.evaluation.records import Entry, Estimate, Metrics, Results
-from sb3_quad.scenarios.load import UNITS, axis_label, axis_name
+from sb3_quad.evaluation.records import Entry, Estimate
 from sb3_quad.scenarios.scenario import Scenario
 
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
@@ -43,7 +41,6 @@ STYLE: Any = {
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), QUIET),
 }
 styled = matplotlib.rc_context(STYLE)
-Cells = list[tuple[Scenario, Metrics]]  # those of a varied scenario that one controller has flown
 METADATA = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # left out: the same results give the same file
 
 
@@ -81,6 +78,11 @@ class Plot:
         return picture(self.figure, "png", bbox_inches="tight", dpi=DPI)
 
     @property
+    def is_narrow(self) -> bool:
+        """Whether two of its kind stand side by side in the page."""
+        return self.space is None and self.figure.get_figwidth() <= WIDTH
+
+    @property
     def inline(self) -> str:
         """The plot as a part of the page: an ``svg`` element in the page's colours, which may be dark."""
         text = self.svg.decode("utf-8")
@@ -100,9 +102,9 @@ def picture(figure: Figure, kind: str, **options: Any) -> bytes:
 
 
 def legend(figure: Figure, axes: Any, first: Sequence[str] = (), side: Literal["upper", "lower"] = "upper") -> None:
-    """Every name once outside of all axes, those of ``first`` before others, in as many columns as the figure is wide."""
-    handles, names = axes.get_legend_handles_labels()
-    found = dict(zip(names, handles, strict=True))
+    """Every name of ``axes``, one or several, once outside, those of ``first`` first, in as many columns as have room."""
+    pairs = [zip(*each.get_legend_handles_labels(), strict=True) for each in np.ravel(axes)]
+    found = {name: handle for pair in pairs for handle, name in pair}
     order = sorted(found, key=lambda name: name not in first)
     place: Any = f"outside {side} left"
     for columns in range(len(order), 0, -1):
@@ -112,14 +114,15 @@ def legend(figure: Figure, axes: Any, first: Sequence[str] = (), side: Literal["
         made.remove()
 
 
-def _axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
+def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:
+    """A figure as wide as one of two side by side, and its axes."""
     figure = Figure(figsize=(WIDTH, HEIGHT), layout="constrained")
     axes = figure.subplots()
     axes.set(xlabel=x_label, ylabel=y_label)
     return figure, axes
 
 
-def _ends(estimates: Sequence[Estimate | None], factor: float = 1.0) -> FloatArray:
+def interval_ends(estimates: Sequence[Estimate | None], factor: float = 1.0) -> FloatArray:
     """Values and both ends of their intervals, (3, n); NaN where there is none."""
     rows = [[each and getattr(each, name) for each in estimates] for name in ("value", "low", "high")]
     return factor * np.array(rows, dtype=np.float64)
@@ -137,11 +140,11 @@ def arrivals_plot(scenario: Scenario, flown: Sequence[Flown], source: str) -> Pl
 
     :param source: where the reference metrics come from.
     """
-    figure, axes = _axes("tolerance (m)", "time (s)")
+    figure, axes = new_axes("tolerance (m)", "time (s)")
     places, width = np.arange(len(scenario.tolerances)), 0.75 / len(flown)
     for number, each in enumerate(flown):
         arrivals = each.entry.metrics.arrivals
-        value, low, high = _ends([arrival.time for arrival in arrivals])
+        value, low, high = interval_ends([arrival.time for arrival in arrivals])
         spread, middle = np.stack([value - low, high - value]), places + (number - 0.5 * (len(flown) - 1)) * width
         bars = {"ecolor": INK, "elinewidth": 0.9, "capsize": 2}
         axes.bar(middle, value, 0.92 * width, color=each.colour, label=each.label, yerr=spread, error_kw=bars)
@@ -168,7 +171,7 @@ def arrivals_plot(scenario: Scenario, flown: Sequence[Flown], source: str) -> Pl
 @styled
 def errors_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
     """Distances from the target over time, of controllers with sampled flights."""
-    figure, axes = _axes("time (s)", "distance from target (m)")
+    figure, axes = new_axes("time (s)", "distance from target (m)")
     for each in flown:
         x, ends = _quantiles(each.tracks)
         if scenario.is_fixed:
@@ -206,12 +209,12 @@ def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
 @styled
 def hits_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
     """Shares of flights that survive, over the size of force and torque."""
-    figure, axes = _axes("factor of force and torque", "survived (%)")
+    figure, axes = new_axes("factor of force and torque", "survived (%)")
     for each in flown:
         if each.entry.hit_limit is not None:
             trials = sorted(each.entry.hit_limit.trials, key=lambda trial: trial.factor)
             factors = np.array([trial.factor for trial in trials])
-            ends = _ends([trial.survived for trial in trials], 100.0)
+            ends = interval_ends([trial.survived for trial in trials], 100.0)
             first = 1 + next((k for k, share in enumerate(ends[0]) if share <= 50.0), len(factors))
             band(axes, each.colour, each.label, factors[:first], ends[:, :first], **POINTS)
             axes.plot(factors[first:], ends[0, first:], color=each.colour, **POINTS, linestyle="none", markerfacecolor=PAPER)
@@ -224,81 +227,3 @@ def hits_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
         "that at most half survive. Open circles: greater factors, of which a few may be survived again."
     )
     return Plot(f"{scenario.name}_limit", caption, figure)
-
-
-@styled
-def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mapping[str, str]) -> list[Plot]:
-    """The plots of the cells that ``vary`` makes of a scenario: curves over one quantity, or bars in each cell of several.
-
-    :param colours: by the labels of the controllers.
-    """
-    flown: dict[str, Cells] = {}
-    for label, scenario in itertools.product(colours, scenarios):
-        entry = results.entry(label, scenario.name)
-        if entry is not None:
-            flown.setdefault(label, []).append((scenario, entry.metrics))
-    if not flown:
-        return []
-    return _sweep(scenarios[0], flown, colours) if len(scenarios[0].cell) == 1 else [_losses(scenarios, flown, colours)]
-
-
-def _sweep(first: Scenario, flown: Mapping[str, Cells], colours: Mapping[str, str]) -> list[Plot]:
-    (key,) = first.cell
-    success, shares = _axes(axis_label(key, first), "success (%)")
-    error, distances = _axes(axis_label(key, first), "final distance (m)")
-    for label, cells in flown.items():
-        x = np.array([scenario.cell[key] for scenario, _ in cells])
-        successes = [metrics.success or metrics.survival for _, metrics in cells]
-        band(shares, colours[label], label, x, _ends(successes, 100.0), **POINTS)
-        medians = np.array([metrics.final_error_median for _, metrics in cells], dtype=np.float64)
-        distances.plot(x, medians, color=colours[label], label=label, **POINTS)
-    shares.set_ylim(-3.0, 103.0)
-    distances.set_ylim(bottom=0.0)
-    legend(success, shares)
-    legend(error, distances)
-    success_plot = Plot(f"{first.group}_success", "Success, with 95 % intervals.", success)
-    return [success_plot, Plot(f"{first.group}_error", "Median of the final error of flights that were not lost.", error)]
-
-
-def _losses(scenarios: Sequence[Scenario], flown: Mapping[str, Cells], colours: Mapping[str, str]) -> Plot:
-    """What each controller loses, side by side in each cell of the first two keys; a panel for each value of the others."""
-    keys = list(scenarios[0].cell)
-    x_values, y_values = (sorted({scenario.cell[key] for scenario in scenarios}) for key in keys[:2])
-    columns = list(dict.fromkeys(_rest(scenario) for scenario in scenarios))
-    size = WIDTH, 0.7 + len(columns) * (0.3 + 0.36 * len(y_values))
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(len(columns), sharex=True, squeeze=False)[:, 0]
-    width = 0.84 / len(flown)
-    for axes, column in zip(panels, columns, strict=True):
-        for number, (label, cells) in enumerate(flown.items()):
-            lost = {
-                (x_values.index(scenario.cell[keys[0]]), y_values.index(scenario.cell[keys[1]])): 1.0 - metrics.survival.value
-                for scenario, metrics in cells
-                if _rest(scenario) == column
-            }
-            x, y = np.array([*lost]).T
-            middle, heights = x + (number - 0.5 * (len(flown) - 1)) * width, 0.7 * np.sqrt([*lost.values()])
-            axes.bar(middle, heights, 0.92 * width, bottom=y, color=colours[label], label=label)
-            for at, top, share in zip(middle, y + heights, lost.values(), strict=True):
-                if share > 0.0:
-                    axes.text(at, top + 0.02, f"{100 * share:.0f}", ha="center", va="bottom", fontsize=6)
-        axes.set_title(column, loc="left")
-        axes.set(xlim=(-0.5, len(x_values) - 0.5), ylim=(0.0, len(y_values)), ylabel=axis_label(keys[1], scenarios[0]))
-        axes.set_xticks(np.arange(len(x_values) - 1) + 0.5, minor=True)
-        axes.set_xticks(np.arange(len(x_values)), [f"{value:g}" for value in x_values])
-        axes.set_yticks(np.arange(len(y_values)), [f"{value:g}" for value in y_values], va="bottom")
-        axes.tick_params(which="both", length=0)
-        axes.grid(axis="x", visible=False)
-        axes.grid(axis="x", which="minor")
-    panels[-1].set_xlabel(axis_label(keys[0], scenarios[0]))
-    legend(figure, panels[0])
-    names = ", ".join(axis_name(key).replace("_", " ") for key in keys)
-    caption = f"Flights lost, in %, over {names}; no bar: none. The bars' heights grow with the square root."
-    return Plot(f"{scenarios[0].group}_success", caption, figure)
-
-
-def _rest(scenario: Scenario) -> str:
-    """The values of all but the first two keys of a cell, with their units."""
-    names = {key: axis_name(key) for key in list(scenario.cell)[2:]}
-    parts = (f"{name} {scenario.cell[key]:g} {UNITS.get(name, '')}" for key, name in names.items())
-    return ", ".join(part.replace("_", " ").strip() for part in parts)

@@ -18,7 +18,8 @@ from sb3_quad.evaluation.metric_tables import (
 from sb3_quad.evaluation.records import Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
-from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, group_plots, hits_plot
+from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, hits_plot
+from sb3_quad.report.varied import families_plot, group_plots
 from sb3_quad.scenarios.load import axis_label
 from sb3_quad.scenarios.scenario import Scenario
 
@@ -48,7 +49,8 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     colours = colours_of([record.label for record in results.controllers])
     groups = scenario_groups(results)
     shares = [_share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)]
-    parts = [Section("overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows])]
+    tables, families = [table for table in shares if table.rows], families_plot(results, groups, colours)
+    parts = [Section("overview", "Success and survival", OVERVIEW, tables, families)]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:

@@ -23,6 +23,7 @@ UNITS = dict(
     **dict.fromkeys(("mass", "inertia", "motor_gain"), "× the vehicle's own"),
     delay="control steps",
     noise="relative std",
+    gusts="std, N",
     duration="s",
 )
 WEIGHTS = {"force": "weights", "torque": "weights × arm length"}  # units of wrenches whose unit is weight

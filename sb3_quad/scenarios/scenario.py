@@ -7,12 +7,22 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Field, PositiveFloat, PositiveInt, ValidationError, field_validator, model_validator
+from pydantic import (
+    Field,
+    PositiveFloat,
+    PositiveInt,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
+from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 
@@ -73,6 +83,9 @@ class Scenario(Frozen):
         default=None, description="name, or path of a YAML file (relative to the suite's); left out: the agent's own, or itm"
     )
     vehicle_changes: VehicleChanges = Field(default=VehicleChanges(), description="unknown to the controller")
+    randomize: Randomization | None = Field(
+        default=None, description="what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"
+    )
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(default=240, description="how many are flown")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=0, description="from which every episode gets its own")
     tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m")
@@ -90,6 +103,10 @@ class Scenario(Frozen):
     def _possible(self) -> "Scenario":
         vehicle = self.flown_vehicle()
         self._check_way(vehicle)
+        if self.randomize is not None:
+            self.randomize.check(vehicle)
+            if self.randomize.sets_wrench and self.wrenches:
+                raise ValueError("randomize: force and torque do not go with wrenches, which replace them")
         step = vehicle.control_step
         if self.duration < step:
             raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
@@ -175,8 +192,13 @@ class Scenario(Frozen):
         """Whether every episode has the same start, target and wrenches, so that only noise tells them apart."""
         vectors = [self.start.velocity, self.start.body_rates]
         vectors += [vector for wrench in self.wrenches for vector in (wrench.force, wrench.torque)]
-        random = self.start.attitude.distribution or self.start.attitude.tilt or self.target.distance
+        random = self.start.attitude.distribution or self.start.attitude.tilt or self.target.distance or self.randomize
         return not random and all(vector.value is not None or vector.largest == 0.0 for vector in vectors)
+
+    @model_serializer(mode="wrap")
+    def _default_left_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """``randomize`` is younger than results and their hashes."""
+        return {key: value for key, value in handler(self).items() if (key, value) != ("randomize", None)}
 
     def _check_way(self, vehicle: Vehicle) -> None:
         """See that start and targets lie above ground, within ``max_distance`` of each other and within reach."""

@@ -24,7 +24,7 @@ from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
 SETTINGS = YamlFolder(
-    "settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("pid", "thesis"), former="geometric/"
+    "settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("pid", "robust", "thesis"), former="geometric/"
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
@@ -223,6 +223,8 @@ def build_config(
 def with_vehicle_path(value: Any) -> Any:
     """``env_kwargs`` whose vehicle file, if they name one, can be found from any folder: runs are flown and resumed later."""
     vehicle = value.get("vehicle") if isinstance(value, dict) else None
+    if isinstance(vehicle, (list, tuple)):
+        return {**value, "vehicle": [with_vehicle_path({"vehicle": each})["vehicle"] for each in vehicle]}
     if not isinstance(vehicle, (str, Path)) or not VEHICLES.is_path(vehicle):
         return value
     return {**value, "vehicle": str(Path(vehicle).absolute())}

@@ -7,26 +7,31 @@ import numpy as np
 from pydantic import Field, PositiveInt
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import parse_mapping_file
 from sb3_quad.envs.registration import ENVIRONMENTS, MAX_EPISODE_STEPS
 from sb3_quad.experts.models import saved_data
 from sb3_quad.settings.literals import ZooLoader, parse_mapping
+from sb3_quad.simulation.memory import Memory
+from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
 
 
-class FlightSettings(Frozen):
+class FlightSettings(Memory):
     """What an agent is flown with: keywords of the quadcopter environments, ``env_kwargs`` in YAML; ``dict`` gives them."""
 
     task: Any = Field(default="target_tracking", description="name, Task, or mixture {name: weight}")
     task_kwargs: dict[str, Any] | None = Field(default=None, description="fields of the task to override")
-    vehicle: Any = Field(default="itm", description="name, path or Vehicle")
+    vehicle: Any = Field(
+        default="itm", description="name, path or Vehicle; or a list, of which row i flies number i, counted round"
+    )
     noise: float = Field(default=0.05, ge=0, description="relative standard deviation of the observation noise")
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
     observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
+    randomize: Randomization | None = Field(default=None, description="fields of Randomization: what differs by episode")
     max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, lt=2**62, description="control steps of an episode")
 
     def given(self) -> dict[str, Any]:
@@ -34,10 +39,15 @@ class FlightSettings(Frozen):
         return {name: value for name, value in self if name in self.model_fields_set}
 
     def in_any_task(self) -> dict[str, Any]:
-        """Of these, what an agent must be flown with in any task: vehicle, noise and scaling."""
-        return {
-            name: value for name, value in self.given().items() if name not in ("task", "task_kwargs", "max_episode_steps")
-        }
+        """Of these, what an agent must be flown with in any task: vehicle, noise, and what it sees."""
+        others = ("task", "task_kwargs", "max_episode_steps", "randomize")
+        return {name: value for name, value in self.given().items() if name not in others}
+
+    @property
+    def observed(self) -> dict[str, Any]:
+        """What goes with an agent wherever it flies: how its observations are scaled, and what it remembers."""
+        scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
+        return {**scaling, **self.model_dump(mode="json", include=set(Memory.model_fields))}
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed.
@@ -46,16 +56,29 @@ class FlightSettings(Frozen):
         """
         return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
+    @property
+    def first_vehicle(self) -> Vehicle:
+        """The vehicle; of a list the first.
+
+        :raises ConfigError: it cannot be loaded.
+        """
+        several = isinstance(self.vehicle, (list, tuple))
+        if several and not self.vehicle:
+            raise ConfigError("vehicle []: give at least one")
+        return load_vehicle(self.vehicle[0] if several else self.vehicle)
+
     def write_into(self, model: Any) -> None:
         """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with the vehicle's parameters.
 
         Its zips hold them from then on, and ``load`` of Stable-Baselines3 carries them along, also without this package.
 
+        Of several vehicles it is the first.
+
         :raises ConfigError: a vehicle that cannot be loaded.
         """
         scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
         lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
-        setattr(model, KEY, self.with_changes(vehicle=load_vehicle(self.vehicle), **lists).model_dump(mode="json"))
+        setattr(model, KEY, self.with_changes(vehicle=self.first_vehicle, **lists).model_dump(mode="json"))
 
     @staticmethod
     def of(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:

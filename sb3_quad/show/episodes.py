@@ -147,8 +147,8 @@ def fly_all(
         together: list[Recording] = []
         for name, controller in controllers.items():
             sampling = hasattr(controller, "predict") and not deterministic
-            flown = observation_function(controller, deterministic=False) if sampling else controller
             for each in range(seed, seed + n_envs):
+                flown = observation_function(controller, deterministic=False) if sampling else controller
                 label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
                 try:
                     its = settings.with_changes(**setting.own.get(name, {}))

@@ -6,20 +6,28 @@ from typing import Any, TypeAlias, TypedDict
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
+from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run
+from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
-from sb3_quad.simulation.state import STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
+from sb3_quad.simulation.randomization import resolve_randomization
+from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
+from sb3_quad.simulation.worlds import new_worlds
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 MAX_ROWS = 2**20
-_MEMORY = ("state", "queue", "wrench", "streams", "task_index", "returns", "limits")  # all that future flight depends on
+COLUMNS = {"vehicle": "vehicles", "nominal": "nominal", "world": "worlds", "gust": "gust", "scaling": "mean"}
+_MEMORY = (  # all that future flight depends on
+    *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
+    *("vehicles", "gust", "frames", "integral"),
+)
 
 
 class BatchKeywords(TypedDict, total=False):
@@ -29,6 +37,10 @@ class BatchKeywords(TypedDict, total=False):
     noise: Any
     observation_mean: Any
     observation_std: Any
+    last_action: bool
+    history: Any
+    position_integral: Any
+    randomize: Any
     max_episode_steps: int
     seed: int | None
     n_threads: int | None
@@ -40,11 +52,16 @@ class QuadcopterBatch:
     :param n_envs: number of rows, from 1 to 2^20.
     :param task: name, :class:`~sb3_quad.simulation.tasks.Task`, or mixture ``{name: weight}`` sampled from at each reset.
     :param task_kwargs: fields of the task to override.
-    :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of ``n_envs`` of them whose time
-        steps and delays agree.
+    :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of them whose time steps agree:
+        row i has number i, counted round.
     :param noise: relative standard deviation of the observation noise, shape () or (n_envs,).
     :param observation_mean: μ of Eq. 3.16, shape (18,) or (n_envs, 18); None: zero.
     :param observation_std: σ of Eq. 3.16, likewise; None: Table A.2.
+    :param last_action: whether a policy sees its last action; ``history``, of which age the frames are that it sees;
+        ``position_integral``, whether it sees that: see :class:`~sb3_quad.simulation.memory.Memory`. An observation then has
+        ``memory.size`` numbers, which is 18 by default.
+    :param randomize: None, a :class:`~sb3_quad.simulation.randomization.Randomization` or its fields: what is random in each
+        episode.
     :param max_episode_steps: control steps after which an episode is truncated.
     :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the operating system's entropy.
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
@@ -64,6 +81,10 @@ class QuadcopterBatch:
         noise: Any = 0.05,
         observation_mean: Any = None,
         observation_std: Any = None,
+        last_action: bool = False,
+        history: Sequence[int] | None = None,
+        position_integral: Any = None,
+        randomize: Any = None,
         max_episode_steps: int = 1500,
         seed: int | None = None,
         n_threads: int | None = None,
@@ -74,14 +95,22 @@ class QuadcopterBatch:
         self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads)
         self.autoreset = autoreset
         one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
-        self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle] * n, n)
+        self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle], n)
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
-        self.vehicles = np.stack([each.parameters() for each in columns], axis=1)
+        self.nominal = np.stack([each.parameters() for each in columns], axis=1)
+        self.randomize = resolve_randomization(randomize)
+        self.memory = resolve_memory(last_action=last_action, history=history, position_integral=position_integral)
+        self.vehicles, self.worlds, self.gust = new_worlds(self.randomize, columns, n)
+        self.frames = new_frames(self.memory, n)
+        self.ages = np.array(self.memory.ages, dtype=np.int64)
+        integral = self.memory.position_integral
+        self.integral = np.zeros((0 if integral is None else 3, n))
+        self.integral_numbers = np.array((integral or PositionIntegral()).numbers(columns[0].control_step))
         self.tasks = resolve_tasks(task, task_kwargs)
         self.task, self.task_kwargs = task, dict(task_kwargs or {})
         self.task_index = np.zeros(n, dtype=np.int64)
         self.state = np.zeros((STATE_SIZE, n))
-        self.queue = np.zeros((self.vehicle_list[0].delay, 4, n))
+        self.queue = np.zeros((max(self.randomize.longest_delay, *(each.delay for each in columns), 0), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         # One column serves all rows until rows are set apart.
@@ -91,6 +120,7 @@ class QuadcopterBatch:
         self.returns = np.zeros(n)
         self.limits = np.full(n, self.max_episode_steps, dtype=np.int64)  # control steps of the present episodes, at most
         self.outcome = np.zeros(n, dtype=OUTCOME)
+        self.last_observations = np.zeros((n, self.memory.size), dtype=np.float32)
         self.lock = batch_lock()  # held while compiled code reads and writes the arrays, and while some are replaced
         self._bind()
         self.set_noise(noise)
@@ -104,7 +134,7 @@ class QuadcopterBatch:
         self.streams[:, self.rows(rows)] = new_streams(seeds)
 
     def reset(self, rows: Rows = None) -> Float32Array:
-        """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, 18)."""
+        """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, memory.size)."""
         return self._run(LOOK, self.rows(rows)).observations
 
     def stagger(self) -> None:
@@ -112,29 +142,35 @@ class QuadcopterBatch:
         self.limits[:] = self.max_episode_steps - np.arange(self.n) * self.max_episode_steps // self.n
 
     def observe(self) -> Float32Array:
-        """The present observations, float32 (n, 18); the same numbers until the next step."""
+        """The present observations, float32 (n, memory.size); the same numbers until the next step."""
         return self._run(LOOK).observations
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         """One control step of every row.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: observations float32 (n, 18), rewards float32 (n,), done bool (n,): fresh arrays. Of rows that are done,
-            ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, success, observation)
-            tells how the episode ended, until the row's next one ends; without autoreset it is of every row's last step.
+        :return: observations float32 (n, memory.size), rewards float32 (n,), done bool (n,): fresh arrays. Of rows that are
+            done, ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, success) and
+            ``last_observations`` tell how the episode ended, until the row's next one ends; without autoreset they are of
+            every row's last step.
         """
+        return self._move(FLY, actions)
+
+    def score(self, actions: npt.NDArray[Any] | None = None) -> tuple[Float32Array, Float32Array, BoolArray]:
+        """As :meth:`step`, of a control step that another simulator has flown and written into ``state``.
+
+        :param actions: for those that a policy is to see; None: zeros.
+        """
+        return self._move(SCORE, np.zeros((self.n, 4), np.float32) if actions is None else actions)
+
+    def _move(self, mode: int, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
-        arrays = step_arrays(self.n, array)
-        if not self._do(FLY, arrays):
+        arrays = step_arrays(self.n, self.memory.size, array)
+        if not self._do(mode, arrays):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
-        return arrays.observations, arrays.rewards, arrays.dones
-
-    def score(self) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """As :meth:`step`, of a control step that another simulator has flown and written into ``state``."""
-        arrays = self._run(SCORE)
         return arrays.observations, arrays.rewards, arrays.dones
 
     def clear_outcome(self, rows: Rows = None) -> None:
@@ -145,7 +181,7 @@ class QuadcopterBatch:
         self.outcome["distance"][chosen] = QuadcopterState(self.state[:, chosen]).distance
 
     def _run(self, mode: int, resetting: IntArray | None = None) -> StepArrays:
-        arrays = step_arrays(self.n)
+        arrays = step_arrays(self.n, self.memory.size)
         if resetting is not None:
             arrays.dones[resetting] = True
         self._do(mode, arrays)
@@ -166,8 +202,16 @@ class QuadcopterBatch:
             raise ConfigError(f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}") from None
 
     def true_state(self) -> QuadcopterState:
-        """The true state of all rows, a live view."""
-        return QuadcopterState(self.state)
+        """The true state of all rows, a live view but for the gusts."""
+        return QuadcopterState(self.state, self.vehicles, self.total_wrench())
+
+    def total_wrench(self) -> FloatArray:
+        """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and gusts."""
+        if self.randomize.gusts is None:
+            return self.wrench
+        total = self.wrench.copy()
+        total[FORCE_WORLD] += self.gust[:3]
+        return total
 
     def snapshot(self) -> Arrays:
         """Copies of all that future flight depends on, by name."""
@@ -278,13 +322,20 @@ class QuadcopterBatch:
             bound = {name: bound[name] if name in bound else values[name] for name in ARRAYS}
             sizes = {
                 "n": self.n,
-                "delay": first.delay,
+                "delay": len(self.queue),
                 "substeps": first.substeps,
                 "physics_step": first.physics_step,
                 "max_steps": values["max_episode_steps"],
                 "tasks": table.weights.size,
-                "vehicle_columns": values["vehicles"].shape[1],
-                "scaling_columns": values["mean"].shape[1],
+                **{f"{name}_columns": values[array].shape[1] for name, array in COLUMNS.items()},
+                "gusts": self.randomize.gusts is not None,
+                "sets_vehicle": self.randomize.sets_vehicle,
+                "sets_wrench": self.randomize.sets_wrench,
+                "mixed_delays": self.randomize.delay is not None or bool((self.nominal[P.delay] != len(self.queue)).any()),
+                "width": self.memory.size,
+                **dict(zip(("depth", "frame"), self.frames.shape[1:], strict=True)),
+                "ages": self.ages.size,
+                "integrals": len(self.integral),
                 "autoreset": self.autoreset,
             }
             vars(self).update(replaced, _bound=bound, _sizes=sizes, _jobs=new_jobs(bound, sizes))

@@ -80,16 +80,16 @@ def whole_number(name: str, value: Any, least: int = 1, most: int | None = None,
 
 
 def row_vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
-    """The vehicles of n rows, whose time steps and delays must agree."""
-    if len(given) != n:
-        raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give one, or one for each")
+    """The vehicles of n rows, given round, whose time steps must agree."""
+    if not 0 < len(given) <= n:
+        raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give from one to as many")
     loaded = {key: load_vehicle(each) for key, each in {id(each): each for each in given}.items()}  # each file once
     vehicles = [loaded[id(each)] for each in given]
     first = vehicles[0]
     for row, each in enumerate(vehicles):
-        if (each.delay, each.physics_step, each.substeps) != (first.delay, first.physics_step, first.substeps):
-            raise ConfigError(f"vehicle of row {row}: delay, physics_step and control_step must be those of row 0")
-    return vehicles
+        if (each.physics_step, each.substeps) != (first.physics_step, first.substeps):
+            raise ConfigError(f"vehicle of row {row}: physics_step and control_step must be those of row 0")
+    return [vehicles[row % len(vehicles)] for row in range(n)]
 
 
 def check_size(width: int, height: int) -> None:

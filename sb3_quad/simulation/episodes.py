@@ -12,8 +12,15 @@ TURN = 2.0 * math.pi
 
 
 @compiled
+def count_episode(i, streams):
+    """Row i's stream goes on to its next episode, in place."""
+    streams[EPISODE, i] += np.uint32(1)
+    streams[STEP, i] = np.uint32(0)
+
+
+@compiled
 def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights):
-    """Begin the next episode of row i, in place: its stream's next, with a task, state and target sampled from it.
+    """Begin the episode that row i's stream has come to, in place: a task, state and target sampled from it.
 
     Targets are never below ground.
 
@@ -25,8 +32,6 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     :param tasks: float64 (K, columns), :meth:`sb3_quad.simulation.tasks.Task.parameters` of each task.
     :param weights: float64 (K,), cumulative.
     """
-    streams[EPISODE, i] += np.uint32(1)
-    streams[STEP, i] = np.uint32(0)
     u = uniforms(streams, i, 7, EPISODE_START)
     choice, height, azimuth = u[0], u[1], TURN * u[2]
     k = 0
@@ -55,10 +60,11 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
         qw, qx, qy, qz = b * math.cos(beta), a * math.sin(alpha), a * math.cos(alpha), b * math.sin(beta)
     state[X.quaternion, i], state[X.quaternion + 1, i] = qw, qx
     state[X.quaternion + 2, i], state[X.quaternion + 3, i] = qy, qz
+    spin = math.hypot(tasks[k, T.body_rates_std], tasks[k, T.hit_rates_std])
     for axis in range(3):  # two normals from two uniforms (Box-Muller)
         radius, angle = math.sqrt(-2.0 * math.log(u[6 + 2 * axis])), TURN * u[7 + 2 * axis]
         state[X.velocity + axis, i] = tasks[k, T.velocity_std] * radius * math.cos(angle)
-        state[X.body_rates + axis, i] = tasks[k, T.body_rates_std] * radius * math.sin(angle)
+        state[X.body_rates + axis, i] = spin * radius * math.sin(angle)
     hover = math.sqrt(vehicles[P.hover_thrust, column] / vehicles[P.thrust_coefficient, column])
     for rotor in range(4):
         state[X.rotor_speeds + rotor, i] = hover

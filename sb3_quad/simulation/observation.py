@@ -80,12 +80,14 @@ def _disturb_and_scale(b):
 
 
 @compiled(inline="always")
-def observe(b):
+def observe(b, normals):
     """``b.feature``: the observations of a loaded block, each feature times (1 + level N(0, 1)), then scaled.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
+
+    :param normals: how many standard normals are needed, at least OBSERVATION_SIZE; ``b.noise`` has those for others behind.
     """
     features(b)
-    random_words(b)
-    standard_normals(b)
+    random_words(b, normals)
+    standard_normals(b, normals)
     _disturb_and_scale(b)

@@ -34,9 +34,14 @@ class QuadcopterState:
 
     :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The properties are views
         of it with one vehicle per row, so they show later changes: copy what must last.
+    :param vehicles: the true parameters of the vehicles, float64 ``(len(PARAMETER_NAMES), n)``, or of one column for all,
+        their rows in the order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None: unknown.
+    :param wrench: what pushes them, float64 ``(WRENCH_SIZE, n)``, its rows in the order of :data:`WRENCH`; None: unknown.
     """
 
     array: FloatArray
+    vehicles: FloatArray | None = None
+    wrench: FloatArray | None = None
 
     @property
     def n(self) -> int:
@@ -87,12 +92,28 @@ class QuadcopterState:
 
     def copy(self) -> "QuadcopterState":
         """A state of its own memory, unaffected by later flight."""
-        return QuadcopterState(self.array.copy())
+        vehicles, wrench = (each if each is None else each.copy() for each in (self.vehicles, self.wrench))
+        return QuadcopterState(self.array.copy(), vehicles, wrench)
+
+    def rows(self, rows: slice) -> "QuadcopterState":
+        """Some of the vehicles, views."""
+        vehicles = self.vehicles if self.vehicles is None or self.vehicles.shape[1] == 1 else self.vehicles[:, rows]
+        return QuadcopterState(self.array[:, rows], vehicles, None if self.wrench is None else self.wrench[:, rows])
 
     @staticmethod
     def concatenate(states: Sequence["QuadcopterState"]) -> "QuadcopterState":
         """Several states as one batch, in order."""
-        return QuadcopterState(np.concatenate([state.array for state in states], axis=1))
+
+        def joined(parts: list[FloatArray | None]) -> FloatArray | None:
+            known = [
+                np.broadcast_to(part, (len(part), state.n))
+                for part, state in zip(parts, states, strict=True)
+                if part is not None
+            ]
+            return np.concatenate(known, axis=1) if len(known) == len(states) else None
+
+        array = np.concatenate([state.array for state in states], axis=1)
+        return QuadcopterState(array, joined([each.vehicles for each in states]), joined([each.wrench for each in states]))
 
 
 def make_wrench(force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body") -> FloatArray:

@@ -33,6 +33,7 @@ class Task(Frozen):
     random_attitude: bool = Field(default=False, description="start attitude uniform on SO(3), else level")
     velocity_std: NonNegativeFloat = Field(default=0.0, description="standard deviation of v at the start, per axis, m/s")
     body_rates_std: NonNegativeFloat = Field(default=0.0, description="of the body rates at the start, per axis, rad/s")
+    hit_rates_std: NonNegativeFloat = Field(default=0.0, description="of what a hit adds to them, per axis, rad/s")
     max_distance: PositiveFloat = Field(default=30.0, description="farther from the target ends, m")
     success_distance: PositiveFloat = Field(default=0.1, description="a flight succeeds that ends this close to its target, m")
     success_tilt: PositiveFloat = Field(default=np.pi, description="and is tilted by no more than this, rad")
@@ -82,6 +83,15 @@ TASKS: Mapping[str, Task] = {
         random_attitude=True,
         velocity_std=2.0,
         body_rates_std=4.0,
+    ),
+    "after_hit": Task(  # on its way when something hits it
+        name="after_hit",
+        target_distance=25.0,
+        nearest_target=0.0,
+        random_attitude=True,
+        velocity_std=2.0,
+        body_rates_std=4.0,
+        hit_rates_std=25.0,
     ),
     "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
 }

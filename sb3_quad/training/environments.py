@@ -80,10 +80,13 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
             env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs})
         else:
             in_worker = config.vec_env == "subproc"
-            make = partial(_make_one, config.env_id, config.env_kwargs, config.env_wrapper, in_worker)
+            given = config.env_kwargs.get("vehicle")
+            vehicles = [{"vehicle": each} for each in given] if isinstance(given, (list, tuple)) else [{}]
+            keywords = [{**config.env_kwargs, **vehicles[row % len(vehicles)]} for row in range(n_envs)]
             rows = range(n_envs) if staggered else [0] * n_envs
+            make = partial(_make_one, config.env_id, config.env_wrapper, in_worker, n_envs)
             with _worker_errors():
-                env = (_Subproc if in_worker else _Dummy)([partial(make, row, n_envs) for row in rows])
+                env = (_Subproc if in_worker else _Dummy)([partial(make, *each) for each in zip(keywords, rows, strict=True)])
             env.seed(seed)
     except SB3QuadError:
         raise
@@ -95,7 +98,7 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
 
 
 def _make_one(
-    env_id: str, kwargs: dict[str, Any], wrappers: list[tuple[str, dict[str, Any]]], in_worker: bool, row: int, n_envs: int
+    env_id: str, wrappers: list[tuple[str, dict[str, Any]]], in_worker: bool, n_envs: int, kwargs: dict[str, Any], row: int
 ) -> gymnasium.Env[Any, Any]:
     if in_worker:
         ignore_interrupts()

@@ -22,7 +22,7 @@ PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], 
 PARAMETER_NAMES = (
     *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain", "gravity"),
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
-    *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius"),
+    *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
 )
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 OTHER_LIMITS = {
@@ -202,7 +202,7 @@ class Vehicle(Frozen):
         """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of ``PARAMETER_NAMES``."""
         low, high = self.thrust_range
         head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
-        tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius)
+        tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius, self.delay)
         return np.array([*head, *self.mixer[1:].ravel(), *tail], dtype=np.float64)
 
 

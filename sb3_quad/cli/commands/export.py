@@ -29,8 +29,9 @@ def run(options: argparse.Namespace) -> int:
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
     write_bytes(file, exported.content)
     print(f"settings: {exported.settings or 'neither in the zip nor beside it; assumed: itm, the scaling of Table A.2'}")
-    for key in ("vehicle", "scaling", "network", "observation", "result", "rotors", "check"):
-        print(f"{key}: {exported.metadata[key]}")
+    for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check"):
+        if key in exported.metadata:
+            print(f"{key}: {exported.metadata[key]}")
     print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
     print(f"saved {file} ({len(exported.content)} bytes)")
     return 0

@@ -13,16 +13,17 @@ from numba import carray
 from sb3_quad.simulation.engine.lowlevel import LANES, compiled, pointer
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH_SIZE
+from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE
 from sb3_quad.simulation.tasks import SCORED, TASK
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 X = first_rows(STATE)
 T = first_rows(TASK)
 P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
+W = first_rows(WRENCH)
 _SCORED = tuple(getattr(T, name) for name in SCORED)
-_WORDS = -(-OBSERVATION_SIZE // 4) * 4
-_NORMALS = -(-OBSERVATION_SIZE // 2) * 2
+NORMALS = OBSERVATION_SIZE + 3  # at most, in a control step: observation noise, then a gust
+_WORDS = -(-NORMALS // 4) * 4
 
 # Of every lane: the kind of numbers, and how many or of what shape.
 _CONTENTS: dict[str, tuple[str, Any]] = {
@@ -36,10 +37,12 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "push": ("f8", ()),  # dt / m
     "twist": ("f8", 3),  # dt / I
     "gyro": ("f8", 3),  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
-    "arm": ("f8", (3, 4)),  # moment per thrust, by axis and rotor
     "thrust_middle": ("f8", ()),  # divided by kF, as is the next
     "thrust_half_range": ("f8", ()),
     "radius": ("f8", ()),  # of the collision sphere
+    "arm": ("f8", (3, 4)),  # moment per thrust, by axis and rotor
+    "delay": ("f8", ()),  # control steps
+    "vehicle": ("f8", len(PARAMETER_NAMES)),  # room for those of one vehicle for all rows, or of a last block
     "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
     "reward": ("f8", ()),
     "distance": ("f8", ()),
@@ -47,7 +50,7 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
     "noise_level": ("f4", ()),
-    "noise": ("f4", _NORMALS),
+    "noise": ("f4", _WORDS),
     "feature": ("f4", OBSERVATION_SIZE),
     "word": ("u4", _WORDS),  # random
     "stream": ("u4", 4),
@@ -89,24 +92,32 @@ def store_state(b, state, first, count):
 @compiled
 def load_vehicles(b, vehicles, first, count, physics_step):
     """What the control step needs of the vehicles of a block, with the divisions done."""
-    last = vehicles.shape[1] - 1
-    dt = physics_step
+    if vehicles.shape[1] > 1 and count == LANES:
+        _prepare_vehicles(b, vehicles, first, physics_step)
+        return
+    for k in range(vehicles.shape[0]):
+        for lane in range(LANES):
+            b.vehicle[k, lane] = vehicles[k, min(first + min(lane, count - 1), vehicles.shape[1] - 1)]
+    _prepare_vehicles(b, b.vehicle, 0, physics_step)
+
+
+@compiled
+def _prepare_vehicles(b, vehicles, first, dt):
+    motor, lift, fall, push, twist, gyro, arm = b.motor, b.lift, b.fall, b.push, b.twist, b.gyro, b.arm
     for lane in range(LANES):
-        i = min(first + min(lane, count - 1), last)
-        lift = vehicles[P.thrust_coefficient, i]
+        i = first + lane
         ixx, iyy, izz = vehicles[P.ixx, i], vehicles[P.iyy, i], vehicles[P.izz, i]
-        b.motor[lane] = vehicles[P.motor_gain, i] * dt
-        b.lift[lane] = lift
-        b.fall[lane] = vehicles[P.gravity, i] * dt
-        b.push[lane] = dt / vehicles[P.mass, i]
-        b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
-        b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
-        for axis in range(3):
-            for rotor in range(4):
-                b.arm[axis, rotor, lane] = vehicles[P.roll_arm_0 + 4 * axis + rotor, i]
-        b.thrust_middle[lane] = vehicles[P.thrust_middle, i] / lift
-        b.thrust_half_range[lane] = vehicles[P.thrust_half_range, i] / lift
-        b.radius[lane] = vehicles[P.collision_radius, i]
+        motor[lane], push[lane] = vehicles[P.motor_gain, i] * dt, dt / vehicles[P.mass, i]
+        fall[lane], lift[lane] = vehicles[P.gravity, i] * dt, vehicles[P.thrust_coefficient, i]
+        twist[0, lane], twist[1, lane], twist[2, lane] = dt / ixx, dt / iyy, dt / izz
+        gyro[0, lane], gyro[1, lane], gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
+        b.thrust_middle[lane] = vehicles[P.thrust_middle, i] / lift[lane]
+        b.thrust_half_range[lane] = vehicles[P.thrust_half_range, i] / lift[lane]
+        b.radius[lane], b.delay[lane] = vehicles[P.collision_radius, i], vehicles[P.delay, i]
+    for axis in range(3):
+        for rotor in range(4):
+            for lane in range(LANES):
+                arm[axis, rotor, lane] = vehicles[P.roll_arm_0 + 4 * axis + rotor, first + lane]
 
 
 @compiled(fastmath=True)
@@ -119,9 +130,9 @@ def _command_rotors(b):
 
 
 @compiled
-def load_commands(b, actions, queue, first, count):
-    """Actions into the delay's end, and what leaves it into the wanted rotor speeds."""
-    command, wanted = b.command, b.wanted_speeds
+def load_commands(b, actions, queue, mixed, first, count):
+    """Actions into the delay's end, which for ``mixed`` delays is the row's own, and what leaves it into the wanted speeds."""
+    command, wanted, own = b.command, b.wanted_speeds, b.delay
     delay, rotors = queue.shape[0], queue.shape[1]
     for lane in range(LANES):
         i = first + min(lane, count - 1)
@@ -136,11 +147,28 @@ def load_commands(b, actions, queue, first, count):
     for k in range(rotors):
         for lane in range(LANES):
             wanted[k, lane] = queue[0, k, first + min(lane, count - 1)]
-        for late in range(delay - 1):
-            for lane in range(count):
-                queue[late, k, first + lane] = queue[late + 1, k, first + lane]
+        if not mixed:
+            for late in range(delay - 1):
+                for lane in range(count):
+                    queue[late, k, first + lane] = queue[late + 1, k, first + lane]
+        else:
+            for late in range(delay - 1):
+                for lane in range(count):
+                    new = own[lane] == late + 1.0
+                    queue[late, k, first + lane] = command[k, lane] if new else queue[late + 1, k, first + lane]
+            for lane in range(LANES):
+                wanted[k, lane] = command[k, lane] if own[lane] == 0.0 else wanted[k, lane]
         for lane in range(count):
             queue[delay - 1, k, first + lane] = command[k, lane]
+
+
+@compiled
+def add_gusts(b, gust, first, count):
+    """The present gusts of a block to its wrench."""
+    wrench = b.wrench
+    for axis in range(3):
+        for lane in range(count):
+            wrench[W.force_world + axis, lane] += gust[axis, first + lane]
 
 
 @compiled
@@ -170,7 +198,7 @@ def load_scaling(b, mean, std, noise_level, first, count):
 
 @compiled
 def store_observations(b, out, first, count):
-    """The observations of a block to rows of ``out``, float32 (n, OBSERVATION_SIZE)."""
+    """The observations of a block, features alone, to rows of ``out``, float32 (n, OBSERVATION_SIZE)."""
     feature = b.feature
     for lane in range(count):
         for k in range(feature.shape[0]):

@@ -2,9 +2,8 @@
 
 import math
 
-from sb3_quad.simulation.engine.block import P, X
+from sb3_quad.simulation.engine.block import P, W, X
 from sb3_quad.simulation.engine.lowlevel import compiled
-from sb3_quad.simulation.engine.physics import W
 from sb3_quad.simulation.rotation import rotation_rows
 
 NOT_FINITE, BODY_FRAME_ONLY, WORLD_FRAME_TOO = range(3)
@@ -26,7 +25,7 @@ def rotor_wrenches(state, queue, action, wrench, vehicles, physics_step, out):
     for j in range(4):
         if not math.isfinite(action[j]):
             return NOT_FINITE
-    delay = queue.shape[0]
+    delay = int(vehicles[P.delay, 0])
     thrust_coefficient, motor_gain = vehicles[P.thrust_coefficient, 0], vehicles[P.motor_gain, 0]
     for step in range(out.shape[0]):
         for axis in range(3):

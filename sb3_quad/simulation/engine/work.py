@@ -15,6 +15,8 @@ from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.engine.block import (
     MEMORY,
+    NORMALS,
+    add_gusts,
     block_in,
     load_commands,
     load_rows,
@@ -27,12 +29,14 @@ from sb3_quad.simulation.engine.block import (
 from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
 from sb3_quad.simulation.engine.physics import fly_block
 from sb3_quad.simulation.engine.random import STEP
-from sb3_quad.simulation.episodes import start_episode
+from sb3_quad.simulation.episodes import count_episode, start_episode
 from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.memory import forget, integrate, remember, remember_action
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import TASK, S
+from sb3_quad.simulation.worlds import GUST_SIZE, WORLD_SIZE, advance_gusts, sample_gust, sample_vehicle, sample_wrench
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 LOOK, SCORE, FLY = range(3)
@@ -49,21 +53,31 @@ OUTCOME = np.dtype(
         ("out_of_range", "?"),
         ("truncated", "?"),  # neither of these: the flight survived
         ("success", "?"),  # survived, and ended at its target
-        ("observation", "f4", (OBSERVATION_SIZE,)),
     ],
     align=True,
 )
 """How the last episode of a row ended."""
 
-# Columns of vehicles and of scaling: 1 where one serves all rows. Control steps of an episode: limits of the present ones,
-# max_steps of those that follow.
-SIZES = ("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "scaling_columns", "mode", "autoreset")
+# Columns of vehicles, random worlds and scaling: 1 where one serves all rows; none of worlds where all are nominal. Control
+# steps of an episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
+SIZES = (
+    *("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "nominal_columns", "world_columns", "gust_columns"),
+    *("scaling_columns", "mixed_delays", "gusts", "sets_wrench", "sets_vehicle", "width", "depth", "frame", "ages"),
+    *("integrals", "mode", "autoreset"),
+)
 _PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
 ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and shape, of which a name is one of the sizes
     "state": ("f8", (STATE_SIZE, "n")),
     "queue": ("f8", ("delay", 4, "n")),
     "wrench": ("f8", (WRENCH_SIZE, "n")),
-    "vehicles": ("f8", (_PARAMETERS, "vehicle_columns")),
+    "vehicles": ("f8", (_PARAMETERS, "vehicle_columns")),  # that fly
+    "nominal": ("f8", (_PARAMETERS, "nominal_columns")),
+    "worlds": ("f8", (WORLD_SIZE, "world_columns")),
+    "gust": ("f8", (GUST_SIZE, "gust_columns")),
+    "frames": ("f4", ("n", "depth", "frame")),
+    "ages": ("i8", ("ages",)),
+    "integral": ("f8", ("integrals", "n")),
+    "integral_numbers": ("f8", (4,)),
     "streams": ("u4", (4, "n")),
     "mean": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
     "std": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
@@ -74,6 +88,7 @@ ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and
     "returns": ("f8", ("n",)),
     "limits": ("i8", ("n",)),
     "outcome": (OUTCOME, ("n",)),
+    "last_observations": ("f4", ("n", "width")),  # of the episodes that outcome tells of
 }
 STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
 _ADDRESSES = tuple(f"{name}_at" for name in (*ARRAYS, *STEP_ARRAYS))
@@ -90,7 +105,7 @@ last block kept the thread that brought the job waiting."""
 
 
 class StepArrays(NamedTuple):
-    """What a step is given and gives: actions (n, 4), observations (n, OBSERVATION_SIZE), rewards (n,), dones (n,)."""
+    """What a step is given and gives: actions (n, 4), observations (n, width), rewards (n,), dones (n,)."""
 
     actions: Float32Array
     observations: Float32Array
@@ -98,9 +113,9 @@ class StepArrays(NamedTuple):
     dones: BoolArray
 
 
-def step_arrays(n: int, actions: Float32Array | None = None) -> StepArrays:
+def step_arrays(n: int, width: int, actions: Float32Array | None = None) -> StepArrays:
     """Arrays for a step: dones are False, actions zero unless given; observations and rewards hold anything."""
-    observations = np.empty((n, OBSERVATION_SIZE), dtype=np.float32)
+    observations = np.empty((n, width), dtype=np.float32)
     given = np.zeros((n, 4), np.float32) if actions is None else actions
     return StepArrays(given, observations, np.empty(n, np.float32), np.zeros(n, np.bool_))
 
@@ -116,8 +131,8 @@ def check_arrays(arrays: Arrays, sizes: Mapping[str, float]) -> None:
         array, wanted = arrays[name], tuple(int(sizes[size]) if isinstance(size, str) else size for size in shape)
         if array.dtype != kind or array.shape != wanted or not array.flags.carray:
             raise ConfigError(f"{name}: {array.dtype} of shape {array.shape}; needed is {np.dtype(kind)} of shape {wanted}")
-    for name in ("vehicle_columns", "scaling_columns"):
-        if sizes[name] not in (1, sizes["n"]):
+    for name in ("vehicle_columns", "nominal_columns", "world_columns", "gust_columns", "scaling_columns"):
+        if sizes[name] not in (1, sizes["n"]) and not (sizes[name] == 0 and name in ("world_columns", "gust_columns")):
             raise ConfigError(f"{name} {sizes[name]}: must be 1, or one for each of {sizes['n']} rows")
     if not ((arrays["task_index"] >= 0) & (arrays["task_index"] < sizes["tasks"])).all():
         raise ConfigError(f"task_index: every number must be one of the {sizes['tasks']} tasks, counted from 0")
@@ -146,9 +161,16 @@ def run_block(job, number, b, fresh):
     tasks = carray(pointer(job.task_parameters_at), (job.tasks, _COLUMNS), np.float64)
     vehicles = carray(pointer(job.vehicles_at), (_PARAMETERS, job.vehicle_columns), np.float64)
     queue = carray(pointer(job.queue_at), (job.delay, 4, n), np.float64)
+    worlds = carray(pointer(job.worlds_at), (WORLD_SIZE, job.world_columns), np.float64)
+    gust = carray(pointer(job.gust_at), (GUST_SIZE, job.gust_columns), np.float64)
+    wrench = carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64)
+    frames = carray(pointer(job.frames_at), (n, job.depth, job.frame), np.float32)
+    integral = carray(pointer(job.integral_at), (job.integrals, n), np.float64)
+    ages = carray(pointer(job.ages_at), (job.ages,), np.int64)
+    normals = NORMALS if job.gusts else OBSERVATION_SIZE
     returns = carray(pointer(job.returns_at), (n,), np.float64)
     limits = carray(pointer(job.limits_at), (n,), np.int64)
-    observations = carray(pointer(job.observations_at), (n, OBSERVATION_SIZE), np.float32)
+    observations = carray(pointer(job.observations_at), (n, job.width), np.float32)
     dones = carray(pointer(job.dones_at), (n,), np.bool_)
     first = number * LANES
     count = min(LANES, n - first)
@@ -164,17 +186,32 @@ def run_block(job, number, b, fresh):
             load_vehicles(b, vehicles, first, count, job.physics_step)
         if fresh or job.tasks > 1:
             load_scored(b, task_index, tasks, first, count)
+        actions = carray(pointer(job.actions_at), (n, 4), np.float32)
         if job.mode == FLY:
-            load_rows(carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64), first, count, b.wrench)
-            load_commands(b, carray(pointer(job.actions_at), (n, 4), np.float32), queue, first, count)
+            load_rows(wrench, first, count, b.wrench)
+            if job.gusts:
+                add_gusts(b, gust, first, count)
+            load_commands(b, actions, queue, job.mixed_delays, first, count)
             fly_block(b, job.physics_step, job.substeps)
             store_state(b, state, first, count)
         score(b)
         for lane in range(count):
             streams[STEP, first + lane] += np.uint32(1)
         load_rows(streams, first, count, b.stream)
-        observe(b)
-        store_observations(b, observations, first, count)
+        observe(b, normals)
+        if job.gusts:
+            advance_gusts(b, gust, first, count)
+        if job.depth > 0:
+            numbers = carray(pointer(job.integral_numbers_at), (4,), np.float64)
+            for lane in range(count):
+                i = first + lane
+                step = int64(streams[STEP, i])
+                remember_action(i, step, actions[i], frames)
+                if job.integrals > 0:
+                    integrate(i, b.feature, lane, b.mean, b.inverse_std, numbers, integral)
+                remember(i, step, b.feature, lane, b.inverse_std, integral, ages, frames, observations)
+        else:
+            store_observations(b, observations, first, count)
 
         rewards = carray(pointer(job.rewards_at), (n,), np.float32)
         height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
@@ -189,6 +226,7 @@ def run_block(job, number, b, fresh):
         if ended == 0 and job.autoreset:
             return
         outcome = carray(pointer(job.outcome_at), (n,), OUTCOME)
+        last = carray(pointer(job.last_observations_at), (n, job.width), np.float32)
         for lane in range(count):
             i = first + lane
             if dones[i] or not job.autoreset:
@@ -199,20 +237,35 @@ def run_block(job, number, b, fresh):
                 outcome[i].distance = distance[lane]
                 outcome[i].total, outcome[i].reward = returns[i], b.reward[lane]
                 outcome[i].length = streams[STEP, i]
-                for k in range(OBSERVATION_SIZE):
-                    outcome[i].observation[k] = observations[i, k]
+                for k in range(job.width):
+                    last[i, k] = observations[i, k]
         if not job.autoreset:
             return
 
     weights = carray(pointer(job.task_weights_at), (job.tasks,), np.float64)
+    nominal = carray(pointer(job.nominal_at), (_PARAMETERS, job.nominal_columns), np.float64)
     for i in range(first, first + count):
         if dones[i]:
             returns[i], limits[i] = 0.0, job.max_steps
+            count_episode(i, streams)
+            if job.sets_vehicle:
+                sample_vehicle(i, streams, nominal, worlds, vehicles)
+            if job.sets_wrench:
+                sample_wrench(i, streams, worlds, wrench)
+            if job.gusts:
+                sample_gust(i, streams, worlds, gust)
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
+            if job.depth > 0:
+                forget(i, frames, integral)
     load_rows(state, first, count, b.state)
     load_rows(streams, first, count, b.stream)
-    observe(b)
-    store_observations(b, observations, first, count)
+    observe(b, normals)
+    if job.depth > 0:
+        for lane in range(count):
+            i = first + lane
+            remember(i, int64(streams[STEP, i]), b.feature, lane, b.inverse_std, integral, ages, frames, observations)
+    else:
+        store_observations(b, observations, first, count)
 
 
 @compiled

@@ -54,7 +54,7 @@ class Workers:
 
 
 def _loop(control: IntArray, number: int, asleep: threading.Lock) -> None:
-    nothing = np.zeros(1, dtype=JOB).view(np.int64), *step_arrays(1)
+    nothing = np.zeros(1, dtype=JOB).view(np.int64), *step_arrays(1, 1)
     while True:
         asleep.acquire()
         work(control, number, PATIENCE, *nothing)

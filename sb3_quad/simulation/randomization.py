@@ -1,0 +1,224 @@
+"""Random worlds: by what the vehicle and the forces of an episode differ from the nominal ones.
+
+A :class:`Randomization` is data, ``randomize`` in ``env_kwargs``; :mod:`.worlds` samples from it.
+"""
+
+import math
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.vehicles.vehicle import Vehicle
+
+Share = Annotated[float, Field(ge=0, le=1)]
+Vector = tuple[float, float, float]
+MAX_DELAY = 100  # control steps
+FIXED, UNIFORM, LOG_UNIFORM = range(3)
+
+
+class Range(Frozen):
+    """Numbers from ``low`` to ``high``; ``[low, high]`` for short, or one number."""
+
+    low: float = Field(description="the least number")
+    high: float = Field(description="the greatest number, at least low")
+    distribution: Literal["uniform", "log_uniform"] = Field(
+        default="uniform", description="of the number, or of its logarithm (low > 0)"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _for_short(cls, data: Any) -> Any:
+        if isinstance(data, (int, float)) and not isinstance(data, bool):
+            return {"low": data, "high": data}
+        if isinstance(data, (list, tuple)):
+            if len(data) != 2:
+                raise ValueError(f"{list(data)!r}: must be [low, high]")
+            return dict(zip(("low", "high"), data, strict=True))
+        return data
+
+    @model_validator(mode="after")
+    def _rises(self) -> "Range":
+        if self.low > self.high:
+            raise ValueError(f"[{self.low:g}, {self.high:g}]: the first number exceeds the second")
+        if self.distribution == "log_uniform" and self.low <= 0.0:
+            raise ValueError(f"[{self.low:g}, {self.high:g}]: log_uniform numbers are greater than 0")
+        return self
+
+    def numbers(self) -> list[float]:
+        """Low, high, and how to sample between them."""
+        return [self.low, self.high, UNIFORM if self.distribution == "uniform" else LOG_UNIFORM]
+
+
+class Factor(Range):
+    """A factor, from ``low`` to ``high``, of 0.1 to 10; its logarithm is uniform unless ``distribution`` says otherwise."""
+
+    low: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the least factor")
+    high: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the greatest factor, at least low")
+    distribution: Literal["uniform", "log_uniform"] = Field(
+        default="log_uniform", description="of the factor or its logarithm"
+    )
+
+
+class RandomVector(Frozen):
+    """A force or torque at the centre of mass, the same throughout an episode; ``[low, high]`` for short."""
+
+    magnitude: Range = Field(description="its length, N or N m, or as unit says")
+    unit: Literal["SI", "weight"] = Field(
+        default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
+    )
+    frame: Literal["world", "body"] = Field(description="the axes it keeps to")
+    direction: Vector | None = Field(default=None, description="where to; left out: uniformly random")
+    axes: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
+        default=(1.0, 1.0, 1.0), description="factor of each component, such as [1, 1, 0] for a horizontal one"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _for_short(cls, data: Any) -> Any:
+        return {"magnitude": data} if isinstance(data, (list, tuple, int, float)) else data
+
+    @model_validator(mode="after")
+    def _possible(self) -> "RandomVector":
+        if self.magnitude.low < 0.0:
+            raise ValueError(f"magnitude {self.magnitude.low:g}: a length is not negative")
+        if self.direction is not None and not any(self.direction):
+            raise ValueError("direction [0, 0, 0]: is none")
+        return self
+
+    def numbers(self, unit: float) -> list[float]:
+        """What :mod:`.worlds` reads, in the order of ``WORLD``, given the unit in N or N m."""
+        direction = np.zeros(3) if self.direction is None else np.array(self.direction) / np.linalg.norm(self.direction)
+        size = unit if self.unit == "weight" else 1.0
+        return [*self.magnitude.numbers(), size, float(self.frame == "body"), *direction, *self.axes]
+
+
+class Force(RandomVector):
+    """See :class:`RandomVector`."""
+
+    frame: Literal["world", "body"] = Field(default="world", description="the axes it keeps to")
+
+
+class Torque(RandomVector):
+    """See :class:`RandomVector`."""
+
+    frame: Literal["world", "body"] = Field(default="body", description="the axes it keeps to")
+
+
+class Gusts(Frozen):
+    """A force in the world frame that wanders: of each component the Ornstein-Uhlenbeck process, exactly discretised.
+
+    Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930); the update of D. T. Gillespie,
+    "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E 54, 1996). It is what MIL-F-8785C's Dryden
+    model has along the flight path, with the time constant L / V.
+    """
+
+    std: Range = Field(description="standard deviation of each component, N; sampled per episode")
+    time_constant: PositiveFloat = Field(default=1.0, description="after which a gust has faded to 1/e, s")
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Gusts":
+        if self.std.low < 0.0:
+            raise ValueError(f"std {self.std.low:g}: a standard deviation is not negative")
+        return self
+
+
+class Randomization(Frozen):
+    """What is random in each episode, sampled from the row's own stream when it begins; what is left out stays nominal.
+
+    Factors are of the vehicle's own parameters and log-uniform unless they say otherwise. Motors and their limits in N stay
+    what they are, so that action 0 is the nominal hover.
+    """
+
+    share: Share = Field(default=1.0, description="of the episodes whose vehicle differs; the others fly the nominal one")
+    mass: Factor | None = Field(default=None, description="factor, such as [0.8, 1.25]; the thrusts in N stay")
+    inertia: Factor | None = Field(
+        default=None, description="factor, of Ixx, Iyy and Izz each; none exceeds the sum of the other two"
+    )
+    motor_gain: Factor | None = Field(default=None, description="factor of k_m (Eq. 4.1)")
+    thrust: Factor | None = Field(default=None, description="factor of the thrust of a command, as a tired battery has it")
+    arm: Factor | None = Field(default=None, description="factor of the rotors' distances from the centre of mass")
+    center_of_mass: Range | None = Field(default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]")
+    delay: Range | None = Field(
+        default=None,
+        description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
+    )
+    wrench_share: Share = Field(default=1.0, description="of the episodes with force, torque and gusts")
+    force: Force | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, world frame, N")
+    torque: Torque | None = Field(
+        default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, body frame, N m"
+    )
+    gusts: Gusts | None = Field(default=None, description="a force that wanders, such as {std: [0, 1], time_constant: 1}")
+
+    @model_validator(mode="after")
+    def _possible(self) -> "Randomization":
+        limits = self.delay
+        if limits and (limits.low < 0 or limits.high > MAX_DELAY or limits.low % 1 or limits.high % 1):
+            raise ValueError(f"delay [{limits.low:g}, {limits.high:g}]: must be whole control steps of 0 to {MAX_DELAY}")
+        return self
+
+    @property
+    def sets_vehicle(self) -> bool:
+        """Whether an episode begins with a vehicle of its own."""
+        changes = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self.delay)
+        return any(each is not None for each in changes)
+
+    @property
+    def sets_wrench(self) -> bool:
+        """Whether an episode begins with a wrench of its own, none included."""
+        return self.force is not None or self.torque is not None
+
+    @property
+    def longest_delay(self) -> int:
+        """Control steps that a command may take, 0 unless the delay varies."""
+        return 0 if self.delay is None else int(self.delay.high)
+
+    def check(self, vehicle: Vehicle) -> None:
+        """Refuse worlds that this vehicle cannot be flown in.
+
+        :raises ConfigError: it could not hover, or its motors would overshoot.
+        """
+        mass, thrust = self.mass.high if self.mass else 1.0, self.thrust.low if self.thrust else 1.0
+        if thrust * vehicle.thrust_limits[1] <= mass:
+            raise ConfigError(
+                f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
+                f" its rotors lift {vehicle.thrust_limits[1]:g} times its weight"
+            )
+        gain = vehicle.motor_gain * (self.motor_gain.high if self.motor_gain else 1.0)
+        if gain * vehicle.physics_step > 1.0:
+            raise ConfigError(
+                f"randomize: motor_gain of {vehicle.name} may reach {gain:g}; times physics_step it may not exceed 1"
+            )
+
+    def _delay(self) -> Range | None:
+        """Of which the whole part is the delay."""
+        return self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})
+
+    def numbers(self, vehicle: Vehicle) -> FloatArray:
+        """What :mod:`.worlds` reads for rows of a vehicle, in the order of ``WORLD``."""
+        weight = vehicle.mass * vehicle.gravity
+        vectors = (self.force, weight), (self.torque, weight * vehicle.arm_length)
+        ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self._delay())
+        gusts = [*Gusts(std=Range(low=0, high=0)).std.numbers(), 0.0] if self.gusts is None else _gusts(self.gusts, vehicle)
+        parts = [
+            *([self.share], [self.wrench_share]),
+            *([0.0, 0.0, FIXED] if each is None else each.numbers() for each in ranges),
+            *([0.0] * 11 if each is None else each.numbers(unit) for each, unit in vectors),
+            gusts,
+        ]
+        return np.array([number for part in parts for number in part], dtype=np.float64)
+
+
+def _gusts(gusts: Gusts, vehicle: Vehicle) -> list[float]:
+    return [*gusts.std.numbers(), math.exp(-vehicle.control_step / gusts.time_constant)]
+
+
+def resolve_randomization(given: Any) -> Randomization:
+    """A :class:`Randomization`, or a mapping of its fields; None: nothing is random.
+
+    :raises ConfigError: an unknown field, or a value that does not fit.
+    """
+    return given if isinstance(given, Randomization) else validate(Randomization, {} if given is None else given, "randomize")

@@ -1,0 +1,141 @@
+"""How the world of an episode is sampled: its vehicle, and what pushes it."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.simulation.engine.block import P, W
+from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation.engine.random import GUST, PUSH, VEHICLE, uniforms
+from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.randomization import FIXED, LOG_UNIFORM, Randomization
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle
+
+_RANGES = ("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay")
+_VECTOR = {"": 3, "_unit": 1, "_in_body": 1, "_direction": 3, "_axes": 3}
+WORLD = {
+    "share": 1,
+    "wrench_share": 1,
+    **dict.fromkeys(_RANGES, 3),
+    **{f"{name}{part}": size for name in ("force", "torque") for part, size in _VECTOR.items()},
+    "gust_std": 3,
+    "gust_keeps": 1,
+}
+"""Numbers of :meth:`~sb3_quad.simulation.randomization.Randomization.numbers`; a range is low, high and how to sample."""
+WORLD_SIZE = sum(WORLD.values())
+R = first_rows(WORLD)
+GUSTS = {"force": 3, "keeps": 1, "adds": 1}
+"""Of each row: the present gust, world frame, N; what is left of it after a control step; the spread of what comes to it."""
+GUST_SIZE = sum(GUSTS.values())
+G = first_rows(GUSTS)
+_N_PARAMETERS = len(PARAMETER_NAMES)
+
+
+@compiled
+def _between(table, k, column, u, nominal):
+    low, high, kind = table[k, column], table[k + 1, column], table[k + 2, column]
+    if kind == FIXED:
+        return nominal
+    return low * (high / low) ** u if kind == LOG_UNIFORM else low + (high - low) * u
+
+
+@compiled
+def _push(table, k, column, length, height, azimuth, wrench, world, body, i):
+    """Add a constant force or torque, whose numbers begin at ``k``, to its rows of a wrench."""
+    size = _between(table, k, column, length, 0.0) * table[k + 3, column]
+    up = 2.0 * height - 1.0
+    across = math.sqrt(max(0.0, 1.0 - up * up))
+    x, y, z = across * math.cos(2.0 * math.pi * azimuth), across * math.sin(2.0 * math.pi * azimuth), up
+    if table[k + 5, column] != 0.0 or table[k + 6, column] != 0.0 or table[k + 7, column] != 0.0:
+        x, y, z = table[k + 5, column], table[k + 6, column], table[k + 7, column]
+    rows = body if table[k + 4, column] != 0.0 else world
+    wrench[rows, i] = size * x * table[k + 8, column]
+    wrench[rows + 1, i] = size * y * table[k + 9, column]
+    wrench[rows + 2, i] = size * z * table[k + 10, column]
+
+
+@compiled
+def sample_vehicle(i, streams, nominal, table, vehicles):
+    """The vehicle of row i's episode, in place.
+
+    :param nominal: float64 (len(PARAMETER_NAMES), n or 1), of the vehicles that differ by ``table`` (WORLD_SIZE, n or 1).
+    :param vehicles: float64 (len(PARAMETER_NAMES), n).
+    """
+    column, u = min(i, nominal.shape[1] - 1), uniforms(streams, i, 6, VEHICLE)
+    for k in range(_N_PARAMETERS):
+        vehicles[k, i] = nominal[k, column]
+    if u[0] >= table[R.share, column]:
+        return
+    mass = _between(table, R.mass, column, u[1], 1.0)
+    vehicles[P.mass, i] *= mass
+    vehicles[P.hover_thrust, i] *= mass
+    for axis in range(3):
+        vehicles[P.ixx + axis, i] *= _between(table, R.inertia, column, u[2 + axis], 1.0)
+    for axis in range(3):  # no body has one moment larger than the other two together
+        others = vehicles[P.ixx + (axis + 1) % 3, i] + vehicles[P.ixx + (axis + 2) % 3, i]
+        vehicles[P.ixx + axis, i] = min(vehicles[P.ixx + axis, i], others)
+    vehicles[P.motor_gain, i] *= _between(table, R.motor_gain, column, u[5], 1.0)
+    thrust = _between(table, R.thrust, column, u[6], 1.0)
+    vehicles[P.thrust_middle, i] *= thrust
+    vehicles[P.thrust_half_range, i] *= thrust
+    arm = _between(table, R.arm, column, u[7], 1.0)
+    x, y = _between(table, R.center_of_mass, column, u[8], 0.0), _between(table, R.center_of_mass, column, u[9], 0.0)
+    for rotor in range(4):  # roll arms are y of the rotors, pitch arms -x
+        vehicles[P.roll_arm_0 + rotor, i] = arm * vehicles[P.roll_arm_0 + rotor, i] - y
+        vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
+    if table[R.delay + 2, column] != FIXED:
+        vehicles[P.delay, i] = min(math.floor(_between(table, R.delay, column, u[10], 0.0)), table[R.delay + 1, column] - 1.0)
+
+
+@compiled
+def sample_wrench(i, streams, table, wrench):
+    """The constant wrench of row i's episode, in place: ``wrench`` (WRENCH_SIZE, n)."""
+    column, u = min(i, table.shape[1] - 1), uniforms(streams, i, 4, PUSH)
+    for k in range(wrench.shape[0]):
+        wrench[k, i] = 0.0
+    if u[0] < table[R.wrench_share, column]:
+        _push(table, R.force, column, u[1], u[2], u[3], wrench, W.force_world, W.force_body, i)
+        _push(table, R.torque, column, u[4], u[5], u[6], wrench, W.torque_world, W.torque_body, i)
+
+
+@compiled
+def sample_gust(i, streams, table, gust):
+    """How row i's gusts are in its episode, and the first, in place: ``gust`` (GUST_SIZE, n)."""
+    column, u, share = min(i, table.shape[1] - 1), uniforms(streams, i, 4, GUST), uniforms(streams, i, 1, PUSH)
+    std = _between(table, R.gust_std, column, u[0], 0.0) if share[0] < table[R.wrench_share, column] else 0.0
+    keeps = table[R.gust_keeps, column]
+    gust[G.keeps, i], gust[G.adds, i] = keeps, std * math.sqrt(1.0 - keeps * keeps)
+    for axis in range(3):  # stationary from the start; two normals from two uniforms (Box-Muller)
+        radius = math.sqrt(-2.0 * math.log(u[2 + 2 * axis]))
+        gust[G.force + axis, i] = std * radius * math.cos(2.0 * math.pi * u[3 + 2 * axis])
+
+
+@compiled
+def advance_gusts(b, gust, first, count):
+    """The gusts of a block one control step later, in place, by the normals behind those of the observation."""
+    noise = b.noise
+    for axis in range(3):
+        for lane in range(count):
+            i = first + lane
+            kept, added = gust[G.keeps, i] * gust[G.force + axis, i], gust[G.adds, i] * noise[OBSERVATION_SIZE + axis, lane]
+            gust[G.force + axis, i] = kept + added
+
+
+def new_worlds(randomize: Randomization, vehicles: Sequence[Vehicle], n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Arrays of n rows: of the vehicles that fly, of what is random in their worlds, and of gusts.
+
+    :param vehicles: the nominal ones, n or one for all rows.
+    :raises ConfigError: a world that one of them cannot be flown in.
+    """
+    flying = np.stack([each.parameters() for each in vehicles], axis=1)
+    if randomize == Randomization():
+        return flying, np.zeros((WORLD_SIZE, 0)), np.zeros((GUST_SIZE, 0))
+    for each in {id(each): each for each in vehicles}.values():
+        randomize.check(each)
+    worlds = np.stack([randomize.numbers(each) for each in vehicles], axis=1)
+    if randomize.sets_vehicle:
+        flying = np.repeat(flying, n // len(vehicles), axis=1)
+    return flying, worlds, np.zeros((GUST_SIZE, n))

@@ -1,0 +1,151 @@
+"""What a policy sees beside the present features: actions, earlier frames, the integral of the position error."""
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3 import PPO
+from stable_baselines3.common.vec_env import VecFrameStack
+
+import sb3_quad  # noqa: F401  (registers the environments)
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.gym_vector import QuadcopterVectorEnv
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.simulation.observation import DEFAULT_STD
+
+LIMIT = 40
+
+
+def flown(n, steps, **keywords):
+    """Observations before and after each step, actions, dones, and infos of the last."""
+    env = QuadcopterVecEnv(n, task="state_recovery", seed=3, max_episode_steps=LIMIT, **keywords)
+    actions = np.random.default_rng(0).uniform(-1.5, 1.5, (steps, n, 4)).astype(np.float32)
+    observations, dones, last = [env.reset()], [], []
+    for action in actions:
+        observation, _, done, infos = env.step(action)
+        observations.append(observation)
+        dones.append(done)
+        last.append([info.get("terminal_observation") for info in infos])
+    return np.array(observations), actions, np.array(dones), last
+
+
+@settings(max_examples=20)
+@given(st.sets(st.integers(1, 50), max_size=4), st.booleans())
+def test_a_frame_is_what_was_seen_then_and_the_action_before_it(ages, last_action):
+    history = [0, *sorted(ages)]
+    n, steps = 3, 2 * LIMIT + 5
+    plain, actions, dones, plain_last = flown(n, steps)
+    seen, _, _, seen_last = flown(n, steps, history=history, last_action=last_action)
+    size = 18 + 4 * last_action
+    assert seen.shape[2] == len(history) * size
+    for row in range(n):
+        begin = 0  # of the episode
+        for step in range(steps + 1):
+            ended = step > 0 and dones[step - 1, row]
+            if ended:  # the last observation of the episode that ended, then the first of the next
+                check_frames(
+                    seen_last[step - 1][row], plain_last[step - 1][row], plain, actions, row, begin, step, history, size
+                )
+                begin = step
+            check_frames(seen[step, row], plain[step, row], plain, actions, row, begin, step, history, size)
+
+
+def check_frames(seen, now, plain, actions, row, begin, step, history, size):
+    for number, age in enumerate(history):
+        frame = seen[number * size : (number + 1) * size]
+        then = step - age
+        if then < begin:
+            assert not frame.any()
+            continue
+        np.testing.assert_array_equal(frame[:18], now if age == 0 else plain[then, row])
+        if size > 18:
+            expected = np.zeros(4) if then == begin else np.clip(actions[then - 1, row], -1, 1)
+            np.testing.assert_array_equal(frame[18:], expected.astype(np.float32))
+
+
+def test_the_integral_is_that_of_what_is_observed_near_the_target():
+    gain, distance, speed, limit = 0.8, 1.5, 2.0, 0.4
+    n, steps = 20, 3 * LIMIT
+    own = {"gain": gain, "distance": distance, "speed": speed, "limit": limit}
+    plain, _, dones, _ = flown(n, steps)
+    seen, _, _, _ = flown(n, steps, position_integral=own)
+    integral, used = np.zeros((n, 3)), 0
+    for step in range(steps + 1):
+        features = plain[step] * DEFAULT_STD
+        if step > 0:
+            integral[dones[step - 1]] = 0.0
+            near = (np.linalg.norm(features[:, :3], axis=1) < distance) & (np.linalg.norm(features[:, 12:15], axis=1) < speed)
+            near &= ~dones[step - 1]
+            used += near.sum()
+            integral[near] = np.clip(integral + 0.01 * gain * features[:, :3], -limit, limit)[near]
+        np.testing.assert_allclose(seen[step, :, :3] * DEFAULT_STD[:3], features[:, :3] + integral, atol=2e-5)
+        np.testing.assert_array_equal(seen[step, :, 3:], plain[step, :, 3:])
+    assert used > 50
+
+
+def test_what_is_seen_is_the_same_until_the_next_step():
+    env = QuadcopterVecEnv(5, seed=0, history=[0, 2], last_action=True, position_integral={})
+    env.reset()
+    for _ in range(6):
+        seen = env.step(np.full((5, 4), 0.2, np.float32))[0]
+        np.testing.assert_array_equal(env.batch.observe(), seen)
+        np.testing.assert_array_equal(env.batch.observe(), seen)
+
+
+def test_a_snapshot_and_a_copy_remember():
+    env = QuadcopterVecEnv(
+        5, seed=0, history=[0, 2, 7], last_action=True, position_integral={}, randomize={"mass": [0.9, 1.1]}
+    )
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-0.2, 0.3, (60, 5, 4)).astype(np.float32)
+    for action in actions[:30]:
+        env.step(action)
+    saved, copied = env.batch.snapshot(), env.__copy__()
+    ahead = [env.step(action)[0] for action in actions[30:]]
+    np.testing.assert_array_equal(ahead, [copied.step(action)[0] for action in actions[30:]])
+    env.batch.restore(saved)
+    np.testing.assert_array_equal(ahead, [env.step(action)[0] for action in actions[30:]])
+
+
+def test_all_environments_have_the_space_of_what_is_seen():
+    keywords = {"history": [0, 1, 4], "last_action": True}
+    single = gymnasium.make("QuadTargetTracking-v0", **keywords)
+    vector = QuadcopterVectorEnv(3, **keywords)
+    assert single.observation_space.shape == vector.single_observation_space.shape == (66,)
+    assert single.reset(seed=0)[0].shape == (66,) and vector.reset(seed=0)[0].shape == (3, 66)
+    assert single.unwrapped.step(np.zeros(4))[0].shape == (66,)
+    single.close()
+
+
+def test_frame_stacks_of_others_go_round_it():
+    env = VecFrameStack(QuadcopterVecEnv(3, history=[0, 2], last_action=True), 2)
+    assert env.reset().shape == (3, 88)
+    stacked = gymnasium.wrappers.FrameStackObservation(gymnasium.make("QuadTargetTracking-v0", history=[0, 2]), 3)
+    assert stacked.reset(seed=0)[0].shape == (3, 36)
+    stacked.close()
+
+
+def test_an_agent_of_other_observations_is_refused_in_one_line():
+    model = PPO("MlpPolicy", QuadcopterVecEnv(2, history=[0, 1]), n_steps=8, batch_size=8)
+    with pytest.raises(ValueError, match="Observation spaces do not match"):
+        model.set_env(QuadcopterVecEnv(2))
+
+
+@pytest.mark.parametrize(
+    ("keywords", "says"),
+    [
+        ({"history": [1, 2]}, "must rise from 0"),
+        ({"history": [0, 2, 2]}, "must rise from 0"),
+        ({"history": []}, "must rise from 0"),
+        ({"history": [0, 10**6]}, "must rise from 0"),
+        ({"history": "0,1"}, "history"),
+        ({"position_integral": {"gain": -1}}, "gain"),
+        ({"position_integral": {"again": 1}}, "unknown key 'again'"),
+        ({"position_integral": True}, "position_integral"),
+    ],
+)
+def test_what_cannot_be_seen_is_refused_in_one_line(keywords, says):
+    with pytest.raises(ConfigError) as error:
+        QuadcopterVecEnv(1, **keywords)
+    assert says in str(error.value) and "\n" not in str(error.value)
