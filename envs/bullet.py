@@ -49,8 +49,8 @@ class BulletBody:
         p.setPhysicsEngineParameter(fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client)
         ball = p.createCollisionShape(p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client)
         self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=self.client)
-        inertia = {"localInertiaDiagonal": vehicle.inertia, "linearDamping": 0.0, "angularDamping": 0.0}
-        p.changeDynamics(self.body, -1, **inertia, physicsClientId=self.client)
+        p.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        self.become(vehicle.parameters())
         p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=self.client)
 
     def become(self, parameters: FloatArray) -> None:

@@ -179,6 +179,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
 
     def _open(self) -> None:
         self._body = BulletBody(self.vehicle, self._size if self.render_mode == "human" else None)
+        self._body.become(self.batch.vehicles[:, 0])
         self._renderer = None
         if self._body.has_window or self.render_mode == "rgb_array":
             self._renderer = Renderer(self.vehicle, *self._size, self._body)
@@ -200,7 +201,8 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
-        self._body.become(batch.vehicles[:, 0])
+        if batch.randomize.sets_vehicle:
+            self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
         self._ready = True
         if self._renderer is not None:
