@@ -121,12 +121,12 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
             self._infos[row] = {}
         observations, rewards, dones = self.batch.step(self._actions)
         rows = np.flatnonzero(dones)
-        self._ended = rows.tolist()
-        if self._ended:
-            self._follow(self._ended)
+        self._ended = ended = rows.tolist()
+        if ended:
+            self._follow(ended)
             elapsed = round(time.time() - self._start, 6)
             outcomes, last = self.batch.outcome[rows].tolist(), self.batch.last_observations[rows]  # copies
-            for row, outcome, observation in zip(rows.tolist(), outcomes, last, strict=True):
+            for row, outcome, observation in zip(ended, outcomes, last, strict=True):
                 total, _, length, distance, collision, out_of_range, truncated, success = outcome
                 self._infos[row] = {
                     "terminal_observation": observation,

@@ -373,14 +373,15 @@ class DAgger(OnPolicyAlgorithm):
         mean, log_std = common.actor_mean(policy, observations), policy.log_std
         bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
         entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
-        v_loss = th.zeros(())
+        v_loss = th.zeros((), device=self.device)
         if for_critic is not None:
             states, bounds = (th.as_tensor(part[for_critic], device=self.device) for part in (flown, values))
             v_loss = common.value_loss(common.critic_values(policy, states), bounds[:, 0], bounds[:, 1], clip_range_vf)
         loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
         policy.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
-        return np.array([float(term.detach()) for term in (bc, v_loss, entropy_loss, l2)])
+        terms: FloatArray = th.stack([bc, v_loss, entropy_loss, l2]).detach().double().cpu().numpy()
+        return terms
 
     def _compiled_gradients(
         self,

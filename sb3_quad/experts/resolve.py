@@ -8,7 +8,7 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
 from sb3_quad.experts.models import load_model
 from sb3_quad.pretrained_policies import agent_path, pretrained_names
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
@@ -33,14 +33,13 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "i
     """
     if not isinstance(spec, (str, Path)):
         return spec
-    known = vehicle if isinstance(vehicle, (str, Path, Vehicle)) else vehicle[0]
     text = str(spec)
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)
     factory = import_factory(text, kind)
     try:
-        return factory(load_vehicle(known))
+        return factory(first_vehicle(vehicle))
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:

@@ -15,7 +15,7 @@ from sb3_quad.settings.literals import ZooLoader, parse_mapping
 from sb3_quad.simulation.memory import Memory
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
 
@@ -56,17 +56,6 @@ class FlightSettings(Memory):
         """
         return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
 
-    @property
-    def first_vehicle(self) -> Vehicle:
-        """The vehicle; of a list the first.
-
-        :raises ConfigError: it cannot be loaded.
-        """
-        several = isinstance(self.vehicle, (list, tuple))
-        if several and not self.vehicle:
-            raise ConfigError("vehicle []: give at least one")
-        return load_vehicle(self.vehicle[0] if several else self.vehicle)
-
     def write_into(self, model: Any) -> None:
         """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with the vehicle's parameters.
 
@@ -78,7 +67,7 @@ class FlightSettings(Memory):
         """
         scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
         lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
-        setattr(model, KEY, self.with_changes(vehicle=self.first_vehicle, **lists).model_dump(mode="json"))
+        setattr(model, KEY, self.with_changes(vehicle=first_vehicle(self.vehicle), **lists).model_dump(mode="json"))
 
     @staticmethod
     def of(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:

@@ -19,7 +19,7 @@ from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATI
 from sb3_quad.simulation.randomization import resolve_randomization
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
-from sb3_quad.simulation.worlds import new_worlds
+from sb3_quad.simulation.worlds import GUST_FORCE, new_worlds
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 MAX_ROWS = 2**20
@@ -100,7 +100,7 @@ class QuadcopterBatch:
         self.nominal = np.stack([each.parameters() for each in columns], axis=1)
         self.randomize = resolve_randomization(randomize)
         self.memory = resolve_memory(last_action=last_action, history=history, position_integral=position_integral)
-        self.vehicles, self.worlds, self.gust = new_worlds(self.randomize, columns, n)
+        self.vehicles, self.worlds, self.gust = new_worlds(self.randomize, columns, self.nominal, n)
         self.frames = new_frames(self.memory, n)
         self.ages = np.array(self.memory.ages, dtype=np.int64)
         integral = self.memory.position_integral
@@ -203,14 +203,15 @@ class QuadcopterBatch:
 
     def true_state(self) -> QuadcopterState:
         """The true state of all rows, a live view but for the gusts."""
-        return QuadcopterState(self.state, self.vehicles, self.total_wrench())
+        vehicles = np.broadcast_to(self.vehicles, (len(self.vehicles), self.n))
+        return QuadcopterState(self.state, vehicles, self.total_wrench())
 
     def total_wrench(self) -> FloatArray:
         """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and gusts."""
         if self.randomize.gusts is None:
             return self.wrench
         total = self.wrench.copy()
-        total[FORCE_WORLD] += self.gust[:3]
+        total[FORCE_WORLD] += self.gust[GUST_FORCE]
         return total
 
     def snapshot(self) -> Arrays:

@@ -53,6 +53,9 @@ class Range(Frozen):
         return [self.low, self.high, UNIFORM if self.distribution == "uniform" else LOG_UNIFORM]
 
 
+_NONE = Range(low=0.0, high=0.0)
+
+
 class Factor(Range):
     """A factor, from ``low`` to ``high``, of 0.1 to 10; its logarithm is uniform unless ``distribution`` says otherwise."""
 
@@ -202,18 +205,14 @@ class Randomization(Frozen):
         weight = vehicle.mass * vehicle.gravity
         vectors = (self.force, weight), (self.torque, weight * vehicle.arm_length)
         ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self._delay())
-        gusts = [*Gusts(std=Range(low=0, high=0)).std.numbers(), 0.0] if self.gusts is None else _gusts(self.gusts, vehicle)
+        gusts = self.gusts or Gusts(std=_NONE)
         parts = [
             *([self.share], [self.wrench_share]),
             *([0.0, 0.0, FIXED] if each is None else each.numbers() for each in ranges),
-            *([0.0] * 11 if each is None else each.numbers(unit) for each, unit in vectors),
-            gusts,
+            *((each or Force(magnitude=_NONE)).numbers(unit) for each, unit in vectors),
+            *(gusts.std.numbers(), [math.exp(-vehicle.control_step / gusts.time_constant)]),
         ]
         return np.array([number for part in parts for number in part], dtype=np.float64)
-
-
-def _gusts(gusts: Gusts, vehicle: Vehicle) -> list[float]:
-    return [*gusts.std.numbers(), math.exp(-vehicle.control_step / gusts.time_constant)]
 
 
 def resolve_randomization(given: Any) -> Randomization:

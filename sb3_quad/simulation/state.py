@@ -8,7 +8,7 @@ A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N)
 three rows each, all at the centre of mass.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,8 +34,8 @@ class QuadcopterState:
 
     :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The properties are views
         of it with one vehicle per row, so they show later changes: copy what must last.
-    :param vehicles: the true parameters of the vehicles, float64 ``(len(PARAMETER_NAMES), n)``, or of one column for all,
-        their rows in the order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None: unknown.
+    :param vehicles: the true parameters of the vehicles, float64 ``(len(PARAMETER_NAMES), n)``, their rows in the
+        order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None: unknown.
     :param wrench: what pushes them, float64 ``(WRENCH_SIZE, n)``, its rows in the order of :data:`WRENCH`; None: unknown.
     """
 
@@ -92,24 +92,22 @@ class QuadcopterState:
 
     def copy(self) -> "QuadcopterState":
         """A state of its own memory, unaffected by later flight."""
-        vehicles, wrench = (each if each is None else each.copy() for each in (self.vehicles, self.wrench))
-        return QuadcopterState(self.array.copy(), vehicles, wrench)
+        return self._each(np.copy)
 
     def rows(self, rows: slice) -> "QuadcopterState":
         """Some of the vehicles, views."""
-        vehicles = self.vehicles if self.vehicles is None or self.vehicles.shape[1] == 1 else self.vehicles[:, rows]
-        return QuadcopterState(self.array[:, rows], vehicles, None if self.wrench is None else self.wrench[:, rows])
+        return self._each(lambda part: part[:, rows])
+
+    def _each(self, change: Callable[[FloatArray], FloatArray]) -> "QuadcopterState":
+        vehicles, wrench = (None if part is None else change(part) for part in (self.vehicles, self.wrench))
+        return QuadcopterState(change(self.array), vehicles, wrench)
 
     @staticmethod
     def concatenate(states: Sequence["QuadcopterState"]) -> "QuadcopterState":
-        """Several states as one batch, in order."""
+        """Several states as one batch, in order; what one of them does not know is unknown."""
 
         def joined(parts: list[FloatArray | None]) -> FloatArray | None:
-            known = [
-                np.broadcast_to(part, (len(part), state.n))
-                for part, state in zip(parts, states, strict=True)
-                if part is not None
-            ]
+            known = [part for part in parts if part is not None]
             return np.concatenate(known, axis=1) if len(known) == len(states) else None
 
         array = np.concatenate([state.array for state in states], axis=1)

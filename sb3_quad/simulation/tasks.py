@@ -73,26 +73,18 @@ SCORED = [name for name in TASK if name.startswith(("max_", "success_")) or name
 S = first_rows(dict.fromkeys(SCORED, 1))
 
 RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}  # of tasks whose target is their start
+_THROWN_AWAY: Any = {  # from its target, which is somewhere else
+    "target_distance": 25.0,
+    "nearest_target": 0.0,
+    "random_attitude": True,
+    "velocity_std": 2.0,
+    "body_rates_std": 4.0,
+}
 TASKS: Mapping[str, Task] = {
     "target_tracking": Task(name="target_tracking", target_distance=10.0),
     "state_recovery": Task(name="state_recovery", random_attitude=True, velocity_std=2.0, body_rates_std=4.0, **RECOVERED),
-    "recovery_and_tracking": Task(
-        name="recovery_and_tracking",
-        target_distance=25.0,
-        nearest_target=0.0,
-        random_attitude=True,
-        velocity_std=2.0,
-        body_rates_std=4.0,
-    ),
-    "after_hit": Task(  # on its way when something hits it
-        name="after_hit",
-        target_distance=25.0,
-        nearest_target=0.0,
-        random_attitude=True,
-        velocity_std=2.0,
-        body_rates_std=4.0,
-        hit_rates_std=25.0,
-    ),
+    "recovery_and_tracking": Task(name="recovery_and_tracking", **_THROWN_AWAY),
+    "after_hit": Task(name="after_hit", **_THROWN_AWAY, hit_rates_std=25.0),  # on its way when something hits it
     "far_tracking": Task(name="far_tracking", target_distance=25.0, nearest_target=10.0),
 }
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"

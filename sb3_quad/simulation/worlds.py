@@ -9,18 +9,19 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.engine.block import P, W
 from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.engine.random import GUST, PUSH, VEHICLE, uniforms
-from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.layout import first_rows, row_slices
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.randomization import FIXED, LOG_UNIFORM, Randomization
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle
 
 _RANGES = ("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay")
-_VECTOR = {"": 3, "_unit": 1, "_in_body": 1, "_direction": 3, "_axes": 3}
+VECTOR = {"length": 3, "unit": 1, "in_body": 1, "direction": 3, "axes": 3}
+V = first_rows(VECTOR)
 WORLD = {
     "share": 1,
     "wrench_share": 1,
     **dict.fromkeys(_RANGES, 3),
-    **{f"{name}{part}": size for name in ("force", "torque") for part, size in _VECTOR.items()},
+    **dict.fromkeys(("force", "torque"), sum(VECTOR.values())),
     "gust_std": 3,
     "gust_keeps": 1,
 }
@@ -30,6 +31,7 @@ R = first_rows(WORLD)
 GUSTS = {"force": 3, "keeps": 1, "adds": 1}
 """Of each row: the present gust, world frame, N; what is left of it after a control step; the spread of what comes to it."""
 GUST_SIZE = sum(GUSTS.values())
+GUST_FORCE = row_slices(GUSTS)["force"]
 G = first_rows(GUSTS)
 _N_PARAMETERS = len(PARAMETER_NAMES)
 
@@ -45,16 +47,17 @@ def _between(table, k, column, u, nominal):
 @compiled
 def _push(table, k, column, length, height, azimuth, wrench, world, body, i):
     """Add a constant force or torque, whose numbers begin at ``k``, to its rows of a wrench."""
-    size = _between(table, k, column, length, 0.0) * table[k + 3, column]
+    size = _between(table, k, column, length, 0.0) * table[k + V.unit, column]
     up = 2.0 * height - 1.0
     across = math.sqrt(max(0.0, 1.0 - up * up))
     x, y, z = across * math.cos(2.0 * math.pi * azimuth), across * math.sin(2.0 * math.pi * azimuth), up
-    if table[k + 5, column] != 0.0 or table[k + 6, column] != 0.0 or table[k + 7, column] != 0.0:
-        x, y, z = table[k + 5, column], table[k + 6, column], table[k + 7, column]
-    rows = body if table[k + 4, column] != 0.0 else world
-    wrench[rows, i] = size * x * table[k + 8, column]
-    wrench[rows + 1, i] = size * y * table[k + 9, column]
-    wrench[rows + 2, i] = size * z * table[k + 10, column]
+    to = k + V.direction
+    if table[to, column] != 0.0 or table[to + 1, column] != 0.0 or table[to + 2, column] != 0.0:
+        x, y, z = table[to, column], table[to + 1, column], table[to + 2, column]
+    rows, axes = body if table[k + V.in_body, column] != 0.0 else world, k + V.axes
+    wrench[rows, i] = size * x * table[axes, column]
+    wrench[rows + 1, i] = size * y * table[axes + 1, column]
+    wrench[rows + 2, i] = size * z * table[axes + 2, column]
 
 
 @compiled
@@ -114,6 +117,15 @@ def sample_gust(i, streams, table, gust):
 
 
 @compiled
+def add_gusts(b, gust, first, count):
+    """The present gusts of a block to its wrench."""
+    wrench = b.wrench
+    for axis in range(3):
+        for lane in range(count):
+            wrench[W.force_world + axis, lane] += gust[G.force + axis, first + lane]
+
+
+@compiled
 def advance_gusts(b, gust, first, count):
     """The gusts of a block one control step later, in place, by the normals behind those of the observation."""
     noise = b.noise
@@ -124,18 +136,17 @@ def advance_gusts(b, gust, first, count):
             gust[G.force + axis, i] = kept + added
 
 
-def new_worlds(randomize: Randomization, vehicles: Sequence[Vehicle], n: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def new_worlds(
+    randomize: Randomization, vehicles: Sequence[Vehicle], nominal: FloatArray, n: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Arrays of n rows: of the vehicles that fly, of what is random in their worlds, and of gusts.
 
-    :param vehicles: the nominal ones, n or one for all rows.
+    :param vehicles: the nominal ones, n or one for all rows; ``nominal`` their parameters, (len(PARAMETER_NAMES), n or 1).
     :raises ConfigError: a world that one of them cannot be flown in.
     """
-    flying = np.stack([each.parameters() for each in vehicles], axis=1)
     if randomize == Randomization():
-        return flying, np.zeros((WORLD_SIZE, 0)), np.zeros((GUST_SIZE, 0))
+        return nominal.copy(), np.zeros((WORLD_SIZE, 0)), np.zeros((GUST_SIZE, 0))
     for each in {id(each): each for each in vehicles}.values():
         randomize.check(each)
     worlds = np.stack([randomize.numbers(each) for each in vehicles], axis=1)
-    if randomize.sets_vehicle:
-        flying = np.repeat(flying, n // len(vehicles), axis=1)
-    return flying, worlds, np.zeros((GUST_SIZE, n))
+    return np.repeat(nominal, n // len(vehicles) if randomize.sets_vehicle else 1, axis=1), worlds, np.zeros((GUST_SIZE, n))

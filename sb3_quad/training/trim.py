@@ -32,7 +32,7 @@ from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.vehicles.vehicle import first_vehicle
 
 _POSITION = GROUPS["position"]
 SCALES = (1.0, 0.85, 0.75, 0.65, 0.55, 0.5)  # α
@@ -131,7 +131,7 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings
     seen = _Observations()
     fly(model, TASKS, N_FLIGHTS, seed, max_steps=STEPS, hooks=[seen], **own.in_any_task())
     flown = _latents(model, np.concatenate(seen.kept))
-    hover = load_vehicle(own.vehicle).hover_action
+    hover = first_vehicle(own.vehicle).hover_action
     with th.no_grad():
         weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()  # (inputs + 1, actions)
         before = at_target @ weights - hover

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field, ModelWrapValidatorHandler, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.base.errors import CannotHover
+from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.vehicles.gains import GeometricGains
@@ -216,3 +216,12 @@ def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
         return source
     data, where = VEHICLES.read(source if isinstance(source, Path) else str(source))
     return validate(Vehicle, data, where)
+
+
+def first_vehicle(given: Any) -> Vehicle:
+    """As :func:`load_vehicle`; of a list of vehicles, as ``env_kwargs`` may have one, the first."""
+    if isinstance(given, (list, tuple)):
+        if not given:
+            raise ConfigError("vehicle []: give at least one")
+        given = given[0]
+    return load_vehicle(given)

@@ -163,15 +163,6 @@ def load_commands(b, actions, queue, mixed, first, count):
 
 
 @compiled
-def add_gusts(b, gust, first, count):
-    """The present gusts of a block to its wrench."""
-    wrench = b.wrench
-    for axis in range(3):
-        for lane in range(count):
-            wrench[W.force_world + axis, lane] += gust[axis, first + lane]
-
-
-@compiled
 def load_scored(b, task_index, tasks, first, count):
     """Limits and costs of the tasks that the rows of a block are flying."""
     scored = b.scored

@@ -16,7 +16,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.engine.block import (
     MEMORY,
     NORMALS,
-    add_gusts,
     block_in,
     load_commands,
     load_rows,
@@ -36,7 +35,15 @@ from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import TASK, S
-from sb3_quad.simulation.worlds import GUST_SIZE, WORLD_SIZE, advance_gusts, sample_gust, sample_vehicle, sample_wrench
+from sb3_quad.simulation.worlds import (
+    GUST_SIZE,
+    WORLD_SIZE,
+    add_gusts,
+    advance_gusts,
+    sample_gust,
+    sample_vehicle,
+    sample_wrench,
+)
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 LOOK, SCORE, FLY = range(3)
