@@ -18,15 +18,17 @@ if TYPE_CHECKING:
     from sb3_quad.experts.pid import PIDExpert
     from sb3_quad.ppo_bc.ppo_bc import PPOBC
     from sb3_quad.pretrained_policies import load_pretrained, pretrained
+    from sb3_quad.settings.flight import env_kwargs
 
 __version__ = "0.1.0"
-__all__ = ["PPOBC", "DAgger", "GeometricExpert", "PIDExpert", "__version__", "load_pretrained", "pretrained"]
+__all__ = ["PPOBC", "DAgger", "GeometricExpert", "PIDExpert", "__version__", "env_kwargs", "load_pretrained", "pretrained"]
 
 _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
     "DAgger": "sb3_quad.dagger.dagger",
     "GeometricExpert": "sb3_quad.experts.geometric",
     "PIDExpert": "sb3_quad.experts.pid",
     "PPOBC": "sb3_quad.ppo_bc.ppo_bc",
+    "env_kwargs": "sb3_quad.settings.flight",
     "load_pretrained": "sb3_quad.pretrained_policies",
     "pretrained": "sb3_quad.pretrained_policies",
 }

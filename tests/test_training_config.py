@@ -274,10 +274,13 @@ def test_packaged_files_hold_good_settings(name):
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
     for algo in ("dagger", "ppo_bc"):
-        assert load_config(algo, env_id).expert == build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT == "geometric"
+        assert load_config(algo, env_id).expert == "told_geometric"  # in random worlds
+        assert load_config(algo, env_id, f"nominal/{algo}.yml").expert == DEFAULT_EXPERT == "geometric"
+        assert build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT
         assert build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT  # which config.yml then names
         assert {load_config(algo, env_id, f"{folder}/{algo}.yml").expert for folder in ("pid", "thesis")} == {"pid"}
-    for file, expert in ((DEFAULT_PIPELINE, "geometric"), ("thesis/two_stage.yml", "pid")):
+    pipelines = {DEFAULT_PIPELINE: "told_geometric", "two_stage.yml": "told_geometric", "nominal/two_stage.yml": "geometric"}
+    for file, expert in {**pipelines, "thesis/two_stage.yml": "pid"}.items():
         assert {load_config(each.algo, each.env, each.conf_file).expert for each in load_pipeline(file).stages} == {expert}
 
 

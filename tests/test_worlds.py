@@ -129,15 +129,17 @@ def test_a_nominal_world_is_the_one_without_randomize():
             np.testing.assert_array_equal(ours, theirs)
 
 
-def test_gusts_have_the_spread_and_the_memory_that_were_asked_for():
-    batch = QuadcopterBatch(4000, randomize={"gusts": {"std": 2.0, "time_constant": 0.2}}, seed=0, max_episode_steps=10**6)
+@pytest.mark.parametrize(("std", "unit", "newtons"), [(2.0, "SI", 2.0), (0.1, "weight", 0.1 * 1.727 * 9.81)])
+def test_gusts_have_the_spread_and_the_memory_that_were_asked_for(std, unit, newtons):
+    gusts = {"std": std, "unit": unit, "time_constant": 0.2}
+    batch = QuadcopterBatch(4000, randomize={"gusts": gusts}, seed=0, max_episode_steps=10**6)
     batch.reset()
     gusts = [batch.gust[:3].copy()]
     for _ in range(40):
         batch.step(np.zeros((4000, 4), np.float32))
         gusts.append(batch.gust[:3].copy())
-    assert np.std(gusts[0], axis=1) == pytest.approx(2.0, rel=0.05)
-    assert np.std(gusts[-1], axis=1) == pytest.approx(2.0, rel=0.05)
+    assert np.std(gusts[0], axis=1) == pytest.approx(newtons, rel=0.05)
+    assert np.std(gusts[-1], axis=1) == pytest.approx(newtons, rel=0.05)
     for steps in (10, 20):
         kept = [np.corrcoef(gusts[0][axis], gusts[steps][axis])[0, 1] for axis in range(3)]
         assert kept == pytest.approx([np.exp(-steps * 0.01 / 0.2)] * 3, abs=0.05)

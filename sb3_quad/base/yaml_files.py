@@ -1,7 +1,8 @@
 """YAML files by name, where they come with the package, or by path."""
 
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -85,7 +86,7 @@ class YamlFolder:
     :param suffix: of the files.
     :param in_name: whether the suffix is part of the name, as in ``thesis/dagger.yml``.
     :param folders: further ones inside the package, in the order in which their names are listed.
-    :param former: a folder whose files now lie in the package itself; their former names still find them.
+    :param former: folders that once were, and where their files are now; their former names still find them.
     """
 
     kind: str
@@ -93,7 +94,7 @@ class YamlFolder:
     suffix: str = ".yaml"
     in_name: bool = False
     folders: tuple[str, ...] = ()
-    former: str = ""
+    former: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> list[str]:
         """The names of the files in the package."""
@@ -115,7 +116,9 @@ class YamlFolder:
         """
         if self.is_path(source):
             return read_text(source), str(source)
-        name, files = str(source).removeprefix(self.former), self._files()
+        name, files = str(source), self._files()
+        for former, now in self.former.items():
+            name = name if not name.startswith(former) else now + name.removeprefix(former)
         if name not in files:
             raise ConfigError(f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file")
         return files[name].read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"

@@ -11,6 +11,7 @@ from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import parse_mapping_file
 from sb3_quad.envs.registration import ENVIRONMENTS, MAX_EPISODE_STEPS
 from sb3_quad.experts.models import saved_data
+from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.settings.literals import ZooLoader, parse_mapping
 from sb3_quad.simulation.memory import Memory
 from sb3_quad.simulation.randomization import Randomization
@@ -103,3 +104,15 @@ class FlightSettings(Memory):
         for part in parts:
             given |= parse_mapping(part, where)
         return validate(FlightSettings, given, where), files[0]
+
+
+def env_kwargs(agent: str | Path) -> dict[str, Any]:
+    """What the environments must be given so that they fly as an agent was trained to: its vehicle, noise and observation.
+
+    >>> import gymnasium, sb3_quad
+    >>> env = gymnasium.make("QuadTargetTracking-v0", **sb3_quad.env_kwargs("itm-robust"))
+
+    :param agent: a zip, a run folder, or the name of a policy that comes with the package.
+    :raises ConfigError: a zip or settings that cannot be read.
+    """
+    return FlightSettings.of(agent_path(str(agent)))[0].in_any_task()

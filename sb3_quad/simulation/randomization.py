@@ -119,7 +119,8 @@ class Gusts(Frozen):
     model has along the flight path, with the time constant L / V.
     """
 
-    std: Range = Field(description="standard deviation of each component, N; sampled per episode")
+    std: Range = Field(description="standard deviation of each component, N or as unit says; sampled per episode")
+    unit: Literal["SI", "weight"] = Field(default="SI", description="weight: in weights m g of the vehicle")
     time_constant: PositiveFloat = Field(default=1.0, description="after which a gust has faded to 1/e, s")
 
     @model_validator(mode="after")
@@ -206,11 +207,13 @@ class Randomization(Frozen):
         vectors = (self.force, weight), (self.torque, weight * vehicle.arm_length)
         ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self._delay())
         gusts = self.gusts or Gusts(std=_NONE)
+        gust = weight if gusts.unit == "weight" else 1.0
         parts = [
             *([self.share], [self.wrench_share]),
             *([0.0, 0.0, FIXED] if each is None else each.numbers() for each in ranges),
             *((each or Force(magnitude=_NONE)).numbers(unit) for each, unit in vectors),
-            *(gusts.std.numbers(), [math.exp(-vehicle.control_step / gusts.time_constant)]),
+            [gusts.std.low * gust, gusts.std.high * gust, gusts.std.numbers()[2]],
+            [math.exp(-vehicle.control_step / gusts.time_constant)],
         ]
         return np.array([number for part in parts for number in part], dtype=np.float64)
 

@@ -63,12 +63,16 @@ def single(seconds: float) -> Measurement:
         return _measure("PyBullet, one environment", 1, env.step, (4,), seconds)
 
 
-def vectorised(kind: str, n_envs: int, seconds: float) -> Measurement:
-    """``VecEnv.step`` of ``batch``, ``dummy`` or ``subproc``: physics, noise, reward, resets, infos; random actions."""
-    config = build_config("ppo", ENV_ID, {"n_timesteps": 1, "vec_env": kind})
+def vectorised(kind: str, n_envs: int, seconds: float, randomize: Any = None) -> Measurement:
+    """``VecEnv.step`` of ``batch``, ``dummy`` or ``subproc``: physics, noise, reward, resets, infos; random actions.
+
+    :param randomize: the worlds that the episodes are flown in, nominal ones without it.
+    """
+    config = build_config("ppo", ENV_ID, {"n_timesteps": 1, "vec_env": kind, "env_kwargs": {"randomize": randomize or {}}})
+    name = f"{NAMES[kind]}, random worlds" if randomize else NAMES[kind]
     with closing(make_environments(config, n_envs, 0)) as env:
         env.reset()
-        return _measure(NAMES[kind], n_envs, env.step, (n_envs, 4), seconds)
+        return _measure(name, n_envs, env.step, (n_envs, 4), seconds)
 
 
 def _measure(name: str, n_envs: int, step: Callable[[Any], Any], shape: tuple[int, ...], seconds: float) -> Measurement:

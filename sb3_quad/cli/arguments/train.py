@@ -1,11 +1,12 @@
-"""Train an agent. Without arguments: two stages, DAgger from the geometric expert, then PPO with cloning.
+"""Train an agent. Without arguments: DAgger in random worlds, from the geometric expert that is told the true vehicle and forces.
 
 examples:
-  sb3-quad train                                          both stages, in the batched environment
+  sb3-quad train                                          imitation in random worlds, in the batched environment
+  sb3-quad train --conf-file two_stage.yml                the same, then PPO with a cloning term
+  sb3-quad train --conf-file nominal/two_stage.yml        both stages for one vehicle in still air
   sb3-quad train --conf-file thesis/two_stage.yml         both stages from the PID expert, as in the thesis
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
-  sb3-quad train --algo dagger                            stage one alone
-  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   the same on PyBullet, a process per environment
+  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
@@ -20,7 +21,7 @@ import argparse
 from sb3_quad.cli.parser import BRIDGE, TRUST, Pairs, Parser, pointers, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
-DEFAULT_PIPELINE = "two_stage.yml"
+DEFAULT_PIPELINE = "imitation.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 
 

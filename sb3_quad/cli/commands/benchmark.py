@@ -23,10 +23,12 @@ def run(options: argparse.Namespace) -> int:
     if options.training is not True:
         with screen.status("one PyBullet environment"):
             measurements.append(single(options.seconds))
-        kinds = [("dummy", options.n_envs), ("subproc", options.n_envs), *(("batch", size) for size in options.sizes)]
-        for kind, n_envs in kinds:
+        kinds = [("dummy", options.n_envs, None), ("subproc", options.n_envs, None)]
+        worlds = load_config("dagger", TRAINED).env_kwargs["randomize"]
+        kinds += [("batch", size, randomize) for size in options.sizes for randomize in (None, worlds)]
+        for kind, n_envs, randomize in kinds:
             with screen.status(f"{kind}, {n_envs}"):
-                measurements.append(vectorised(kind, n_envs, options.seconds))
+                measurements.append(vectorised(kind, n_envs, options.seconds, randomize))
     for config in loops:
         with screen.status(f"training loop of {config.algo}"):
             rates, parts[config.algo] = training_loop(config)

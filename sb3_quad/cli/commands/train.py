@@ -136,7 +136,7 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
         controllers[REFERENCE] = load_model(trained.run.result)
     how = result.job.flight_settings.in_any_task()
     print_tables(controllers, how, FRESH_EPISODES, seed_for("table", result.job.seed), THESIS_COLUMNS)
-    print("; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; both stages together: {seconds:.0f} s")
+    print("; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; in all: {seconds:.0f} s")
     for name, entry in result.stages.items():
         print(f"{name}: {entry.agent}")
     print(f"saved in {result.folder}")
