@@ -24,7 +24,12 @@ from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.vehicles.vehicle import VEHICLES
 
 SETTINGS = YamlFolder(
-    "settings file", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("nominal", "pid", "thesis"), former={"geometric/": "nominal/", "robust/": ""}
+    "settings file",
+    "sb3_quad.zoo_configs",
+    ".yml",
+    in_name=True,
+    folders=("nominal", "pid", "thesis"),
+    former={"geometric/": "nominal/", "robust/": ""},
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")

@@ -1,4 +1,4 @@
-"""Train an agent. Without arguments: DAgger in random worlds, from the geometric expert that is told the true vehicle and forces.
+"""Train an agent. Without arguments: DAgger in random worlds, from the geometric expert that is told the truth.
 
 examples:
   sb3-quad train                                          imitation in random worlds, in the batched environment
