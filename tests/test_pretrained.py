@@ -54,7 +54,7 @@ def test_each_flies_as_its_card_says(name):
 
 
 def test_the_robust_one_ends_at_its_target_whatever_pushes():
-    own = FlightSettings.of(sb3_quad.pretrained("itm-robust"))[0].in_any_task()
+    own = sb3_quad.env_kwargs("itm-robust")
     force = {"magnitude": 27**0.5, "direction": [-1, -1, -1]}  # the thesis's
     worlds = {"mass": [0.8, 1.2], "motor_gain": [0.7, 1.5], "force": {"magnitude": [0, 3]}}
     for randomize, largest in (({"force": force}, 0.04), (worlds, 0.1)):
@@ -110,7 +110,7 @@ def run_folder(tmp_path_factory):
     """A short run of the command line, as `publish` expects one."""
     logs = tmp_path_factory.mktemp("logs")
     flags = ["--n-envs", "16", "-n", "1500", "--eval-episodes", "0", "--no-progress", "--seed", "3"]
-    command = ["train", "--algo", "dagger", "--env", "QuadStateRecovery-v0", "-f", str(logs)]
+    command = ["train", "--algo", "dagger", "--env", "QuadStateRecovery-v0", "-f", str(logs), "--conf-file", "nominal/dagger.yml"]
     assert main([*command, *flags, "--hyperparams", "n_steps:50", "gradient_steps:2", "batch_size:64"]) == 0
     return logs / "dagger" / "QuadStateRecovery-v0_1"
 
