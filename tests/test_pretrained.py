@@ -110,8 +110,8 @@ def run_folder(tmp_path_factory):
     """A short run of the command line, as `publish` expects one."""
     logs = tmp_path_factory.mktemp("logs")
     flags = ["--n-envs", "16", "-n", "1500", "--eval-episodes", "0", "--no-progress", "--seed", "3"]
-    command = ["train", "--algo", "dagger", "--env", "QuadStateRecovery-v0", "-f", str(logs), "--conf-file", "nominal/dagger.yml"]
-    assert main([*command, *flags, "--hyperparams", "n_steps:50", "gradient_steps:2", "batch_size:64"]) == 0
+    command = ["train", "--algo", "dagger", "--env", "QuadStateRecovery-v0", "--conf-file", "nominal/dagger.yml"]
+    assert main([*command, "-f", str(logs), *flags, "--hyperparams", "n_steps:50", "gradient_steps:2", "batch_size:64"]) == 0
     return logs / "dagger" / "QuadStateRecovery-v0_1"
 
 
