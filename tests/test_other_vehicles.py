@@ -36,6 +36,7 @@ def here(tmp_path, monkeypatch):
             "name": name,
             "algo": algo,
             "env": ENV,
+            "conf_file": f"nominal/{algo}.yml",
             "pass_on": "last",
             "trim": "hover",
             "settings": {**TINY, "expert": "geometric"},

@@ -68,6 +68,7 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "algo": "daggr"}], "did you mean 'dagger'"),
         ([{**STAGES[0], "settings": {"n_stepz": 3}}], "did you mean 'n_steps'"),
         ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
+        ([{**STAGES[0], "trim": "hover", "conf_file": "dagger.yml"}], "read the 18 features"),
         ([], "at least 1"),
     ],
 )
@@ -170,7 +171,8 @@ def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, mo
 
 def two_stages(tmp_path):
     """The first is to be trimmed."""
-    stages = [{**STAGES[0], "trim": "hover"}, {**STAGES[0], "name": "two"}]
+    first = {**STAGES[0], "conf_file": "nominal/dagger.yml"}
+    stages = [{**first, "trim": "hover"}, {**first, "name": "two"}]
     return with_settings(load_pipeline(write(tmp_path, stages)), {**TINY, "policy_kwargs": {"net_arch": [8]}})
 
 

@@ -32,6 +32,7 @@ from sb3_quad.report.curves import read_curve
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.settings.literals import parse_mapping
+from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import check_tensorboard, resume, train
@@ -174,6 +175,10 @@ def _make_jobs(status: Status) -> list[TrainingJob]:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
+        if stage.trim and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
+            raise ConfigError(
+                f"{where}: trim {stage.trim} is for agents that read the 18 features, not for ones that remember"
+            )
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         jobs.append(validate(TrainingJob, {**status.job, **own, "config": config}, where))
     return jobs

@@ -5,8 +5,9 @@ resumed run is bit for bit the one that was not interrupted; elsewhere episodes 
 """
 
 import copy
+import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,6 +182,8 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
     try:
+        weights = _weights(config.policy_kwargs.get("net_arch"), env)
+        check_memory("policy_kwargs: net_arch", 16.0 * weights)  # each with its gradient and two numbers of Adam's
         model = get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
@@ -197,6 +200,13 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
     if job.trained_agent is not None:
         transfer_policy(job.trained_agent, model)
     return model
+
+
+def _weights(net_arch: Any, env: VecEnv) -> float:
+    """About how many weights the hidden layers of both networks have."""
+    both = [net_arch.get(part, []) for part in ("pi", "vf")] if isinstance(net_arch, Mapping) else [net_arch or []] * 2
+    inputs = float(np.prod(env.observation_space.shape or (1,)))
+    return float(sum(before * after for layers in both for before, after in itertools.pairwise([inputs, *layers])))
 
 
 def _learn(

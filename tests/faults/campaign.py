@@ -34,8 +34,23 @@ TINY = {
 }
 DAGGER = {**TINY, "dataset_capacity": 4000, "gradient_steps": 5}  # a ring that has been round
 STAGES = [
-    {"name": "one", "algo": "dagger", "env": "QuadTargetTracking-v0", "settings": DAGGER, "trim": "hover", "pass_on": "last"},
-    {"name": "two", "algo": "ppo_bc", "env": "QuadStateRecovery-v0", "settings": TINY, "pass_on": "last"},
+    {
+        "name": "one",
+        "algo": "dagger",
+        "env": "QuadTargetTracking-v0",
+        "conf_file": "nominal/dagger.yml",
+        "settings": DAGGER,
+        "trim": "hover",
+        "pass_on": "last",
+    },
+    {
+        "name": "two",
+        "algo": "ppo_bc",
+        "env": "QuadStateRecovery-v0",
+        "conf_file": "nominal/ppo_bc.yml",
+        "settings": TINY,
+        "pass_on": "last",
+    },
 ]
 
 
