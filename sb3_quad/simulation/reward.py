@@ -6,7 +6,7 @@ from sb3_quad.simulation.engine.lowlevel import LANES, compiled
 from sb3_quad.simulation.tasks import S
 
 
-@compiled(fastmath=True, forceinline=True)
+@compiled(fastmath=True)
 def _tilt(sine2, cosine2):
     """arccos(R33) from the squared sine and cosine of its half (their sum is 1), to 1e-15 and without a library call.
 
@@ -26,7 +26,7 @@ def _tilt(sine2, cosine2):
     return angle if sine2 <= cosine2 else math.pi - angle
 
 
-@compiled(forceinline=True)
+@compiled
 def succeeds(b, lane):
     """Whether a flight that ends now ends close enough to its target, and level enough."""
     q, scored = b.quaternion, b.scored

@@ -83,6 +83,26 @@ def test_a_file_that_cannot_be_written_is_done_without(folder, capfd):
     assert "cannot be kept" in capfd.readouterr().err
 
 
+TRAINING = """
+import hashlib
+from sb3_quad import DAgger, GeometricExpert
+from sb3_quad.envs import QuadcopterVecEnv
+
+worlds = {"mass": [0.7, 1.3], "force": [0, 3], "gusts": {"std": 1.0}, "delay": [1, 3]}
+env = QuadcopterVecEnv(70, task="recovery_and_tracking", randomize=worlds, history=[0, 1], last_action=True)
+model = DAgger("MlpPolicy", env, GeometricExpert(), n_steps=20, batch_size=600, n_epochs=2, seed=0).learn(2 * 70 * 20)
+print(hashlib.sha256(b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())).hexdigest())
+"""
+
+
+def test_what_is_compiled_now_computes_what_the_cache_holds_to_the_last_bit(tmp_path):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    command = [sys.executable, "-W", "ignore", "-c", TRAINING]
+    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2))
+    assert "compiling" in first.stderr and "compiling" not in second.stderr
+    assert first.stdout == second.stdout
+
+
 CODE = """
 import sys
 import numpy as np

@@ -63,13 +63,13 @@ BLOCK = np.dtype(_FIELDS)
 MEMORY = BLOCK.itemsize + 64  # bytes of the array that a block lies in, at a cache line
 
 
-@compiled(forceinline=True)
+@compiled
 def block_in(memory):
     """The block in a uint8 array of ``MEMORY`` bytes."""
     return carray(pointer((memory.ctypes.data + 63) // 64 * 64), 1, BLOCK)[0]
 
 
-@compiled(forceinline=True)
+@compiled
 def load_rows(source, first, count, target):
     """Copy the first rows of a (rows, n) array to those of a block."""
     for k in range(target.shape[0]):

@@ -22,11 +22,13 @@ LANES = 64  # rows of a block; a multiple of every vector width, small enough fo
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     """``numba.njit`` with a cache that notices a change in any of this package's compiled modules.
 
-    Numba looks only at the file of the function itself, but keeps what it calls, from other files, compiled in.
+    Numba looks only at the file of the function itself, but keeps what it calls, from other files, compiled in. All calls are
+    inlined, whatever LLVM thinks of it: a function left to be called would in the process that compiles be another copy of
+    it than in one that loads its caller from the cache, and two copies can round differently under ``fastmath``.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
-    dispatcher = numba.njit(error_model="numpy", nogil=True, **options)(function)
+    dispatcher = numba.njit(error_model="numpy", nogil=True, forceinline=True, **options)(function)
     try:
         dispatcher._cache = Cache(function, _source_stamp())
     except RuntimeError:

@@ -44,7 +44,7 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
     return streams
 
 
-@compiled(forceinline=True)
+@compiled
 def _round(c0, c1, c2, c3, k0, k1):
     # In uint64 whose upper half is left to hold anything: AVX2 multiplies the lower halves of 64-bit lanes.
     p0 = uint64(0xD2511F53) * (c0 & _MASK)
@@ -52,7 +52,7 @@ def _round(c0, c1, c2, c3, k0, k1):
     return (p1 >> _SHIFT) ^ c1 ^ k0, p1, (p0 >> _SHIFT) ^ c3 ^ k1, p0
 
 
-@compiled(forceinline=True)
+@compiled
 def philox(c0, c1, c2, c3, k0, k1):
     """Philox4x32-10: four uint32 from a counter of four and a key of two."""
     c0, c1, c2, c3, k0, k1 = uint64(c0), uint64(c1), uint64(c2), uint64(c3), uint64(k0), uint64(k1)
@@ -63,7 +63,7 @@ def philox(c0, c1, c2, c3, k0, k1):
     return uint32(c0), uint32(c1), uint32(c2), uint32(c3)
 
 
-@compiled(forceinline=True)
+@compiled
 def _words(streams, row, block, purpose):
     counter = uint32(block), streams[STEP, row], streams[EPISODE, row], uint32(purpose)
     return philox(*counter, streams[KEY_LO, row], streams[KEY_HI, row])
@@ -91,7 +91,7 @@ def random_words(b, count):
             word[4 * block + 2, lane], word[4 * block + 3, lane] = w2, w3
 
 
-@compiled(forceinline=True)
+@compiled
 def _log(x):
     """ln x of a positive float32: the exponent, and a polynomial on [sqrt(1/2), sqrt(2))."""
     bits = np.float32(x).view(np.int32)
