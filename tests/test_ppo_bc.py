@@ -16,6 +16,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.common import CLONING_LOSSES, evaluate_actions
+from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.settings.algorithms import constructor_parameters
 
@@ -122,6 +123,13 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, rows):
     model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, bc_loss="mse", bc_filter=bc_filter, **SMALL)
     errors, advantages = th.tensor([[0.1], [-0.2], [0.4]]), th.tensor([1.0, -1.0, 0.0])
     assert model._bc_loss(th.zeros(3, 1), errors, advantages).item() == pytest.approx(errors[rows].square().sum().item() / 3)
+
+
+def test_the_log_likelihood_is_a_sum_over_the_action_as_in_eq_3_12():
+    model = PPOBC("MlpPolicy", QuadcopterVecEnv(2), bc_coef=0.0, n_steps=8, batch_size=16, device="cpu")
+    mean, actions = th.randn(5, 4), th.randn(5, 4)
+    log_likelihood = th.distributions.Normal(mean, model.policy.log_std.exp()).log_prob(actions).sum(dim=1)
+    assert model._bc_loss(mean, actions, th.zeros(5)).item() == pytest.approx(-log_likelihood.mean().item(), rel=1e-5)
 
 
 def test_labels_belong_to_the_state_before_the_step():
@@ -296,7 +304,7 @@ def test_bad_arguments_are_named(arguments):
 
 def test_the_signature_is_ppos_and_what_is_added():
     stock, ours = (inspect.signature(algorithm).parameters for algorithm in (PPO, PPOBC))
-    added = ["expert", "bc_coef", "bc_loss", "bc_filter", "l2_coef", "max_clipped_value", "critic_warmup"]
+    added = ["expert", "bc_coef", "bc_loss", "bc_filter", "l2_coef", "max_clipped_value", "critic_warmup", "shuffle"]
     assert [*ours] == [*(name for name in stock if name != "_init_setup_model"), *added, "_init_setup_model"]
     assert all(ours[name].default == stock[name].default for name in stock)
     assert {*added, "learning_rate"} - {"expert"} <= constructor_parameters(PPOBC).keys()
@@ -315,3 +323,15 @@ def test_dict_observations_are_refused():
 
     with pytest.raises(ConfigError, match="FlattenObservation"):
         PPOBC("MultiInputPolicy", Nothing(), expert=swing_back)
+
+
+def test_in_order_mini_batches_follow_each_other_in_time():
+    model = PPOBC("MlpPolicy", make_vec_env("Pendulum-v1", n_envs=3), n_steps=4, batch_size=6, shuffle=False, bc_coef=0.0)
+    buffer = model.rollout_buffer
+    buffer.reset()
+    for step in range(4):
+        rewards = np.arange(3.0) + 10 * step
+        buffer.add(np.zeros((3, 3)), np.zeros((3, 1)), rewards, np.zeros(3), th.zeros(3), th.zeros(3))
+    buffer.returns[:] = buffer.rewards
+    seen = [buffer.samples(rows)[0].returns.tolist() for rows in buffer.indices(6, model.shuffle)]
+    assert seen == [[0, 1, 2, 10, 11, 12], [20, 21, 22, 30, 31, 32]]

@@ -80,6 +80,8 @@ class DAgger(OnPolicyAlgorithm):
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
+    :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis prepares them
+        ("chronologically", 4.2.3)
     :raises ConfigError: an argument out of range, or a space that is not supported
     :raises ExpertError: an expert that does not fit the environment
     """
@@ -109,6 +111,7 @@ class DAgger(OnPolicyAlgorithm):
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
         dataset_capacity: int = 1_500_000,
+        shuffle: bool = True,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -157,6 +160,7 @@ class DAgger(OnPolicyAlgorithm):
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
+        self.shuffle = shuffle
         self.expert: Any = None
         self._n_rollouts = 0
         self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
@@ -317,9 +321,9 @@ class DAgger(OnPolicyAlgorithm):
         n_rows = buffer.buffer_size * buffer.n_envs
         n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
         n_batches = min(n_batches, self.n_epochs * n_rows)
-        actor_batches = sample_rows(len(self.dataset), n_batches * self.batch_size, rng).reshape(n_batches, -1)
+        actor_batches = sample_rows(len(self.dataset), n_batches * self.batch_size, rng, self.shuffle).reshape(n_batches, -1)
         n_critic = min(self.n_epochs * -(-n_rows // self.batch_size), n_batches)  # steps in which the critic takes part
-        critic_batches = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng), n_critic))
+        critic_batches = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle), n_critic))
         flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
         values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
         networks = common.perceptrons(self.policy)

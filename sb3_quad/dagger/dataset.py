@@ -107,8 +107,10 @@ class AggregatedDataset:
             raise ConfigError(f"dataset {path}: holds arrays of shape {given}, this model needs {needed}")
 
 
-def sample_rows(n_rows: int, count: int, rng: np.random.Generator) -> IntArray:
-    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at random."""
+def sample_rows(n_rows: int, count: int, rng: np.random.Generator, shuffle: bool = True) -> IntArray:
+    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at random; or all in order."""
+    if not shuffle:
+        return np.arange(count, dtype=np.int64) % n_rows
     passes, rest = divmod(count, n_rows)
     parts = [rng.permutation(n_rows) for _ in range(passes)]
     return np.concatenate([*parts, rng.integers(n_rows, size=rest)]).astype(np.int64, copy=False)

@@ -46,7 +46,7 @@ class PPOBC(PPO):
         an SB3 model, or a callable from observations to actions. Needed when learning starts with a cloning weight.
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining progress (SB3's
         ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
-    :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a mean over the action's
+    :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum over the action's
         dimensions; ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone;
         ``"huber"``, that is linear beyond 0.05; or ``"huber_mse"``, that and three times the squared error.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"negative_advantage"``, where the flown action did worse than
@@ -58,6 +58,8 @@ class PPOBC(PPO):
         ``clip_range_vf`` is given; False for stock PPO's clipped error.
     :param critic_warmup: for this many rollouts only the critic learns. A critic that comes from another task, or from another
         policy, would otherwise spoil the actor with its first advantages.
+    :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis prepares them
+        ("chronologically", 4.2.3).
     :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
     :raises ExpertError: when learning starts, or at the latest with the first rollout that is to be cloned: no expert, or
         one whose labels do not fit.
@@ -74,6 +76,7 @@ class PPOBC(PPO):
         l2_coef: float = 0.0,
         max_clipped_value: bool = True,
         critic_warmup: int = 0,
+        shuffle: bool = True,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ):
@@ -93,6 +96,7 @@ class PPOBC(PPO):
         self.l2_coef = l2_coef
         self.max_clipped_value = max_clipped_value
         self.critic_warmup = critic_warmup
+        self.shuffle = shuffle
         self._n_rollouts_trained = 0
         self._rollout_bc_coef = 0.0  # the weight in the update on the present rollout, which is labelled if there is one
 
@@ -194,7 +198,7 @@ class PPOBC(PPO):
 
         for epoch in range(self.n_epochs):
             first = len(monitored)
-            for index in buffer.indices(self.batch_size):
+            for index in buffer.indices(self.batch_size, self.shuffle):
                 if networks is not None:  # +
                     targets = targets or buffer.targets(labelled=bc_coef != 0.0)
                     coefs = (bc_coef, clip_range, clip_range_vf)
@@ -326,7 +330,6 @@ class PPOBC(PPO):
             shift, scale = float(advantages.mean()), 1.0 / (float(advantages.std(ddof=1)) + 1e-8)
         rows: dict[str, float] = {"clip_range": clip_range, "shift": shift, "scale": scale}
         rows |= {"filter": BC_FILTERS.index(self.bc_filter), "agreement": AGREEMENT}
-        n_actions = len(networks.log_std) if self.bc_loss == "nll" else 1  # a mean over them
 
         def of_actor(cloning: float, policy: float) -> FloatArray:
             terms = common.actor_terms(self.bc_loss, cloning, policy=policy, labelled=bc_coef != 0.0, **rows)
@@ -334,11 +337,11 @@ class PPOBC(PPO):
 
         own = [*networks.actor.parameters(), networks.log_std]
         if norms is not None:
-            for name, weights in {"policy": (0.0, 1.0), "bc": (bc_coef / n_actions, 0.0)}.items():
+            for name, weights in {"policy": (0.0, 1.0), "bc": (bc_coef, 0.0)}.items():
                 if any(weights):
                     of_actor(*weights)
                     norms[name] = _norm(own)
-        sums = of_actor(bc_coef / n_actions, 1.0)
+        sums = of_actor(bc_coef, 1.0)
         critic = common.critic_terms(self.vf_coef, clip_range_vf, self.max_clipped_value)
         value = networks.critic.gradient(observations, index, for_critic, critic)[0] / len(index)
         if norms is not None:
@@ -358,11 +361,11 @@ class PPOBC(PPO):
         logged |= {"approx_kl": kl, "clip_fraction": clipped}
         loss = self.vf_coef * value
         if bc_coef != 0.0:
-            logged["bc_loss"] = bc / n_actions
+            logged["bc_loss"] = bc
         if self.l2_coef > 0.0:
             logged["l2_loss"] = l2
         if not warming_up:
-            loss += policy + self.ent_coef * entropy + bc_coef * bc / n_actions + self.l2_coef * l2
+            loss += policy + self.ent_coef * entropy + bc_coef * bc + self.l2_coef * l2
         return {name: th.tensor(number, dtype=th.float32) for name, number in {"loss": loss, **logged}.items()}
 
     def _diverged(self, what: str) -> TrainingError:
@@ -376,8 +379,6 @@ class PPOBC(PPO):
         :param advantages: (batch_size,), before they are normalised.
         """
         errors = common.cloning_errors(self.bc_loss, mean, self.policy.log_std, expert_actions)
-        if self.bc_loss == "nll":
-            errors = errors / expert_actions.shape[1]
         if self.bc_filter == "negative_advantage":
             errors = errors * (advantages < 0)
         elif self.bc_filter == "agreement":
@@ -419,11 +420,14 @@ class ExpertRolloutBuffer(RolloutBuffer):
         for index in self.indices(batch_size):
             yield self.samples(index)
 
-    def indices(self, batch_size: int | None = None) -> Generator[IntArray, None, None]:
-        """The rows of each mini-batch of :meth:`get`."""
+    def indices(self, batch_size: int | None = None, shuffle: bool = True) -> Generator[IntArray, None, None]:
+        """The rows of each mini-batch of :meth:`get`; without ``shuffle``, consecutive in time over all environments."""
         if not self.generator_ready:
             self.expert_actions = self.swap_and_flatten(self.expert_actions)
-        yield from super().get(batch_size)  # type: ignore[misc]
+        in_time, first = np.arange(self.buffer_size * self.n_envs).reshape(self.n_envs, -1).T.reshape(-1), 0
+        for index in super().get(batch_size):
+            yield index if shuffle else in_time[first : first + len(index)]  # type: ignore[misc]
+            first += len(index)
 
     def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> IntArray:  # type: ignore[override]
         return batch_inds
