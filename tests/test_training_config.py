@@ -19,6 +19,7 @@ from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get
 from sb3_quad.settings.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.settings.values import convert, qualified_classes, takes_whole
+from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline
 
@@ -265,7 +266,7 @@ def test_packaged_files_hold_good_settings(name):
     content, _ = SETTINGS.read(name)
     if "stages" in content:
         pytest.skip("a pipeline")
-    algo = name.rpartition("/")[2].removesuffix(".yml")
+    algo = name.rpartition("/")[2].removesuffix(".yml").replace("reference", "ppo_bc")
     assert algo in ALGORITHMS
     for env_id in content:
         assert load_config(algo, env_id, name).n_timesteps > 0
@@ -280,20 +281,36 @@ def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
         assert build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT  # which config.yml then names
         assert {load_config(algo, env_id, f"{folder}/{algo}.yml").expert for folder in ("pid", "thesis")} == {"pid"}
     pipelines = {DEFAULT_PIPELINE: "told_geometric", "two_stage.yml": "told_geometric", "nominal/two_stage.yml": "geometric"}
-    for file, expert in {**pipelines, "thesis/two_stage.yml": "pid"}.items():
+    for file, expert in {**pipelines, "pid/two_stage.yml": "pid", "thesis/two_stage.yml": "pid"}.items():
         assert {load_config(each.algo, each.env, each.conf_file).expert for each in load_pipeline(file).stages} == {expert}
 
 
-def test_thesis_settings_are_table_a4():
-    config = load_config("dagger", ENV, "thesis/dagger.yml")
-    used = config.hyperparams
-    assert (config.n_envs, used["n_steps"], used["n_epochs"]) == (240, 1500, 12)
-    assert config.n_envs * used["n_steps"] / used["batch_size"] == 8
-    assert (used["learning_rate"], used["vf_coef"], used["ent_coef"], used["l2_coef"]) == (5e-5, 0.5, 5e-4, 1e-4)
-    assert (used["beta"], used["beta_decay"], used["beta_final"]) == (0.5, 0.001, 0.3)
-    assert used["bc_loss"] == "nll"
-    assert used["dataset_capacity"] == 0
-    assert config.n_timesteps == 550 * 240 * 1500
+def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
+    pipeline = load_pipeline("thesis/two_stage.yml")
+    stages = {each.name: each for each in (*pipeline.stages, pipeline.reference)}
+    configs = {name: load_config(each.algo, each.env, each.conf_file) for name, each in stages.items()}
+    batches = {"IL-agent": 8, "RL-agent": 3, "PPO only": 3}
+    epochs = {"IL-agent": 12, "RL-agent": 6, "PPO only": 6}
+    rollouts = {"IL-agent": 550, "RL-agent": 2450, "PPO only": 3000}  # 4.2.3
+    for name, config in configs.items():
+        used = config.hyperparams
+        assert (config.n_envs, used["n_steps"]) == (240, 1500)
+        assert config.n_envs * used["n_steps"] / used["batch_size"] == batches[name] and used["n_epochs"] == epochs[name]
+        assert config.n_timesteps == rollouts[name] * 240 * 1500
+        assert (used["gamma"], used["gae_lambda"], used["vf_coef"], used["l2_coef"]) == (0.998, 0.95, 0.5, 1e-4)
+        assert (used["max_grad_norm"], used["clip_range_vf"], used["shuffle"]) == (0.5, 0.2, False)
+        assert config.policy_kwargs["net_arch"] == [64, 64] and config.policy_kwargs["activation_fn"] is nn.Tanh  # 4.2
+    imitated = configs["IL-agent"].hyperparams
+    assert (imitated["beta"], imitated["beta_final"], imitated["beta_decay"]) == (0.5, 0.3, 0.001)
+    assert (imitated["learning_rate"], imitated["ent_coef"]) == (5e-5, 5e-4)
+    assert (imitated["bc_loss"], imitated["dataset_capacity"]) == ("nll", 0)
+    for name, c_bc in {"RL-agent": 0.005, "PPO only": 0.0}.items():
+        used = configs[name].hyperparams
+        assert (used["learning_rate"], used["clip_range"], used["ent_coef"], used["bc_coef"]) == (7.5e-4, 0.2, 1e-4, c_bc)
+    assert (configs["RL-agent"].hyperparams["bc_loss"], configs["RL-agent"].expert) == ("nll", "pid")
+    reward = TASKS["state_recovery"]
+    assert (reward.position_cost, reward.tilt_cost, reward.body_rates_cost) == (0.003, 0.002, 0.0005)
+    assert (reward.collision_cost, reward.out_of_range_cost) == (15.0, 15.0)
 
 
 def test_classes_in_every_form_of_rl_zoo():

@@ -60,6 +60,7 @@ class Stage(Frozen):
     env: str = Field(description="as for a single run")
     conf_file: str | None = Field(default=None, description="settings file; <algo>.yml of the package without it")
     settings: dict[str, Any] = Field(default={}, description="changes to these settings, such as n_timesteps: 5_000_000")
+    begin: Literal["before", "new"] = Field(default="before", description="from the agent of the stage before, or a new one")
     pass_on: Literal["best", "last"] = Field(default="best", description="the best evaluation, by success, then by reward")
     trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
@@ -67,10 +68,16 @@ class Stage(Frozen):
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
 
+REFERENCE = Stage(name="PPO only", algo="ppo", env="QuadStateRecovery-v0", begin="new")
+
+
 class Pipeline(Frozen):
     """The stages, in order."""
 
     stages: tuple[Stage, ...] = Field(min_length=1)
+    reference: Stage = Field(
+        default=REFERENCE, description="a further stage, by --reference, on as many timesteps as the others"
+    )
 
 
 class StageResult(Frozen):
@@ -123,6 +130,18 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
     return validate(Pipeline, *SETTINGS.read(conf_file))
 
 
+def with_reference(pipeline: Pipeline) -> Pipeline:
+    """The same and its reference as a last stage, on as many timesteps as the others together, in the same environments.
+
+    :raises ConfigError: settings that do not fit, named with their stage.
+    """
+    configs = [load_config(each.algo, each.env, each.conf_file, each.settings) for each in pipeline.stages]
+    shared = {"n_timesteps": sum(each.n_timesteps for each in configs), "vec_env": configs[0].vec_env}
+    own = {"env_kwargs": configs[0].flight_settings.in_any_task()}
+    reference = pipeline.reference.model_copy(update={"settings": {**shared, **own, **pipeline.reference.settings}})
+    return pipeline.model_copy(update={"stages": (*pipeline.stages, reference)})
+
+
 def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
     """The pipeline with ``changes`` put over the settings of every stage (into them, for ``env_kwargs``)."""
     stages = []
@@ -132,7 +151,7 @@ def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
         if any(parts):
             settings["env_kwargs"] = with_vehicle_path({**parts[0], **parts[1]})
         stages.append(stage.model_copy(update={"settings": settings}))
-    return Pipeline(stages=tuple(stages))
+    return pipeline.model_copy(update={"stages": tuple(stages)})
 
 
 def run_pipeline(
@@ -201,7 +220,8 @@ def _go_on(
                 if number == len(done):
                     report(f"{stage.name}: {describe(job)}")
                     current = status.current if number == len(status.done) else None
-                    start = job.model_copy(update={"trained_agent": done[-1].agent}) if done else job
+                    goes_on = done and stage.begin == "before"
+                    start = job.model_copy(update={"trained_agent": done[-1].agent}) if goes_on else job
                     entry = _train_stage(stage, start, current, report, write, changes)
                     if entry is not None:
                         done.append(entry)

@@ -4,7 +4,8 @@ examples:
   sb3-quad train                                          imitation in random worlds, in the batched environment
   sb3-quad train --conf-file two_stage.yml                the same, then PPO with a cloning term
   sb3-quad train --conf-file nominal/two_stage.yml        both stages for one vehicle in still air
-  sb3-quad train --conf-file thesis/two_stage.yml         both stages from the PID expert, as in the thesis
+  sb3-quad train --conf-file pid/two_stage.yml            both stages from the PID expert
+  sb3-quad train --conf-file thesis/two_stage.yml         the thesis's recipe as it prints it; hours
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard

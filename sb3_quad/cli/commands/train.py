@@ -22,12 +22,14 @@ from sb3_quad.networks import share_out
 from sb3_quad.settings.config import TrainingConfig, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import (
+    REFERENCE,
     PipelineResult,
     is_pipeline,
     is_pipeline_run,
     load_pipeline,
     resume_pipeline,
     run_pipeline,
+    with_reference,
     with_settings,
 )
 from sb3_quad.training.runs import open_run
@@ -38,8 +40,7 @@ KEPT_BY_RESUME = (
     *("eval_env_kwargs", "trained_agent", "log_folder", "seed"),
 )
 FRESH_EPISODES = 960  # in each table of a pipeline
-REFERENCE, REFERENCE_ALGO, REFERENCE_ENV = "PPO only", "ppo", "QuadStateRecovery-v0"
-THESIS_COLUMNS = ("expert", "IL-agent", "RL-agent", REFERENCE)
+THESIS_COLUMNS = ("expert", "IL-agent", "RL-agent", REFERENCE.name)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -48,11 +49,11 @@ def run(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     arguments = {**given(options, *TrainingJob.model_fields), "progress": shows_progress(options.progress)}
     if options.resume is not None:
-        for name in given(options, *KEPT_BY_RESUME):
+        for name in [*given(options, *KEPT_BY_RESUME), *["reference"] * options.reference]:
             raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
         folder = Path(options.resume)
         if is_pipeline_run(folder):
-            return _finish_stages(resume_pipeline(folder, **arguments), options.reference, start)
+            return _finish_stages(resume_pipeline(folder, **arguments), start)
         return _finish(resume(options.resume, **arguments))
     arguments["unique"] = options.uuid
     conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
@@ -62,7 +63,8 @@ def run(options: argparse.Namespace) -> int:
                 own = f"a pipeline's stages have their own in {conf_file}"
                 raise ConfigError(f"{flag} goes with a single run (--algo, --env); {own}")
         pipeline = with_settings(load_pipeline(conf_file), _changed_settings(options))
-        return _finish_stages(run_pipeline(pipeline, arguments, Path(conf_file).stem), options.reference, start)
+        pipeline = with_reference(pipeline) if options.reference else pipeline
+        return _finish_stages(run_pipeline(pipeline, arguments, Path(conf_file).stem), start)
     if options.reference:
         raise ConfigError("--reference goes with a pipeline, such as train without --algo and --env")
     job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
@@ -111,10 +113,9 @@ def _finish(result: TrainingResult) -> int:
     return 0
 
 
-def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int:
-    """Train the reference agent if it is wanted, print both tasks' tables, tell where everything is. Returns the exit code.
+def _finish_stages(result: PipelineResult, start: float) -> int:
+    """Print both tasks' tables, tell where everything is. Returns the exit code.
 
-    :param reference: PPO alone, on as many timesteps as all stages had together.
     :param start: when the pipeline began, s.
     """
     if result.exit_code != 0:
@@ -123,22 +124,11 @@ def _finish_stages(result: PipelineResult, reference: bool, start: float) -> int
     times = {name: entry.seconds for name, entry in result.stages.items()}
     controllers = {"expert": resolve_expert(config.expert or DEFAULT_EXPERT, result.job.flight_settings.vehicle)}
     controllers |= {name: load_model(entry.agent) for name, entry in result.stages.items()}
-    if reference:
-        settings: dict[str, Any] = {"vec_env": config.vec_env, "env_kwargs": config.flight_settings.in_any_task()}
-        settings["n_timesteps"] = sum(entry.timesteps for entry in result.stages.values())
-        alone = load_config(REFERENCE_ALGO, REFERENCE_ENV, None, settings)
-        job = result.job.model_copy(update={"config": alone, "trained_agent": None})
-        print(f"{REFERENCE}: {describe(job)}")
-        trained = train(job)
-        if trained.exit_code != 0:
-            return trained.exit_code
-        times[REFERENCE] = trained.seconds
-        controllers[REFERENCE] = load_model(trained.run.result)
     how = result.job.flight_settings.in_any_task()
     print_tables(controllers, how, FRESH_EPISODES, seed_for("table", result.job.seed), THESIS_COLUMNS)
     print("; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; in all: {seconds:.0f} s")
     for name, entry in result.stages.items():
         print(f"{name}: {entry.agent}")
     print(f"saved in {result.folder}")
-    print_next(open_run(list(result.stages.values())[-1].run))
+    print_next(open_run([entry for name, entry in result.stages.items() if name != REFERENCE.name][-1].run))
     return 0
