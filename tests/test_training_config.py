@@ -285,6 +285,18 @@ def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
         assert {load_config(each.algo, each.env, each.conf_file).expert for each in load_pipeline(file).stages} == {expert}
 
 
+@pytest.mark.parametrize("name", [name for name in SETTINGS.names() if "two_stage" not in name and name != DEFAULT_PIPELINE])
+def test_the_section_of_an_environment_trains_its_task_and_the_first_line_names_a_mixture(name):
+    algo = name.rpartition("/")[2].removesuffix(".yml").replace("reference", "ppo_bc")
+    for env_id, task in ENVIRONMENTS.items():
+        config = load_config(algo, env_id, name)
+        flown, line = config.env_kwargs.get("task", task), describe(TrainingJob(config=config))
+        if isinstance(flown, str):
+            assert flown == task and "tasks" not in line
+        else:
+            assert max(flown, key=flown.get) == task and f"tasks {flown[task]:.0%} {task}, " in line
+
+
 def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
     pipeline = load_pipeline("thesis/two_stage.yml")
     stages = {each.name: each for each in (*pipeline.stages, pipeline.reference)}

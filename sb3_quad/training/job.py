@@ -1,5 +1,6 @@
 """What one training run is asked to do, beyond its settings."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import torch as th
@@ -68,7 +69,10 @@ def describe(job: TrainingJob) -> str:
     idle = "; critic_warmup lasts all of it, so that the policy will not learn" if warming else ""
     start = f", from {job.trained_agent}" if job.trained_agent else ""
     expert = f", expert {config.expert}" if config.expert is not None else ""
+    task = config.env_kwargs.get("task")
+    shares = {name: share / sum(task.values()) for name, share in task.items()} if isinstance(task, Mapping) else {}
+    mixture = f", tasks {', '.join(f'{share:.0%} {name}' for name, share in shares.items())}" if shares else ""
     return (
         f"{config.algo} on {config.env_id}: {timesteps:,} timesteps{asked}, rollouts of {n_steps} steps, "
-        f"{config.n_envs} environments ({config.vec_env}){expert}, seed {job.seed}{start}{idle}"
+        f"{config.n_envs} environments ({config.vec_env}){mixture}{expert}, seed {job.seed}{start}{idle}"
     )
