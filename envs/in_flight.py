@@ -89,6 +89,11 @@ class InFlight:
         return self._by_row(self.batch.noise_level)
 
     @property
+    def additive_noise(self) -> Any:
+        """Standard deviations of the noise that is added, in σ, (n,)."""
+        return self._by_row(self.batch.additive_level)
+
+    @property
     def observation_mean(self) -> FloatArray:
         """μ of Eq. 3.16, (n, 18)."""
         return self._by_row(self.batch.mean)

@@ -122,7 +122,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `task` | by id | a name, a :class:`~sb3_quad.simulation.tasks.Task`, or a mixture `{name: weight}` |
     | `task_kwargs` | `None` | fields of the task to override |
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.vehicles.vehicle.Vehicle` |
-    | `noise` | 0.05 | relative standard deviation of the observation noise; 0: none |
+    | `noise` | 0.05 | relative std of the observation noise; or `{"relative": …, "additive": …}`, the second in σ |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
     | `last_action` | `False` | whether a frame ends with the action before it, so that it has 22 numbers |
     | `history` | `None` | ages of the frames that are seen, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |

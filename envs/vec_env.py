@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sb3_quad.envs.bullet import Renderer
 
 _SETTABLE = ("target", "noise", "observation_mean", "observation_std", "task")
-_OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench")
+_OF_ROWS = ("target", "noise", "additive_noise", "observation_mean", "observation_std", "wrench")
 _METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
 
 

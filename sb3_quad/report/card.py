@@ -10,6 +10,7 @@ from sb3_quad.evaluation.records import Metrics
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.simulation.memory import Memory
+from sb3_quad.simulation.noise import in_words
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 DISTANCES = (10.0, 15.0, 20.0)  # m
@@ -23,7 +24,7 @@ to targets. It reads the 18 features of `sb3_quad`'s environments, scaled as the
 
 ## Measured
 
-{recoveries:,} fresh recoveries and {targets:,} fresh targets at each distance; {noise:g} % observation noise, the mean action.
+{recoveries:,} fresh recoveries and {targets:,} fresh targets at each distance; {noise} observation noise, the mean action.
 95 % intervals.
 
 {table}
@@ -84,7 +85,7 @@ def write_card(
         name=name,
         memory=f" It also reads what they were before, as these `env_kwargs` say:\n`{kept}`." if kept else "",
         vehicle=settings["vehicle"],
-        noise=100 * settings["noise"],
+        noise=in_words(settings["noise"]),
         recoveries=measured[RECOVERY].n,
         targets=next(metrics.n for task, metrics in measured.items() if task != RECOVERY),
         table=Table(columns, rows).markdown(),

@@ -22,6 +22,7 @@ from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, hits_
 from sb3_quad.report.varied import families_plot, group_plots
 from sb3_quad.scenarios.load import axis_label
 from sb3_quad.scenarios.scenario import Scenario
+from sb3_quad.simulation.noise import in_words
 
 OVERVIEW = (
     "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within 0.25 m and tilted by at"
@@ -67,7 +68,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
                 tables.append(_share_table(SUCCESS, results, cells, colours, corner))
         facts = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
-            f"observation noise {100 * first.noise:g} %; seed {first.seed}"
+            f"observation noise {in_words(first.noise)}; seed {first.seed}"
         )
         parts.append(Section(first.group or first.name, heading, first.description, tables, plots, facts))
     return parts

@@ -22,6 +22,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
+from sb3_quad.simulation.noise import Noise
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
@@ -74,8 +75,8 @@ class Scenario(Frozen):
     start: Start = Field(default=Start(), description="where an episode starts; left out: hovering at (0, 0, 15) m")
     target: Target = Field(default=Target(distance=0.0), description="where to fly; left out: to the start")
     wrenches: tuple[Wrench, ...] = Field(default=(), description="external forces and torques")
-    noise: Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.05, description="relative std of the observation noise, a share: 0.05 is 5 %"
+    noise: Noise | Annotated[float, Field(ge=0, le=1)] = Field(
+        default=0.05, description="relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"
     )
     duration: Annotated[float, Field(gt=0, le=600)] = Field(default=15.0, description="of an episode; the unit is s")
     max_distance: PositiveFloat = Field(default=30.0, description="farther than this from the target ends an episode, m")

@@ -14,6 +14,7 @@ from sb3_quad.experts.models import saved_data
 from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.settings.literals import ZooLoader, parse_mapping
 from sb3_quad.simulation.memory import Memory
+from sb3_quad.simulation.noise import NoiseLevel
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
@@ -29,7 +30,7 @@ class FlightSettings(Memory):
     vehicle: Any = Field(
         default="itm", description="name, path or Vehicle; or a list, of which row i flies number i, counted round"
     )
-    noise: float = Field(default=0.05, ge=0, description="relative standard deviation of the observation noise")
+    noise: NoiseLevel = Field(default=0.05, description="relative standard deviation of the observation noise, or Noise")
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
     observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
     randomize: Randomization | None = Field(default=None, description="fields of Randomization: what differs by episode")

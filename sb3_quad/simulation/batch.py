@@ -15,6 +15,7 @@ from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
 from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run
 from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
+from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.randomization import resolve_randomization
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
@@ -54,7 +55,8 @@ class QuadcopterBatch:
     :param task_kwargs: fields of the task to override.
     :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of them whose time steps agree:
         row i has number i, counted round.
-    :param noise: relative standard deviation of the observation noise, shape () or (n_envs,).
+    :param noise: relative standard deviation of the observation noise, shape () or (n_envs,); or a
+        :class:`~sb3_quad.simulation.noise.Noise` or its fields.
     :param observation_mean: μ of Eq. 3.16, shape (18,) or (n_envs, 18); None: zero.
     :param observation_std: σ of Eq. 3.16, likewise; None: Table A.2.
     :param last_action: whether a policy sees its last action; ``history``, of which age the frames are that it sees;
@@ -114,7 +116,7 @@ class QuadcopterBatch:
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         # One column serves all rows until rows are set apart.
-        self.noise_level = np.zeros(1)
+        self.noise_level, self.additive_level = np.zeros(1), np.zeros(1)
         self.mean = DEFAULT_MEAN[:, None].copy()
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
@@ -260,14 +262,14 @@ class QuadcopterBatch:
         vectors = [per_row(name, each, chosen.size, 3).T for name, each in (("force", force), ("torque", torque))]
         self.wrench[:, chosen] = make_wrench(vectors[0], vectors[1], force_frame, torque_frame)
 
-    def set_noise(self, level: npt.ArrayLike, indices: Rows = None) -> None:
-        """Set the relative standard deviation of the observation noise, () or (rows,); 0: none."""
+    def set_noise(self, level: Any, indices: Rows = None) -> None:
+        """Set the relative standard deviation of the observation noise, () or (rows,), or a ``Noise``; 0: none."""
         chosen = self.rows(indices)
-        levels = per_row("noise", level, chosen.size, None)[0]
-        if (levels < 0).any():
+        relative, additive = (per_row("noise", each, chosen.size, None)[0] for each in levels(level))
+        if (relative < 0).any():
             raise ConfigError(f"noise {level!r}: must not be negative")
         columns = self._columns(indices, one_for_all=np.ndim(level) == 0)
-        self.noise_level[columns] = levels[: columns.size]
+        self.noise_level[columns], self.additive_level[columns] = relative[: columns.size], additive[: columns.size]
 
     def set_observation_scaling(self, mean: Any = None, std: Any = None, indices: Rows = None) -> None:
         """Set μ and σ of Eq. 3.16, (18,) or (rows, 18) each; None leaves one as it is."""
@@ -311,7 +313,8 @@ class QuadcopterBatch:
                 if rows is None and one_for_all:
                     return np.zeros(1, dtype=np.int64)
                 mean, std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-                self._bind(noise_level=np.repeat(self.noise_level, self.n), mean=mean, std=std)
+                relative, additive = (np.repeat(each, self.n) for each in (self.noise_level, self.additive_level))
+                self._bind(noise_level=relative, additive_level=additive, mean=mean, std=std)
         return self.rows(rows)
 
     def _bind(self, **replaced: Any) -> None:

@@ -73,15 +73,23 @@ def features(b):
 @compiled(fastmath=True)
 def _disturb_and_scale(b):
     feature, noise, mean, inverse_std = b.feature, b.noise, b.mean, b.inverse_std
+    added = float32(0.0)
+    for lane in range(LANES):
+        added = max(added, b.additive[lane])
     for k in range(OBSERVATION_SIZE):
         for lane in range(LANES):
-            noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+            relative = b.noise_level[lane] * feature[k, lane]
+            if added == float32(0.0):
+                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+            else:
+                fixed = b.additive[lane] / inverse_std[k, lane]
+                noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
             feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
 
 
 @compiled(inline="always")
 def observe(b, normals):
-    """``b.feature``: the observations of a loaded block, each feature times (1 + level N(0, 1)), then scaled.
+    """``b.feature``: the observations of a loaded block, disturbed by :mod:`.noise`, scaled.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
 

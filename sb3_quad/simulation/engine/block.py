@@ -49,7 +49,8 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "work": ("f8", 4),
     "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
-    "noise_level": ("f4", ()),
+    "noise_level": ("f4", ()),  # relative
+    "additive": ("f4", ()),  # level of the noise that is added, in σ
     "noise": ("f4", _WORDS),
     "feature": ("f4", OBSERVATION_SIZE),
     "word": ("u4", _WORDS),  # random
@@ -173,12 +174,12 @@ def load_scored(b, task_index, tasks, first, count):
 
 
 @compiled
-def load_scaling(b, mean, std, noise_level, first, count):
-    """μ, 1/σ and the noise level of a block, in float32."""
+def load_scaling(b, mean, std, noise_level, additive, first, count):
+    """μ, 1/σ and the noise levels of a block, in float32."""
     step = 0 if noise_level.shape[0] == 1 else 1
     for lane in range(LANES):
         i = step * (first + min(lane, count - 1))
-        b.noise_level[lane] = noise_level[i]
+        b.noise_level[lane], b.additive[lane] = noise_level[i], additive[i]
         for k in range(std.shape[0]):
             b.mean[k, lane] = mean[k, i]
             b.inverse_std[k, lane] = std[k, i]

@@ -89,6 +89,7 @@ ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and
     "mean": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
     "std": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
     "noise_level": ("f8", ("scaling_columns",)),
+    "additive_level": ("f8", ("scaling_columns",)),
     "task_index": ("i8", ("n",)),
     "task_parameters": ("f8", ("tasks", _COLUMNS)),
     "task_weights": ("f8", ("tasks",)),
@@ -186,7 +187,9 @@ def run_block(job, number, b, fresh):
         scaling = job.scaling_columns
         mean = carray(pointer(job.mean_at), (OBSERVATION_SIZE, scaling), np.float64)
         std = carray(pointer(job.std_at), (OBSERVATION_SIZE, scaling), np.float64)
-        load_scaling(b, mean, std, carray(pointer(job.noise_level_at), (scaling,), np.float64), first, count)
+        relative = carray(pointer(job.noise_level_at), (scaling,), np.float64)
+        additive = carray(pointer(job.additive_level_at), (scaling,), np.float64)
+        load_scaling(b, mean, std, relative, additive, first, count)
     if job.mode > LOOK:
         load_rows(state, first, count, b.state)
         if fresh or job.vehicle_columns > 1:
