@@ -24,7 +24,8 @@ class BestModel(EveryTimesteps):
 
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's EvalCallback keeps the
     model of the highest mean reward; here a model that succeeds more often is better, and reward decides between equals.
-    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training besides. It logs ``eval/success_rate``,
+    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training and the losses of the latest update besides, by their names
+    in the log such as ``train/value_loss``. It logs ``eval/success_rate``,
     ``eval/survival_rate``, ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``, where the
     evaluation happens.
 
@@ -93,7 +94,7 @@ class BestModel(EveryTimesteps):
         for group, path in self._paths.items():
             if path.is_file():
                 arrays = read_arrays(path)
-                self._rows[group] = {key: list(arrays[key]) for key in KEYS}
+                self._rows[group] = {key: list(array) for key, array in arrays.items() if key in KEYS or _is_loss(key)}
                 flown = arrays["results"].shape[-1]
                 if flown != self._n_episodes:
                     raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")
@@ -146,6 +147,8 @@ class BestModel(EveryTimesteps):
         rewards, lengths = self._evaluate(self.model, env, note)
         for key, value in zip(KEYS, (self.num_timesteps, rewards, lengths, successes, seconds), strict=True):
             rows[key].append(value)
+        if group == "eval":
+            self._note_losses(rows)
         write_arrays(self._paths[group], **rows)
         success, reward = score = _score(successes, rewards)
         self.logger.record(f"{group}/success_rate", success)
@@ -160,10 +163,21 @@ class BestModel(EveryTimesteps):
             self.logger.record(f"{group}/reward_against_expert", reward - self._expert_rewards[group])
         return score
 
+    def _note_losses(self, rows: dict[str, Any]) -> None:
+        """Those of the latest update, which the log still holds; NaN where there is none, as before the first."""
+        latest = {name: float(value) for name, value in self.logger.name_to_value.items() if _is_loss(name)}
+        before = len(rows["timesteps"]) - 1
+        for name in {*latest, *filter(_is_loss, rows)}:
+            rows.setdefault(name, [np.nan] * before).append(latest.get(name, np.nan))
+
     def _evaluate(self, model: Any, env: VecEnv, callback: Any = None) -> tuple[Any, Any]:
         """Rewards and lengths of the same episodes each time, (n_episodes,) both."""
         env.seed(self._seed)
         return evaluate_policy(model, env, self._n_episodes, callback=callback, return_episode_rewards=True, warn=False)
+
+
+def _is_loss(name: str) -> bool:
+    return name.startswith("train/") and name.endswith("loss")
 
 
 def _score(successes: Any, rewards: Any) -> Score:
