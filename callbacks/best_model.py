@@ -15,6 +15,7 @@ from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.experts.controller import Controller
 
 KEYS = ("timesteps", "results", "ep_lengths", "successes", "seconds")  # of the file
+MORE = ("survivals",)  # where environments report survival
 LIVES = 20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
 Score = tuple[float, float]  # success rate, mean reward
 
@@ -24,7 +25,7 @@ class BestModel(EveryTimesteps):
 
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's EvalCallback keeps the
     model of the highest mean reward; here a model that succeeds more often is better, and reward decides between equals.
-    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training and the losses of the latest update besides, by their names
+    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training, ``survivals`` where environments report them, and the losses of the latest update besides, by their names
     in the log such as ``train/value_loss``. It logs ``eval/success_rate``,
     ``eval/survival_rate``, ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``, where the
     evaluation happens.
@@ -94,7 +95,7 @@ class BestModel(EveryTimesteps):
         for group, path in self._paths.items():
             if path.is_file():
                 arrays = read_arrays(path)
-                self._rows[group] = {key: list(array) for key, array in arrays.items() if key in KEYS or _is_loss(key)}
+                self._rows[group] = {key: list(array) for key, array in arrays.items() if key in KEYS + MORE or _is_loss(key)}
                 flown = arrays["results"].shape[-1]
                 if flown != self._n_episodes:
                     raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")
@@ -147,6 +148,8 @@ class BestModel(EveryTimesteps):
         rewards, lengths = self._evaluate(self.model, env, note)
         for key, value in zip(KEYS, (self.num_timesteps, rewards, lengths, successes, seconds), strict=True):
             rows[key].append(value)
+        if len(survived) == len(successes):
+            rows.setdefault("survivals", [[np.nan] * self._n_episodes] * (len(rows["timesteps"]) - 1)).append(survived)
         if group == "eval":
             self._note_losses(rows)
         write_arrays(self._paths[group], **rows)
