@@ -25,8 +25,8 @@ class BestModel(EveryTimesteps):
 
     Every evaluation flies the same episodes, so that models are compared and not their luck. SB3's EvalCallback keeps the
     model of the highest mean reward; here a model that succeeds more often is better, and reward decides between equals.
-    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training, ``survivals`` where environments report them, and the losses of the latest update besides, by their names
-    in the log such as ``train/value_loss``. It logs ``eval/success_rate``,
+    ``evaluations.npz`` is EvalCallback's, with ``seconds`` of training, ``survivals`` where environments report them, and the
+    losses of the latest update, by their names in the log such as ``train/value_loss``. It logs ``eval/success_rate``,
     ``eval/survival_rate``, ``eval/mean_reward`` and ``eval/mean_ep_length``, for ``others`` under ``eval_<name>/``, where the
     evaluation happens.
 

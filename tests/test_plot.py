@@ -7,6 +7,8 @@ from conftest import legends_cover_nothing
 from sb3_quad.cli import main
 from sb3_quad.report.curves import Curve, plot_curves, read_curve
 
+EXPERT = {"expert": {"success": 0.3, "reward": -5.0}}
+
 
 @pytest.fixture
 def runs(tmp_path):
@@ -31,7 +33,7 @@ def test_a_curve_holds_the_means_of_the_evaluations(runs):
 
 
 def test_seeds_are_drawn_as_mean_and_range(runs):
-    figure = plot_curves({"agent": [read_curve(runs / "Env_1"), read_curve(runs / "Env_2")]}, {"expert": (0.3, -5.0)})
+    figure = plot_curves({"agent": [read_curve(runs / "Env_1"), read_curve(runs / "Env_2")]}, EXPERT)
     reward = figure.axes[2].lines[0]
     assert reward.get_ydata()[0] == pytest.approx(-4.5) and reward.get_ydata()[-1] == pytest.approx(-1.5)
     np.testing.assert_array_equal(figure.axes[0].lines[1].get_ydata(), [30.0, 30.0])
@@ -39,7 +41,7 @@ def test_seeds_are_drawn_as_mean_and_range(runs):
 
 def test_every_evaluation_is_marked_and_the_legend_covers_nothing(runs):
     long, short = read_curve(runs / "Env_1"), Curve(*(np.array([each]) for each in (150.0, 30.0, 0.5, -2.0)))
-    figure = plot_curves({"agent": [long], "a run with a single evaluation": [short]}, {"expert": (0.3, -5.0)}, "title")
+    figure = plot_curves({"agent": [long], "a run with a single evaluation": [short]}, EXPERT, "title")
     for axes, times in zip(figure.axes, ([1e-4, 2e-4], [1.0, 2.0]) * 2, strict=True):
         several, single, _ = axes.lines
         np.testing.assert_allclose(several.get_xdata(), times)
@@ -53,6 +55,27 @@ def test_the_command_writes_a_picture(runs, capsys):
     assert picture.read_text(encoding="utf-8").count("<svg") == 1 and "curves.svg" in capsys.readouterr().out
 
 
+def test_losses_and_survival_are_drawn_where_a_run_has_them(runs):
+    path = runs / "Env_1" / "evaluations.npz"
+    more = {"survivals": np.ones((2, 2)), "train/bc_loss": np.array([np.nan, 0.25])}
+    np.savez(path, **{**np.load(path), **more})
+    groups = {"agent": [read_curve(runs / "Env_1")]}
+    figure = plot_curves(groups, {"thesis": {"survival": 0.88}}, show=["survival", "losses"])
+    survival, _, loss, _ = figure.axes
+    np.testing.assert_array_equal(survival.lines[0].get_ydata(), [100.0, 100.0])
+    np.testing.assert_array_equal(survival.lines[1].get_ydata(), [88.0, 88.0])
+    assert loss.get_ylabel() == "cloning loss" and loss.lines[0].get_ydata().tolist() == [0.25]
+
+
+def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
+    path = runs / "Env_1" / "evaluations.npz"
+    np.savez(path, **{**np.load(path), "survivals": np.ones((2, 2))})
+    picture = runs / "curves.svg"
+    assert main(["plot", f"agent={runs}/Env_1", "--thesis", "state_recovery", "-o", str(picture)]) == 0
+    text = picture.read_text(encoding="utf-8")
+    assert all(f"thesis: {name}" in text for name in ("expert", "RL-agent", "PPO only"))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -61,6 +84,8 @@ def test_the_command_writes_a_picture(runs, capsys):
         (["agent={runs}/Env_1", "-o", "curves.gif"], "must end in"),
         (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
         (["agent={runs}"], "no such file"),
+        (["agent={runs}/Env_1", "--thesis", "state_recovery"], "survival: the runs' evaluations hold none"),
+        (["agent={runs}/Env_1", "--show", "losses"], "losses: the runs' evaluations hold none"),
         (["agent={runs}/Env_1", "--task", "target_tracking"], "none of this run's eval_tasks"),
     ],
 )

@@ -1,9 +1,9 @@
-"""Learning curves from run folders: success and reward over timesteps and over wall-clock time (Figs. 4.3 and 4.4)."""
+"""Learning curves from run folders: success, reward and losses over timesteps and wall-clock time (Figs. 4.3 and 4.4)."""
 
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,6 +15,8 @@ from sb3_quad.drawing.labels import colours_of
 from sb3_quad.report.plots import POINTS, band, legend, styled
 
 NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file
+SUCCESS, SURVIVAL, REWARD, LOSSES = "success", "survival", "reward", "losses"
+_LABELS = {SUCCESS: "success in %", SURVIVAL: "survival in %", REWARD: "mean reward", "bc_loss": "cloning loss"}
 
 
 class Curve(NamedTuple):
@@ -24,6 +26,13 @@ class Curve(NamedTuple):
     seconds: FloatArray  # of training, evaluations along the way included, (k,)
     success: FloatArray  # share of successful episodes, (k,)
     reward: FloatArray  # mean per episode, (k,)
+    survival: FloatArray | None = None  # share of episodes, (k,); None: the environment reports none, or version 0.1 flew
+    losses: Mapping[str, FloatArray] = {}  # by name, of the update before each evaluation, (k,); NaN where there was none
+
+    def values(self, name: str) -> FloatArray:
+        """What a panel shows: success, survival, reward or the loss of a name, (k,); NaN where there is none."""
+        found: Any = self.losses.get(name) if name.endswith("loss") else getattr(self, name)
+        return np.full(len(self.timesteps), np.nan) if found is None else found
 
 
 def read_curve(run: str | Path, task: str | None = None) -> Curve:
@@ -45,35 +54,61 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
     if not (right and count and all(arrays[name].dtype.kind in "fiub" for name in NAMES)):
         raise ConfigError(f"{path}: cannot be read (timesteps, seconds, successes and results do not fit together)")
     timesteps, seconds = (np.asarray(arrays[name], dtype=np.float64) for name in ("timesteps", "seconds"))
-    return Curve(timesteps, seconds, arrays["successes"].mean(axis=1), arrays["results"].mean(axis=1))
+    survival = arrays["survivals"].mean(axis=1) if "survivals" in arrays else None
+    losses = {name.removeprefix("train/"): array for name, array in arrays.items() if name.startswith("train/")}
+    return Curve(timesteps, seconds, arrays["successes"].mean(axis=1), arrays["results"].mean(axis=1), survival, losses)
 
 
 @styled
-def plot_curves(groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, tuple[float, float]], title: str = "") -> Figure:
-    """Four panels: success and reward, each over timesteps and over wall-clock time; a marker at each evaluation.
+def plot_curves(
+    groups: Mapping[str, Sequence[Curve]],
+    lines: Mapping[str, Mapping[str, float]],
+    title: str = "",
+    show: Sequence[str] = (SUCCESS, REWARD),
+) -> Figure:
+    """Two panels, over timesteps and over wall-clock time, for each of ``show``; a marker at each evaluation.
 
     :param groups: from the name of an agent to the curves of its seeds; their mean is drawn, with their range around it.
-    :param lines: from a name to (success share, mean reward): drawn as horizontal lines, such as the expert's.
+    :param lines: from a name to heights by panel, shares for success and survival: horizontal lines, such as the expert's.
+    :param show: of success, survival, reward and losses, which take a row for each that a curve has.
+    :raises ConfigError: a panel that no curve has values for.
     """
-    figure = Figure(figsize=(11, 6.5), layout="constrained")
-    panels = figure.subplots(2, 2, sharex="col", sharey="row")
+    names = [row for each in show for row in (_losses(groups) if each == LOSSES else [each])]
+    for name in names or show:
+        curves = [curve for group in groups.values() for curve in group]
+        if name == LOSSES or all(np.isnan(curve.values(name)).all() for curve in curves):
+            raise ConfigError(f"{name}: the runs' evaluations hold none; runs since version 0.2 do")
+    figure = Figure(figsize=(11, 1.2 + 2.65 * len(names)), layout="constrained")
+    panels = figure.subplots(len(names), 2, sharex="col", sharey="row", squeeze=False)
     axes = (("timesteps", 1e6, "timesteps in millions"), ("seconds", 60.0, "wall-clock time in minutes"))
     colours = colours_of([*groups])
-    values = (("success", 100.0, "success in %"), ("reward", 1.0, "mean reward"))
-    for (row, (value, factor, name)), (column, (axis, scale, label)) in itertools.product(enumerate(values), enumerate(axes)):
-        panel = panels[row, column]
-        panel.set(xlabel=label, ylabel=name)
+    for (row, value), (column, (axis, scale, label)) in itertools.product(enumerate(names), enumerate(axes)):
+        panel, factor = panels[row, column], 100.0 if value in (SUCCESS, SURVIVAL) else 1.0
+        panel.set(xlabel=label, ylabel=_LABELS.get(value, value.replace("_", " ")))
         panel.label_outer()
         for group, curves in groups.items():
-            times = [getattr(curve, axis) for curve in curves]
+            times, heights = zip(*(_known(getattr(curve, axis), curve.values(value)) for curve in curves), strict=True)
+            if not all(map(len, times)):
+                continue
             grid = np.clip(times[0], max(each[0] for each in times), min(each[-1] for each in times))  # that all runs have
-            rows = [factor * np.interp(grid, getattr(curve, axis), getattr(curve, value)) for curve in curves]
+            rows = [factor * np.interp(grid, *known) for known in zip(times, heights, strict=True)]
             ends = np.stack([np.mean(rows, axis=0), np.min(rows, axis=0), np.max(rows, axis=0)])
             seeds = f" ({len(curves)} seeds)" if len(curves) > 1 else ""
             band(panel, colours[group], group + seeds, grid / scale, ends, **POINTS)
-        for number, (line, heights) in enumerate(lines.items()):
-            style = ("--", ":", "-.")[number % 3]
-            panel.axhline(heights[row] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
-    legend(figure, panels[0, 0], side="lower")
+        for number, (line, at) in enumerate(lines.items()):
+            if value in at:
+                style = ("--", ":", "-.")[number % 3]
+                panel.axhline(at[value] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
+    legend(figure, panels, side="lower")
     figure.suptitle(title)
     return figure
+
+
+def _losses(groups: Mapping[str, Sequence[Curve]]) -> list[str]:
+    """The names of all losses, in the order in which they come."""
+    return [*dict.fromkeys(name for curves in groups.values() for curve in curves for name in curve.losses)]
+
+
+def _known(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    known = np.isfinite(values)
+    return times[known], values[known]

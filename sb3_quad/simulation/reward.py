@@ -51,6 +51,7 @@ def score(b):
         tilt = _tilt(qx * qx + qy * qy, qw * qw + qz * qz)
         reward = -cost[S.position_cost, lane] * distance - cost[S.tilt_cost, lane] * tilt
         reward -= cost[S.body_rates_cost, lane] * rates
+        reward -= cost[S.precision_cost, lane] * distance / (distance + cost[S.precision_range, lane])
         reward -= cost[S.collision_cost, lane] if x[2, lane] <= b.radius[lane] else 0.0
         reward -= cost[S.out_of_range_cost, lane] if distance > cost[S.max_distance, lane] else 0.0
         b.reward[lane], b.distance[lane] = reward, distance

@@ -38,6 +38,8 @@ class Task(Frozen):
     success_distance: PositiveFloat = Field(default=0.1, description="a flight succeeds that ends this close to its target, m")
     success_tilt: PositiveFloat = Field(default=np.pi, description="and is tilted by no more than this, rad")
     position_cost: NonNegativeFloat = Field(default=0.003, description="per m and control step (Eq. 4.5)")
+    precision_cost: NonNegativeFloat = Field(default=0.0, description="per step, times d / (d + precision_range)")
+    precision_range: PositiveFloat = Field(default=0.3, description="the distance at which half of it is due, m")
     tilt_cost: NonNegativeFloat = Field(default=0.002, description="per rad and control step (Eq. 4.6)")
     body_rates_cost: NonNegativeFloat = Field(default=0.0005, description="per rad/s and control step (Eq. 4.7)")
     collision_cost: NonNegativeFloat = Field(default=15.0, description="for touching the ground (Eq. 4.8)")
@@ -69,7 +71,7 @@ class Task(Frozen):
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
 # What a control step needs:
-SCORED = [name for name in TASK if name.startswith(("max_", "success_")) or name.endswith("_cost")]
+SCORED = [name for name in TASK if name.startswith(("max_", "success_")) or name.endswith(("_cost", "_range"))]
 S = first_rows(dict.fromkeys(SCORED, 1))
 
 RECOVERED = {"success_distance": 0.25, "success_tilt": np.radians(10.0)}  # of tasks whose target is their start

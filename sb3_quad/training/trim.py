@@ -30,6 +30,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import first_vehicle
@@ -181,8 +182,10 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     cosine, sine = np.cos(heading), np.sin(heading)
     rotation = np.stack([cosine, sine, 0 * sine, -sine, cosine, 0 * sine, 0 * sine, 0 * sine, 0 * sine + 1], axis=1)
     features[:, GROUPS["rotation"]] = rotation  # world to body, row by row
-    features *= 1.0 + settings.noise * rng.standard_normal(features.shape)
     mean, std = _scaling(settings)
+    relative, additive = levels(settings.noise)
+    features *= 1.0 + relative * rng.standard_normal(features.shape)  # type: ignore[operator]
+    features += additive * std * rng.standard_normal(features.shape)  # type: ignore[operator]
     return np.asarray((features - mean) / std, dtype=np.float32)
 
 
