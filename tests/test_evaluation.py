@@ -155,6 +155,8 @@ def test_tables_say_how_many_arrived():
         path_length=np.full(n, 10.0),
         final_error=np.array([0.1, 0.2, 9.0, 0.3]),
         final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
+        stabilised=np.array([1.0, 2.0, np.nan, 3.0]),
+        sideways=np.array([0.2, 0.4, 9.0, 0.6]),
         waypoint_times=np.zeros((n, 0)),
         start=np.zeros((n, 13)),
         target=np.zeros((n, 3)),
@@ -163,6 +165,9 @@ def test_tables_say_how_many_arrived():
     assert (figures.success.value, figures.survival.value) == (0.25, 0.75)
     assert (figures.collisions, figures.out_of_range) == (1, 0)
     assert figures.arrivals[-1].time.value == 5.0 and figures.arrivals[-1].share.value == 0.75
+    assert figures.stabilised.time.value == 2.0 and figures.stabilised.share.value == 0.75
+    assert figures.sideways.value == pytest.approx(0.4)
+    assert figures.final_error_95.value == pytest.approx(0.29) and figures.final_error_95.high <= 0.3
     assert figures.final_error_max == 0.3 and figures.final_offset == pytest.approx((0.2, 0.0, 0.0))
     text = text_of(table_of(figures, "tracking", ["expert"]))
     for part in (
@@ -173,7 +178,7 @@ def test_tables_say_how_many_arrived():
         "5.00 (",
         ", 75 % arrive",
         "never",
-        "0.300",
+        "0.290",
         "thesis: expert",
         "7.75",
     ):

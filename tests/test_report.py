@@ -134,7 +134,7 @@ def test_the_page_holds_the_results(folder, page):
     assert LABEL in text and results.description in text
     metrics = results.entry("pid", "tracking").metrics
     assert f"{metrics.reward.value:.2f}".replace("-", "−") in text
-    assert f"{metrics.arrivals[0].time.value:.2f}" in text and f"{metrics.final_error_max:.3f}" in text
+    assert f"{metrics.arrivals[0].time.value:.2f}" in text and f"{metrics.final_error_95.value:.3f}" in text
     low, high = metrics.success.low, metrics.success.high
     assert f"{100 * low:.1f} to {100 * high:.1f}" in text
     for figure in ("1.25", "never", "2 to 3", "paper"):  # the reference's

@@ -21,6 +21,8 @@ episode_reward        (n,)
 episode_path          (n,)               m
 episode_final_error   (n,)               |r - r_T|, m
 episode_final_offset  (n, 3)             r - r_T, world frame, m; NaN where the flight was lost
+episode_stabilised    (n,)               s until it was stable (``motion.py``); NaN: never
+episode_sideways      (n,)               largest distance from the straight way to the target, m; NaN: there is none
 episode_time_to       (n, T)             s until |r - r_T| was first within the tolerance; NaN: never
 episode_tolerances    (T,)               m
 episode_waypoints     (n, W)             s until each waypoint was reached; NaN: never; W = 0 without a course
@@ -90,7 +92,7 @@ class Recorder(Hook):
 
 def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     """The ``episode_`` arrays of this module's table."""
-    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset")
+    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset", "stabilised", "sideways")
     return {
         "episode_seed": np.asarray(seeds, dtype=np.int64),
         "episode_outcome": np.select([flights.success, flights.survival, flights.collision], [*OUTCOMES][:3], [*OUTCOMES][3]),

@@ -18,6 +18,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.in_flight import quadcopter_spaces
 from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
+from sb3_quad.evaluation.motion import Motion
 from sb3_quad.experts.controller import Controller
 from sb3_quad.scenarios.sample import Plan
 from sb3_quad.settings.flight import FlightSettings
@@ -43,6 +44,8 @@ class Flights:
     path_length: FloatArray  # (n,), m, over the whole episode
     final_error: FloatArray  # (n,), |r - r_T| at the end, m
     final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    stabilised: FloatArray  # (n,), s until it was stable again, NaN if it never was, see motion.py
+    sideways: FloatArray  # (n,), largest distance from the straight way to the target, m; NaN where there is none
     waypoint_times: FloatArray  # (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
     start: FloatArray  # (n, 13), position, quaternion, velocity (world frame), body rates; SI
     target: FloatArray  # (n, 3), the first target, m
@@ -136,6 +139,7 @@ def _fly_fleet(
     state = fleet.true_state()
     position, error = state.position.copy(), state.distance
     wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
+    motion = Motion(state, control_step)
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     flights = Flights(
@@ -149,6 +153,8 @@ def _fly_fleet(
         path_length=np.zeros(n),
         final_error=error.copy(),
         final_offset=np.full((n, 3), np.nan),
+        stabilised=motion.stabilised,
+        sideways=motion.sideways if count == 0 else np.full(n, np.nan),
         waypoint_times=np.full((n, count), np.nan),
         start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
         target=state.target.copy(),
@@ -174,6 +180,7 @@ def _fly_fleet(
         times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
         flights.collision[flying & lost & collided] = True
         flying &= ~lost
+        motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():

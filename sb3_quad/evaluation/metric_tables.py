@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from sb3_quad.evaluation.records import Estimate, HitLimit, Metrics, Results
+from sb3_quad.evaluation.records import Estimate, HitLimit, Metrics, Moment, Results
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.scenarios.load import axis_name
 from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
@@ -12,7 +12,8 @@ from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 # The rows, without their cells:
 SUCCESS, SURVIVAL = Row("success", "%"), Row("survival", "%")
 REWARD, FLOWN = Row("mean reward"), Row("time flown", "s")
-PATH, MEDIAN, LARGEST = Row("mean path", "m"), Row("final error, median", "m"), Row("final error, largest", "m")
+PATH, MEDIAN, QUANTILE = Row("mean path", "m"), Row("final error, median", "m"), Row("final error, 95 %", "m")
+STABLE, SIDEWAYS = Row("mean time until stable", "s"), Row("beside the straight way", "m")
 REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
 HIT, HIT_SIZE = Row("half survive up to", "×"), Row("which is")
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
@@ -35,12 +36,15 @@ def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
     if metrics.success is not None:
         cells[SUCCESS] = _share(metrics.success)
     for arrival in metrics.arrivals:
-        some = arrival.time is not None and arrival.share.value < 1.0
-        note = f"{100 * arrival.share.value:.3g} % arrive" if some else ""
-        cells[time_row(arrival.tolerance)] = replace(_mean(arrival.time, "never"), note=note)
+        cells[time_row(arrival.tolerance)] = _moment(arrival)
     cells[PATH] = _mean(metrics.path)
     cells[MEDIAN] = Cell(metrics.final_error_median, decimals=3, words="–")
-    cells[LARGEST] = Cell(metrics.final_error_max, decimals=3, words="–")
+    if metrics.final_error_95 is not None:
+        cells[QUANTILE] = replace(_mean(metrics.final_error_95), decimals=3)
+    if metrics.sideways is not None:
+        cells[SIDEWAYS] = _mean(metrics.sideways)
+    if metrics.stabilised is not None:
+        cells[STABLE] = _moment(metrics.stabilised, "are")
     if metrics.course is not None:
         cells[REACHED], cells[COMPLETED] = _mean(metrics.course.reached), _share(metrics.course.completed)
         cells[COURSE_TIME] = _mean(metrics.course.time, "never")
@@ -58,6 +62,7 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
 def reference_cells(reference: Reference) -> Cells:
     """Others' metrics."""
     given = {REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error, FLOWN: reference.flown}
+    given |= {STABLE: reference.stabilised}
     cells = {row: _given(value) for row, value in given.items() if value is not None}
     shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
     cells |= {row: replace(_given(share, 100.0), note=reference.note) for row, share in shares.items() if share is not None}
@@ -146,9 +151,9 @@ def _rows_of(scenario: Scenario, brief: bool) -> list[Row]:
         kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        rows = [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, MEDIAN, LARGEST]
+        rows = [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
     else:
-        rows = [SUCCESS, SURVIVAL, REWARD, *map(time_row, tolerances), PATH, MEDIAN, LARGEST]
+        rows = [SUCCESS, SURVIVAL, REWARD, *map(time_row, tolerances), PATH, SIDEWAYS, MEDIAN, QUANTILE]
     return rows + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
 
 
@@ -165,6 +170,11 @@ def _share(estimate: Estimate) -> Cell:
 
 def _mean(estimate: Estimate | None, none: str = "–") -> Cell:
     return Cell(words=none) if estimate is None else Cell(estimate.value, (estimate.low, estimate.high))
+
+
+def _moment(moment: Moment, verb: str = "arrive") -> Cell:
+    some = moment.time is not None and moment.share.value < 1.0
+    return replace(_mean(moment.time, "never"), note=f"{100 * moment.share.value:.3g} % {verb}" if some else "")
 
 
 def _limit(limit: HitLimit) -> tuple[Cell, Cell]:

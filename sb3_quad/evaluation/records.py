@@ -31,12 +31,17 @@ class Estimate(Frozen):
     n: int = Field(description="flights it is taken over")
 
 
-class Arrival(Frozen):
+class Moment(Frozen):
+    """Something that a flight comes to, or never does."""
+
+    share: Estimate = Field(description="of the flights that came to it")
+    time: Estimate | None = Field(description="mean time until then of those flights, s; None: no flight did")
+
+
+class Arrival(Moment):
     """Arrival within one tolerance."""
 
     tolerance: float = Field(description="m")
-    share: Estimate = Field(description="of the flights that came within the tolerance")
-    time: Estimate | None = Field(description="mean time of those flights, s; None: no flight arrived")
 
 
 class Course(Frozen):
@@ -64,8 +69,11 @@ class Metrics(Frozen):
     path: Estimate | None = Field(description="mean length of the path over the whole episode, m")
     final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
     final_error_median: float | None = Field(description="m")
+    final_error_95: Estimate | None = Field(default=None, description="its 95 % quantile, m; None in older results, too")
     final_error_max: float | None = Field(description="m")
     final_offset: Vector | None = Field(description="mean r - r_T at the end, world frame, m")
+    stabilised: Moment | None = Field(default=None, description="which flights got stable again, and when; older: None")
+    sideways: Estimate | None = Field(default=None, description="mean largest distance from the straight way, m")
     course: Course | None = Field(default=None, description="of scenarios with waypoints")
 
     @model_validator(mode="before")

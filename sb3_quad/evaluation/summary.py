@@ -1,13 +1,14 @@
 """Many flights in a few metrics, with 95 % intervals: Wilson's for shares, the bootstrap for means."""
 
 import math
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flights import Flights
-from sb3_quad.evaluation.records import Arrival, Course, Estimate, Metrics
+from sb3_quad.evaluation.records import Arrival, Course, Estimate, Metrics, Moment
 
 Z = 1.959963984540054  # 97.5 % of the normal distribution lie below
 RESAMPLES = 1000
@@ -30,17 +31,21 @@ def summarise(flights: Flights) -> Metrics:
         out_of_range=int((~done & ~flights.collision).sum()),
         reward=_bootstrap(flights.reward),
         flown=_bootstrap(flights.flown),
-        arrivals=[
-            Arrival(tolerance=tolerance, share=share(np.isfinite(times)), time=mean(times))
-            for tolerance, times in sorted(flights.time_to.items())
-        ],
+        arrivals=[Arrival(tolerance=each, **_moment(times)) for each, times in sorted(flights.time_to.items())],
         path=mean(flights.path_length[done]),
         final_error=mean(error),
         final_error_median=float(np.median(error)) if some else None,
+        final_error_95=_bootstrap(error, 0.95) if some else None,
         final_error_max=float(error.max()) if some else None,
         final_offset=tuple(offset.mean(axis=0).tolist()) if some else None,
+        stabilised=Moment(**_moment(flights.stabilised)),
+        sideways=mean(flights.sideways[done]),
         course=course,
     )
+
+
+def _moment(times: FloatArray) -> dict[str, Any]:
+    return {"share": share(np.isfinite(times)), "time": mean(times)}
 
 
 def share(hits: npt.ArrayLike) -> Estimate:
@@ -66,8 +71,14 @@ def mean(values: npt.ArrayLike) -> Estimate | None:
     return _bootstrap(finite) if finite.size else None
 
 
-def _bootstrap(array: FloatArray) -> Estimate:
-    n, middle = array.size, float(array.mean())
+def _bootstrap(array: FloatArray, quantile: float | None = None) -> Estimate:
+    """The mean, or a quantile."""
+
+    def statistic(values: FloatArray) -> FloatArray:
+        found: FloatArray = values.mean(axis=-1) if quantile is None else np.quantile(values, quantile, axis=-1)
+        return found
+
+    n, middle = array.size, float(statistic(array))
     rows = np.random.default_rng(0).integers(0, n, (RESAMPLES, n))
-    low, high = np.percentile(array[rows].mean(axis=1), [2.5, 97.5])
+    low, high = np.percentile(statistic(array[rows]), [2.5, 97.5])
     return Estimate(value=middle, low=min(middle, float(low)), high=max(middle, float(high)), n=n)
