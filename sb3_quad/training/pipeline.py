@@ -40,7 +40,7 @@ from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
 TRIMS = {  # by the name that a stage gives: what trims, and what is reported of it
-    "position": (trim, "steady offset {0.before:.3f} m, now {0.after:.3f} m; position scale {0.scale:g}"),
+    "position": (trim, "steady offset {0.before:.3f} m, now {0.after:.3f} m"),
     "hover": (trim_hover, "action at the target {0.before:.4f} from hover, now {0.after:.4f}"),
 }
 

@@ -1,10 +1,9 @@
 """Trimming an agent, in place: its steady offset from the target is cancelled by its own weights, so its zip stays stock.
 
 :func:`trim` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its target, by the same vector
-wherever the target is, and covers the last metre slowly. The thesis cancels both in the scaling of the observation (Eq. 3.16):
-the measured offset goes into the position components of μ, and σ is multiplied by an α below 1 near the target (Eq. 4.10).
-Here α is a constant, so that both can go into the actor's first layer, since
-W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ / (α σ)): the agent flies without any wrapper.
+wherever the target is. The thesis cancels that in the scaling of the observation (Eq. 3.16): the measured offset goes into the
+position components of μ. Here it goes into the actor's first layer, since W (s - μ) / σ + b = W s / σ + (b - W μ / σ): the
+agent flies without any wrapper.
 
 That fits one heading. :func:`trim_hover` is for agents whose offset turns with the heading: at its target, level and at rest,
 an agent should give hover thrust, and one that was trained by samples gives that but for a hundredth. What its last layer W, b
@@ -16,7 +15,6 @@ with h the input of that layer and a 1, h̄(ψ) its mean over the observation no
 action there less that of hover, and s the states of flights: a change is cheap where the agent never is.
 """
 
-from copy import deepcopy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,10 +34,6 @@ from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 _POSITION = GROUPS["position"]
-SCALES = (1.0, 0.85, 0.75, 0.65, 0.55, 0.5)  # α
-N_TARGETS, N_RECOVERIES = 120, 480  # flights that judge a scale
-TOLERATED = 0.02  # loss of recoveries for which a smaller α is still taken, if it does not double the failures
-
 STIFFNESS = 0.1  # λ
 N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
 TASKS = {"state_recovery": 0.5, "recovery_and_tracking": 0.5}
@@ -52,51 +46,27 @@ class Trim(NamedTuple):
     :param before: size of the steady offset in m; of :func:`trim_hover`, the mean action at the target less that of hover,
         root mean square over headings and rotors.
     :param after: the same, after it.
-    :param scale: α.
     """
 
     before: float
     after: float
-    scale: float = 1.0
 
 
 def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
-    """Find μ and α for an agent and fold them into its first layer.
+    """Find μ for an agent and fold it into its first layer.
 
-    Of the scales, the one with the highest mean reward of target tracking is taken, if all its flights survive and recoveries
-    survive as often as with α = 1, within two hundredths and with at most twice the failures.
-
-    :param seed: of the flights that judge; report metrics of others.
+    :param seed: of the flights that measure it.
     :param settings: vehicle, noise and scaling that the agent flies with.
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not read the 18 features.
     """
     own = settings or FlightSettings()
-    rounds = row_seeds(seed, ROUNDS)
-    layer = _first_layer(model)
-    original = best = deepcopy(layer.state_dict())
+    _first_layer(model)
     _, std = _scaling(own)
-    before = hover_offset(model, seed=seed, settings=own)
-    best_scale, best_reward, needed = 1.0, -np.inf, 0.0
-    for scale in SCALES:
-        layer.load_state_dict(original)
-        scale_position(model, scale)
-        try:
-            for each in rounds:
-                shift_position(model, hover_offset(model, seed=each, settings=own), std[_POSITION])
-        except ConfigError:
-            if scale == 1.0:
-                raise
-            break  # already too lively to hover
-        tracking = fly(model, "target_tracking", N_TARGETS, seed, **own.in_any_task())
-        recovery = float(fly(model, "state_recovery", N_RECOVERIES, seed, **own.in_any_task()).survival.mean())
-        reward = float(tracking.reward.mean())
-        if scale == 1.0:
-            needed = recovery - min(TOLERATED, 1.0 - recovery)
-        if tracking.survival.all() and recovery >= needed and reward > best_reward:
-            best, best_scale, best_reward = deepcopy(layer.state_dict()), scale, reward
-    layer.load_state_dict(best)
-    after = hover_offset(model, seed=seed, settings=own)
-    return Trim(float(np.linalg.norm(before)), float(np.linalg.norm(after)), best_scale)
+    before = after = hover_offset(model, seed=seed, settings=own)
+    for each in row_seeds(seed, ROUNDS):
+        shift_position(model, after, std[_POSITION])
+        after = hover_offset(model, seed=each, settings=own)
+    return Trim(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
 
 
 def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray) -> None:
@@ -108,12 +78,6 @@ def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray
     with th.no_grad():
         shift = th.as_tensor(offset / std, dtype=layer.weight.dtype, device=layer.weight.device)
         layer.bias.add_(layer.weight[:, _POSITION] @ shift)
-
-
-def scale_position(model: OnPolicyAlgorithm, scale: float) -> None:
-    """Let the actor see its distance from the target divided by ``scale`` (α)."""
-    with th.no_grad():
-        _first_layer(model).weight[:, _POSITION] /= scale
 
 
 def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
