@@ -10,7 +10,7 @@ from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.engine.block import T
 from sb3_quad.simulation.engine.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.state import BODY_RATES, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.simulation.tasks import SCORED, TASK, TASKS, Task, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -229,6 +229,13 @@ def test_tilt_is_exact_at_every_angle(angle):
     rows = start(1, "target_tracking", tilt_cost=1.0, position_cost=0.0, body_rates_cost=0.0)
     rows.state[QUATERNION, 0] = math.cos(angle / 2), 0.6 * math.sin(angle / 2), 0.8 * math.sin(angle / 2), 0.0
     assert scores(rows)["reward"][0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
+
+
+def test_precision_is_half_due_at_its_range_and_steepest_at_the_target():
+    rows = start(3, "target_tracking", precision_cost=0.02, precision_range=0.3, position_cost=0.0)
+    rows.state[POSITION] = rows.state[TARGET] + np.array([-0.001, -0.3, -8.7]) * np.array([[0.0], [0.0], [1.0]])
+    near, middle, far = scores(rows)["reward"]
+    assert near == pytest.approx(-0.02 * 0.001 / 0.3, rel=0.01) and middle == pytest.approx(-0.01) and far > -0.02
 
 
 # --- tasks as data
