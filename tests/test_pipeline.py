@@ -19,7 +19,7 @@ from sb3_quad.pretrained_policies import load_pretrained
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import train
-from sb3_quad.training.trim import shift_position, trim
+from sb3_quad.training.trim import scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
 STAGES = [
@@ -68,6 +68,7 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "settings": {"n_stepz": 3}}], "did you mean 'n_steps'"),
         ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
         ([{**STAGES[0], "trim": "hover", "conf_file": "dagger.yml"}], "read the 18 features"),
+        ([{**STAGES[0], "position_scale": 0.6}], "position_scale goes with trim: position"),
         ([], "at least 1"),
     ],
 )
@@ -109,6 +110,17 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
     result = trim(model)
     assert result.before > 0.4 and result.after < 0.05
+
+
+def test_scaling_the_position_is_seen_by_the_actor_as_a_longer_way():
+    env = QuadcopterVecEnv(16, noise=0.0, seed=1)
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
+    observations = env.reset()
+    longer = observations.copy()
+    longer[:, :3] /= 0.8
+    expected = model.predict(longer, deterministic=True)[0]
+    scale_position(model, 0.8)
+    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, atol=1e-5)
 
 
 def small_file(tmp_path):

@@ -86,14 +86,14 @@ def plot_curves(
         panel, factor = panels[row, column], 100.0 if value in (SUCCESS, SURVIVAL) else 1.0
         panel.set(xlabel=label, ylabel=_LABELS.get(value, value.replace("_", " ")))
         panel.label_outer()
-        for group, curves in groups.items():
-            times, heights = zip(*(_known(getattr(curve, axis), curve.values(value)) for curve in curves), strict=True)
+        for group, runs in groups.items():
+            times, heights = zip(*(_known(getattr(curve, axis), curve.values(value)) for curve in runs), strict=True)
             if not all(map(len, times)):
                 continue
             grid = np.clip(times[0], max(each[0] for each in times), min(each[-1] for each in times))  # that all runs have
             rows = [factor * np.interp(grid, *known) for known in zip(times, heights, strict=True)]
             ends = np.stack([np.mean(rows, axis=0), np.min(rows, axis=0), np.max(rows, axis=0)])
-            seeds = f" ({len(curves)} seeds)" if len(curves) > 1 else ""
+            seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
             band(panel, colours[group], group + seeds, grid / scale, ends, **POINTS)
         for number, (line, at) in enumerate(lines.items()):
             if value in at:

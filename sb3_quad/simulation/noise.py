@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-import numpy.typing as npt
 from pydantic import Field, NonNegativeFloat
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 
 
@@ -22,7 +22,7 @@ class Noise(Frozen):
 NoiseLevel = Noise | Annotated[float, Field(ge=0)]
 
 
-def levels(noise: Any) -> tuple[npt.ArrayLike, npt.ArrayLike]:
+def levels(noise: Any) -> tuple[FloatArray | float, FloatArray | float]:
     """The relative and the additive level of what environments are given: a number or array, a :class:`Noise` or its fields.
 
     :raises ConfigError: an unknown field, or a negative number.
@@ -35,4 +35,4 @@ def levels(noise: Any) -> tuple[npt.ArrayLike, npt.ArrayLike]:
 def in_words(noise: Any) -> str:
     """Such as ``5 %``, or ``5 % and 2 % of σ``."""
     relative, additive = levels(noise)
-    return f"{100 * relative:g} %" + (f" and {100 * additive:g} % of σ" if additive else "")  # type: ignore[operator]
+    return f"{100 * relative:g} %" + (f" and {100 * additive:g} % of σ" if additive else "")

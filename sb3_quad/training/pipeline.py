@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
@@ -63,9 +63,16 @@ class Stage(Frozen):
     begin: Literal["before", "new"] = Field(default="before", description="from the agent of the stage before, or a new one")
     pass_on: Literal["best", "last"] = Field(default="best", description="the best evaluation, by success, then by reward")
     trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
+    position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
     eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
+
+    @model_validator(mode="after")
+    def _scale_with_trim(self) -> "Stage":
+        if self.position_scale != 1.0 and self.trim != "position":
+            raise ValueError("position_scale goes with trim: position")
+        return self
 
 
 REFERENCE = Stage(name="PPO only", algo="ppo", env="QuadStateRecovery-v0", begin="new")
@@ -296,7 +303,8 @@ def _trim(stage: Stage, job: TrainingJob, run: RunFolder, agent: str, report: Ca
     assert stage.trim is not None
     model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
     trimmed, words = TRIMS[stage.trim]
-    did = trimmed(model, seed_for("trim", job.seed), job.flight_settings)
+    scale = {"scale": stage.position_scale} if stage.trim == "position" else {}
+    did = trimmed(model, seed_for("trim", job.seed), job.flight_settings, **scale)
     save_model(model, run.trimmed_model)
     report(f"trimmed: {words.format(did)}: {run.trimmed_model}")
     return run.trimmed_model

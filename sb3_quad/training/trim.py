@@ -2,8 +2,9 @@
 
 :func:`trim` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its target, by the same vector
 wherever the target is. The thesis cancels that in the scaling of the observation (Eq. 3.16): the measured offset goes into the
-position components of μ. Here it goes into the actor's first layer, since W (s - μ) / σ + b = W s / σ + (b - W μ / σ): the
-agent flies without any wrapper.
+position components of μ. To make an agent quicker near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a
+constant, so that both can go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ / (α σ)):
+the agent flies without any wrapper. An α well below 1 costs recoveries and far targets; PPO after it wins them back.
 
 That fits one heading. :func:`trim_hover` is for agents whose offset turns with the heading: at its target, level and at rest,
 an agent should give hover thrust, and one that was trained by samples gives that but for a hundredth. What its last layer W, b
@@ -52,9 +53,10 @@ class Trim(NamedTuple):
     after: float
 
 
-def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
-    """Find μ for an agent and fold it into its first layer.
+def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0) -> Trim:
+    """Find μ for an agent and fold it into its first layer, and α before it.
 
+    :param scale: α.
     :param seed: of the flights that measure it.
     :param settings: vehicle, noise and scaling that the agent flies with.
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not read the 18 features.
@@ -62,7 +64,9 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
     own = settings or FlightSettings()
     _first_layer(model)
     _, std = _scaling(own)
-    before = after = hover_offset(model, seed=seed, settings=own)
+    before = hover_offset(model, seed=seed, settings=own)
+    scale_position(model, scale)
+    after = before if scale == 1.0 else hover_offset(model, seed=seed, settings=own)
     for each in row_seeds(seed, ROUNDS):
         shift_position(model, after, std[_POSITION])
         after = hover_offset(model, seed=each, settings=own)
@@ -78,6 +82,12 @@ def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray
     with th.no_grad():
         shift = th.as_tensor(offset / std, dtype=layer.weight.dtype, device=layer.weight.device)
         layer.bias.add_(layer.weight[:, _POSITION] @ shift)
+
+
+def scale_position(model: OnPolicyAlgorithm, scale: float) -> None:
+    """Let the actor see its distance from the target divided by ``scale`` (α)."""
+    with th.no_grad():
+        _first_layer(model).weight[:, _POSITION] /= scale
 
 
 def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
@@ -148,8 +158,8 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     features[:, GROUPS["rotation"]] = rotation  # world to body, row by row
     mean, std = _scaling(settings)
     relative, additive = levels(settings.noise)
-    features *= 1.0 + relative * rng.standard_normal(features.shape)  # type: ignore[operator]
-    features += additive * std * rng.standard_normal(features.shape)  # type: ignore[operator]
+    features *= 1.0 + relative * rng.standard_normal(features.shape)
+    features += additive * std * rng.standard_normal(features.shape)
     return np.asarray((features - mean) / std, dtype=np.float32)
 
 
