@@ -39,8 +39,7 @@ def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
         cells[time_row(arrival.tolerance)] = _moment(arrival)
     cells[PATH] = _mean(metrics.path)
     cells[MEDIAN] = Cell(metrics.final_error_median, decimals=3, words="–")
-    if metrics.final_error_95 is not None:
-        cells[QUANTILE] = replace(_mean(metrics.final_error_95), decimals=3)
+    cells[QUANTILE] = replace(_mean(metrics.final_error_95), decimals=3)
     if metrics.sideways is not None:
         cells[SIDEWAYS] = _mean(metrics.sideways)
     if metrics.stabilised is not None:
