@@ -60,8 +60,9 @@ def vehicle_of(name):
 
 def survival_on_the_card(name):
     lines = sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8").splitlines()
+    rows = [line.split("|") for line in lines if line.startswith("|")]
     heading, recovery = (
-        next(line.split("|") for line in lines if part in line and line.startswith("|")) for part in ("survival", "state recovery")
+        next(row for row in rows if any(part in cell for cell in row)) for part in ("survival", "state recovery")
     )
     (column,) = (number for number, cell in enumerate(heading) if "survival" in cell)
     return float(recovery[column].split()[0])
