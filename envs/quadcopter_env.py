@@ -127,6 +127,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `last_action` | `False` | whether a frame ends with the action before it, so that it has 22 numbers |
     | `history` | `None` | ages of the frames that are seen, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |
     | `position_integral` | `None` | fields of :class:`~sb3_quad.simulation.memory.PositionIntegral`, `{}` for its own |
+    | `vehicles` | `None` | a distribution of vehicles, one for each episode, such as `{"distribution": "raptor"}` |
     | `randomize` | `None` | fields of :class:`~sb3_quad.simulation.randomization.Randomization`: the world of each episode |
     | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |
     | `render_width`, `render_height` | 640, 480 | size of pictures and window, pixels |
@@ -201,7 +202,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
-        if batch.randomize.sets_vehicle:
+        if batch.sets_vehicle:
             self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
         self._ready = True

@@ -13,6 +13,7 @@ from sb3_quad.envs.registration import ENVIRONMENTS, MAX_EPISODE_STEPS
 from sb3_quad.experts.models import saved_data
 from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.settings.literals import ZooLoader, parse_mapping
+from sb3_quad.simulation.designs import VehicleDistribution
 from sb3_quad.simulation.memory import Memory
 from sb3_quad.simulation.noise import NoiseLevel
 from sb3_quad.simulation.randomization import Randomization
@@ -33,6 +34,9 @@ class FlightSettings(Memory):
     noise: NoiseLevel = Field(default=0.05, description="relative standard deviation of the observation noise, or Noise")
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
     observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
+    vehicles: VehicleDistribution | None = Field(
+        default=None, description="fields of VehicleDistribution, or {distribution: name}: each episode has a vehicle of it"
+    )
     randomize: Randomization | None = Field(default=None, description="fields of Randomization: what differs by episode")
     max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, lt=2**62, description="control steps of an episode")
 
@@ -41,7 +45,7 @@ class FlightSettings(Memory):
         return {name: value for name, value in self if name in self.model_fields_set}
 
     def in_any_task(self) -> dict[str, Any]:
-        """Of these, what an agent must be flown with in any task: vehicle, noise, and what it sees."""
+        """Of these, what an agent must be flown with in any task: vehicle or vehicles, noise, and what it sees."""
         others = ("task", "task_kwargs", "max_episode_steps", "randomize")
         return {name: value for name, value in self.given().items() if name not in others}
 
@@ -52,11 +56,12 @@ class FlightSettings(Memory):
         return {**scaling, **self.model_dump(mode="json", include=set(Memory.model_fields))}
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
-        """The same with some fields changed.
+        """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
 
         :raises ConfigError: an unknown field, or a value that does not fit.
         """
-        return validate(FlightSettings, {**dict(self), **changes}, "env_kwargs")
+        own = {**dict(self), "vehicles": None} if "vehicle" in changes else dict(self)
+        return validate(FlightSettings, {**own, **changes}, "env_kwargs")
 
     def write_into(self, model: Any) -> None:
         """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with the vehicle's parameters.
@@ -69,7 +74,8 @@ class FlightSettings(Memory):
         """
         scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
         lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
-        setattr(model, KEY, self.with_changes(vehicle=first_vehicle(self.vehicle), **lists).model_dump(mode="json"))
+        whole = {**lists, "vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
+        setattr(model, KEY, self.with_changes(**whole).model_dump(mode="json"))
 
     @staticmethod
     def of(zip_file: str | Path) -> tuple["FlightSettings", Path | None]:

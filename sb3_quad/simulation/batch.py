@@ -10,6 +10,7 @@ from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, In
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
+from sb3_quad.simulation.designs import resolve_vehicles
 from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
@@ -24,10 +25,18 @@ from sb3_quad.simulation.worlds import GUST_FORCE, new_worlds
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 MAX_ROWS = 2**20
-COLUMNS = {"vehicle": "vehicles", "nominal": "nominal", "world": "worlds", "gust": "gust", "scaling": "mean"}
+COLUMNS = {
+    "vehicle": "vehicles",
+    "nominal": "nominal",
+    "given": "given",
+    "design": "designs",
+    "world": "worlds",
+    "gust": "gust",
+    "scaling": "mean",
+}
 _MEMORY = (  # all that future flight depends on
     *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
-    *("vehicles", "gust", "frames", "integral"),
+    *("vehicles", "nominal", "gust", "frames", "integral"),
 )
 
 
@@ -41,6 +50,7 @@ class BatchKeywords(TypedDict, total=False):
     last_action: bool
     history: Any
     position_integral: Any
+    vehicles: Any
     randomize: Any
     max_episode_steps: int
     seed: int | None
@@ -62,6 +72,8 @@ class QuadcopterBatch:
     :param last_action: whether a policy sees its last action; ``history``, of which age the frames are that it sees;
         ``position_integral``, whether it sees that: see :class:`~sb3_quad.simulation.memory.Memory`. An observation then has
         ``memory.size`` numbers, which is 18 by default.
+    :param vehicles: None, or a distribution of vehicles from which each episode has one, see
+        :func:`~sb3_quad.simulation.designs.resolve_vehicles`; ``vehicle`` then says what that does not.
     :param randomize: None, a :class:`~sb3_quad.simulation.randomization.Randomization` or its fields: what is random in each
         episode.
     :param max_episode_steps: control steps after which an episode is truncated.
@@ -86,6 +98,7 @@ class QuadcopterBatch:
         last_action: bool = False,
         history: Sequence[int] | None = None,
         position_integral: Any = None,
+        vehicles: Any = None,
         randomize: Any = None,
         max_episode_steps: int = 1500,
         seed: int | None = None,
@@ -99,10 +112,12 @@ class QuadcopterBatch:
         one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
         self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle], n)
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
-        self.nominal = np.stack([each.parameters() for each in columns], axis=1)
-        self.randomize = resolve_randomization(randomize)
+        self.given = np.stack([each.parameters() for each in columns], axis=1)
+        self.distribution, self.randomize = resolve_vehicles(vehicles), resolve_randomization(randomize)
         self.memory = resolve_memory(last_action=last_action, history=history, position_integral=position_integral)
-        self.vehicles, self.worlds, self.gust = new_worlds(self.randomize, columns, self.nominal, n)
+        self.nominal, self.vehicles, self.designs, self.worlds, self.gust = new_worlds(
+            self.randomize, self.distribution, columns, self.given, n
+        ).values()
         self.frames = new_frames(self.memory, n)
         self.ages = np.array(self.memory.ages, dtype=np.int64)
         integral = self.memory.position_integral
@@ -130,6 +145,11 @@ class QuadcopterBatch:
         with compilation_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
+
+    @property
+    def sets_vehicle(self) -> bool:
+        """Whether an episode begins with a vehicle of its own."""
+        return self.distribution is not None or self.randomize.sets_vehicle
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""
@@ -333,9 +353,9 @@ class QuadcopterBatch:
                 "tasks": table.weights.size,
                 **{f"{name}_columns": values[array].shape[1] for name, array in COLUMNS.items()},
                 "gusts": self.randomize.gusts is not None,
-                "sets_vehicle": self.randomize.sets_vehicle,
+                "sets_vehicle": self.sets_vehicle,
                 "sets_wrench": self.randomize.sets_wrench,
-                "mixed_delays": self.randomize.delay is not None or bool((self.nominal[P.delay] != len(self.queue)).any()),
+                "mixed_delays": self.randomize.delay is not None or bool((self.given[P.delay] != len(self.queue)).any()),
                 "width": self.memory.size,
                 **dict(zip(("depth", "frame"), self.frames.shape[1:], strict=True)),
                 "ages": self.ages.size,

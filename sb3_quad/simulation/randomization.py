@@ -12,45 +12,12 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.simulation.ranges import FIXED, Range
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[float, float, float]
 MAX_DELAY = 100  # control steps
-FIXED, UNIFORM, LOG_UNIFORM = range(3)
-
-
-class Range(Frozen):
-    """Numbers from ``low`` to ``high``; ``[low, high]`` for short, or one number."""
-
-    low: float = Field(description="the least number")
-    high: float = Field(description="the greatest number, at least low")
-    distribution: Literal["uniform", "log_uniform"] = Field(
-        default="uniform", description="of the number, or of its logarithm (low > 0)"
-    )
-
-    @model_validator(mode="before")
-    @classmethod
-    def _for_short(cls, data: Any) -> Any:
-        if isinstance(data, (int, float)) and not isinstance(data, bool):
-            return {"low": data, "high": data}
-        if isinstance(data, (list, tuple)):
-            if len(data) != 2:
-                raise ValueError(f"{list(data)!r}: must be [low, high]")
-            return dict(zip(("low", "high"), data, strict=True))
-        return data
-
-    @model_validator(mode="after")
-    def _rises(self) -> "Range":
-        if self.low > self.high:
-            raise ValueError(f"[{self.low:g}, {self.high:g}]: the first number exceeds the second")
-        if self.distribution == "log_uniform" and self.low <= 0.0:
-            raise ValueError(f"[{self.low:g}, {self.high:g}]: log_uniform numbers are greater than 0")
-        return self
-
-    def numbers(self) -> list[float]:
-        """Low, high, and how to sample between them."""
-        return [self.low, self.high, UNIFORM if self.distribution == "uniform" else LOG_UNIFORM]
 
 
 _NONE = Range(low=0.0, high=0.0)
@@ -92,11 +59,11 @@ class RandomVector(Frozen):
             raise ValueError("direction [0, 0, 0]: is none")
         return self
 
-    def numbers(self, unit: float) -> list[float]:
-        """What :mod:`.worlds` reads, in the order of ``WORLD``, given the unit in N or N m."""
+    def numbers(self) -> list[float]:
+        """What :mod:`.worlds` reads, in the order of ``WORLD``."""
         direction = np.zeros(3) if self.direction is None else np.array(self.direction) / np.linalg.norm(self.direction)
-        size = unit if self.unit == "weight" else 1.0
-        return [*self.magnitude.numbers(), size, float(self.frame == "body"), *direction, *self.axes]
+        marks = float(self.unit == "weight"), float(self.frame == "body")
+        return [*self.magnitude.numbers(), *marks, *direction, *self.axes]
 
 
 class Force(RandomVector):
@@ -203,16 +170,13 @@ class Randomization(Frozen):
 
     def numbers(self, vehicle: Vehicle) -> FloatArray:
         """What :mod:`.worlds` reads for rows of a vehicle, in the order of ``WORLD``."""
-        weight = vehicle.mass * vehicle.gravity
-        vectors = (self.force, weight), (self.torque, weight * vehicle.arm_length)
         ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self._delay())
         gusts = self.gusts or Gusts(std=_NONE)
-        gust = weight if gusts.unit == "weight" else 1.0
         parts = [
             *([self.share], [self.wrench_share]),
             *([0.0, 0.0, FIXED] if each is None else each.numbers() for each in ranges),
-            *((each or Force(magnitude=_NONE)).numbers(unit) for each, unit in vectors),
-            [gusts.std.low * gust, gusts.std.high * gust, gusts.std.numbers()[2]],
+            *((each or Force(magnitude=_NONE)).numbers() for each in (self.force, self.torque)),
+            [*gusts.std.numbers(), float(gusts.unit == "weight")],
             [math.exp(-vehicle.control_step / gusts.time_constant)],
         ]
         return np.array([number for part in parts for number in part], dtype=np.float64)

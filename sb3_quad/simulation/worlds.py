@@ -6,16 +6,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.simulation.designs import DESIGN_SIZE, VehicleDistribution, arm_length
 from sb3_quad.simulation.engine.block import P, W
 from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.engine.random import GUST, PUSH, VEHICLE, uniforms
 from sb3_quad.simulation.layout import first_rows, row_slices
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.randomization import FIXED, LOG_UNIFORM, Randomization
+from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.ranges import FIXED, between
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle
 
 _RANGES = ("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay")
-VECTOR = {"length": 3, "unit": 1, "in_body": 1, "direction": 3, "axes": 3}
+VECTOR = {"length": 3, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
 V = first_rows(VECTOR)
 WORLD = {
     "share": 1,
@@ -23,6 +25,7 @@ WORLD = {
     **dict.fromkeys(_RANGES, 3),
     **dict.fromkeys(("force", "torque"), sum(VECTOR.values())),
     "gust_std": 3,
+    "gust_by_weight": 1,
     "gust_keeps": 1,
 }
 """Numbers of :meth:`~sb3_quad.simulation.randomization.Randomization.numbers`; a range is low, high and how to sample."""
@@ -37,17 +40,11 @@ _N_PARAMETERS = len(PARAMETER_NAMES)
 
 
 @compiled
-def _between(table, k, column, u, nominal):
-    low, high, kind = table[k, column], table[k + 1, column], table[k + 2, column]
-    if kind == FIXED:
-        return nominal
-    return low * (high / low) ** u if kind == LOG_UNIFORM else low + (high - low) * u
-
-
-@compiled
-def _push(table, k, column, length, height, azimuth, wrench, world, body, i):
-    """Add a constant force or torque, whose numbers begin at ``k``, to its rows of a wrench."""
-    size = _between(table, k, column, length, 0.0) * table[k + V.unit, column]
+def _push(table, k, column, length, height, azimuth, unit, wrench, world, body, i):
+    """Add a constant force or torque, whose numbers begin at ``k``, to its rows of a wrench; ``unit``: in N or N m."""
+    size = between(table, k, column, length, 0.0)
+    if table[k + V.by_weight, column] != 0.0:
+        size *= unit
     up = 2.0 * height - 1.0
     across = math.sqrt(max(0.0, 1.0 - up * up))
     x, y, z = across * math.cos(2.0 * math.pi * azimuth), across * math.sin(2.0 * math.pi * azimuth), up
@@ -64,51 +61,61 @@ def _push(table, k, column, length, height, azimuth, wrench, world, body, i):
 def sample_vehicle(i, streams, nominal, table, vehicles):
     """The vehicle of row i's episode, in place.
 
-    :param nominal: float64 (len(PARAMETER_NAMES), n or 1), of the vehicles that differ by ``table`` (WORLD_SIZE, n or 1).
+    :param nominal: float64 (len(PARAMETER_NAMES), n or 1), of the vehicles that differ by ``table``, (WORLD_SIZE, n or 1).
     :param vehicles: float64 (len(PARAMETER_NAMES), n).
     """
-    column, u = min(i, nominal.shape[1] - 1), uniforms(streams, i, 6, VEHICLE)
+    column, u = min(i, table.shape[1] - 1), uniforms(streams, i, 6, VEHICLE)
     for k in range(_N_PARAMETERS):
-        vehicles[k, i] = nominal[k, column]
+        vehicles[k, i] = nominal[k, min(i, nominal.shape[1] - 1)]
     if u[0] >= table[R.share, column]:
         return
-    mass = _between(table, R.mass, column, u[1], 1.0)
+    mass = between(table, R.mass, column, u[1], 1.0)
     vehicles[P.mass, i] *= mass
     vehicles[P.hover_thrust, i] *= mass
     for axis in range(3):
-        vehicles[P.ixx + axis, i] *= _between(table, R.inertia, column, u[2 + axis], 1.0)
+        vehicles[P.ixx + axis, i] *= between(table, R.inertia, column, u[2 + axis], 1.0)
     for axis in range(3):  # no body has one moment larger than the other two together
         others = vehicles[P.ixx + (axis + 1) % 3, i] + vehicles[P.ixx + (axis + 2) % 3, i]
         vehicles[P.ixx + axis, i] = min(vehicles[P.ixx + axis, i], others)
-    vehicles[P.motor_gain, i] *= _between(table, R.motor_gain, column, u[5], 1.0)
-    thrust = _between(table, R.thrust, column, u[6], 1.0)
+    vehicles[P.motor_gain, i] *= between(table, R.motor_gain, column, u[5], 1.0)
+    thrust = between(table, R.thrust, column, u[6], 1.0)
     vehicles[P.thrust_middle, i] *= thrust
     vehicles[P.thrust_half_range, i] *= thrust
-    arm = _between(table, R.arm, column, u[7], 1.0)
-    x, y = _between(table, R.center_of_mass, column, u[8], 0.0), _between(table, R.center_of_mass, column, u[9], 0.0)
+    arm = between(table, R.arm, column, u[7], 1.0)
+    x, y = between(table, R.center_of_mass, column, u[8], 0.0), between(table, R.center_of_mass, column, u[9], 0.0)
     for rotor in range(4):  # roll arms are y of the rotors, pitch arms -x
         vehicles[P.roll_arm_0 + rotor, i] = arm * vehicles[P.roll_arm_0 + rotor, i] - y
         vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
     if table[R.delay + 2, column] != FIXED:
-        vehicles[P.delay, i] = min(math.floor(_between(table, R.delay, column, u[10], 0.0)), table[R.delay + 1, column] - 1.0)
+        vehicles[P.delay, i] = min(math.floor(between(table, R.delay, column, u[10], 0.0)), table[R.delay + 1, column] - 1.0)
 
 
 @compiled
-def sample_wrench(i, streams, table, wrench):
+def _weight(i, nominal):
+    column = min(i, nominal.shape[1] - 1)
+    return nominal[P.mass, column] * nominal[P.gravity, column]
+
+
+@compiled
+def sample_wrench(i, streams, nominal, table, wrench):
     """The constant wrench of row i's episode, in place: ``wrench`` (WRENCH_SIZE, n)."""
     column, u = min(i, table.shape[1] - 1), uniforms(streams, i, 4, PUSH)
     for k in range(wrench.shape[0]):
         wrench[k, i] = 0.0
     if u[0] < table[R.wrench_share, column]:
-        _push(table, R.force, column, u[1], u[2], u[3], wrench, W.force_world, W.force_body, i)
-        _push(table, R.torque, column, u[4], u[5], u[6], wrench, W.torque_world, W.torque_body, i)
+        weight = _weight(i, nominal)
+        moment = weight * arm_length(min(i, nominal.shape[1] - 1), nominal)
+        _push(table, R.force, column, u[1], u[2], u[3], weight, wrench, W.force_world, W.force_body, i)
+        _push(table, R.torque, column, u[4], u[5], u[6], moment, wrench, W.torque_world, W.torque_body, i)
 
 
 @compiled
-def sample_gust(i, streams, table, gust):
+def sample_gust(i, streams, nominal, table, gust):
     """How row i's gusts are in its episode, and the first, in place: ``gust`` (GUST_SIZE, n)."""
     column, u, share = min(i, table.shape[1] - 1), uniforms(streams, i, 4, GUST), uniforms(streams, i, 1, PUSH)
-    std = _between(table, R.gust_std, column, u[0], 0.0) if share[0] < table[R.wrench_share, column] else 0.0
+    std = between(table, R.gust_std, column, u[0], 0.0) if share[0] < table[R.wrench_share, column] else 0.0
+    if table[R.gust_by_weight, column] != 0.0:
+        std *= _weight(i, nominal)
     keeps = table[R.gust_keeps, column]
     gust[G.keeps, i], gust[G.adds, i] = keeps, std * math.sqrt(1.0 - keeps * keeps)
     for axis in range(3):  # stationary from the start; two normals from two uniforms (Box-Muller)
@@ -137,16 +144,23 @@ def advance_gusts(b, gust, first, count):
 
 
 def new_worlds(
-    randomize: Randomization, vehicles: Sequence[Vehicle], nominal: FloatArray, n: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Arrays of n rows: of the vehicles that fly, of what is random in their worlds, and of gusts.
+    randomize: Randomization, designs: VehicleDistribution | None, vehicles: Sequence[Vehicle], given: FloatArray, n: int
+) -> dict[str, FloatArray]:
+    """Arrays of n rows, by name: the vehicles that fly and their nominal ones, how to sample both, and gusts.
 
-    :param vehicles: the nominal ones, n or one for all rows; ``nominal`` their parameters, (len(PARAMETER_NAMES), n or 1).
+    :param vehicles: n or one for all rows; ``given`` their parameters, (len(PARAMETER_NAMES), n or 1).
+    :param designs: of the nominal vehicles; None: they are the given ones.
     :raises ConfigError: a world that one of them cannot be flown in.
     """
-    if randomize == Randomization():
-        return nominal.copy(), np.zeros((WORLD_SIZE, 0)), np.zeros((GUST_SIZE, 0))
+    each_row, still = n // len(vehicles), randomize == Randomization() and designs is None
     for each in {id(each): each for each in vehicles}.values():
-        randomize.check(each)
+        randomize.check(each if designs is None else designs.weakest(each))
+    nominal = given if designs is None else np.repeat(given, each_row, axis=1)
     worlds = np.stack([randomize.numbers(each) for each in vehicles], axis=1)
-    return np.repeat(nominal, n // len(vehicles) if randomize.sets_vehicle else 1, axis=1), worlds, np.zeros((GUST_SIZE, n))
+    return {
+        "nominal": nominal,
+        "vehicles": np.repeat(nominal, each_row, axis=1) if randomize.sets_vehicle and designs is None else nominal.copy(),
+        "designs": np.zeros((DESIGN_SIZE, 0)) if designs is None else designs.numbers()[:, None],
+        "worlds": np.zeros((WORLD_SIZE, 0)) if still else worlds,
+        "gust": np.zeros((GUST_SIZE, 0 if still else n)),
+    }

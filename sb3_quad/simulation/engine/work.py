@@ -13,6 +13,7 @@ from numba import carray, int64
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.simulation.designs import DESIGN_SIZE, design
 from sb3_quad.simulation.engine.block import (
     MEMORY,
     NORMALS,
@@ -68,17 +69,20 @@ OUTCOME = np.dtype(
 # Columns of vehicles, random worlds and scaling: 1 where one serves all rows; none of worlds where all are nominal. Control
 # steps of an episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
 SIZES = (
-    *("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "nominal_columns", "world_columns", "gust_columns"),
-    *("scaling_columns", "mixed_delays", "gusts", "sets_wrench", "sets_vehicle", "width", "depth", "frame", "ages"),
-    *("integrals", "mode", "autoreset"),
+    *("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "nominal_columns", "given_columns"),
+    *("design_columns", "world_columns", "gust_columns", "scaling_columns", "mixed_delays", "gusts", "sets_wrench"),
+    *("sets_vehicle", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
 )
+_MAY_BE_NONE = ("world_columns", "gust_columns", "design_columns")
 _PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
 ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and shape, of which a name is one of the sizes
     "state": ("f8", (STATE_SIZE, "n")),
     "queue": ("f8", ("delay", 4, "n")),
     "wrench": ("f8", (WRENCH_SIZE, "n")),
     "vehicles": ("f8", (_PARAMETERS, "vehicle_columns")),  # that fly
-    "nominal": ("f8", (_PARAMETERS, "nominal_columns")),
+    "nominal": ("f8", (_PARAMETERS, "nominal_columns")),  # from which those differ
+    "given": ("f8", (_PARAMETERS, "given_columns")),  # from which the nominal ones are designed
+    "designs": ("f8", (DESIGN_SIZE, "design_columns")),
     "worlds": ("f8", (WORLD_SIZE, "world_columns")),
     "gust": ("f8", (GUST_SIZE, "gust_columns")),
     "frames": ("f4", ("n", "depth", "frame")),
@@ -139,8 +143,8 @@ def check_arrays(arrays: Arrays, sizes: Mapping[str, float]) -> None:
         array, wanted = arrays[name], tuple(int(sizes[size]) if isinstance(size, str) else size for size in shape)
         if array.dtype != kind or array.shape != wanted or not array.flags.carray:
             raise ConfigError(f"{name}: {array.dtype} of shape {array.shape}; needed is {np.dtype(kind)} of shape {wanted}")
-    for name in ("vehicle_columns", "nominal_columns", "world_columns", "gust_columns", "scaling_columns"):
-        if sizes[name] not in (1, sizes["n"]) and not (sizes[name] == 0 and name in ("world_columns", "gust_columns")):
+    for name in (size for size in SIZES if size.endswith("_columns")):
+        if sizes[name] not in (1, sizes["n"]) and not (sizes[name] == 0 and name in _MAY_BE_NONE):
             raise ConfigError(f"{name} {sizes[name]}: must be 1, or one for each of {sizes['n']} rows")
     if not ((arrays["task_index"] >= 0) & (arrays["task_index"] < sizes["tasks"])).all():
         raise ConfigError(f"task_index: every number must be one of the {sizes['tasks']} tasks, counted from 0")
@@ -258,12 +262,16 @@ def run_block(job, number, b, fresh):
         if dones[i]:
             returns[i], limits[i] = 0.0, job.max_steps
             count_episode(i, streams)
+            if job.design_columns > 0:
+                given = carray(pointer(job.given_at), (_PARAMETERS, job.given_columns), np.float64)
+                designs = carray(pointer(job.designs_at), (DESIGN_SIZE, job.design_columns), np.float64)
+                design(i, streams, given, designs, nominal)
             if job.sets_vehicle:
                 sample_vehicle(i, streams, nominal, worlds, vehicles)
             if job.sets_wrench:
-                sample_wrench(i, streams, worlds, wrench)
+                sample_wrench(i, streams, nominal, worlds, wrench)
             if job.gusts:
-                sample_gust(i, streams, worlds, gust)
+                sample_gust(i, streams, nominal, worlds, gust)
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
             if job.depth > 0:
                 forget(i, frames, integral)

@@ -1,0 +1,1 @@
+"""Vehicle distributions as YAML files; ``simulation/designs.py`` samples from them."""
