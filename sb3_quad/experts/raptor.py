@@ -6,6 +6,7 @@ README says: world frame, x forward, y left, z up; the target's heading is x. Fa
 are clipped as in PX4's ``mc_raptor``.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,8 @@ class Raptor:
     It sees the 18 features as an agent does, noise and all, and is not told the vehicle: of that it needs only the order of
     the rotors and the range of their speeds.
 
-    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that it flies.
+    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that it flies; or a sequence of them, of
+        which row i flies number i, counted round.
     :param observation_mean: μ of Eq. 3.16, shape (18,), that is undone; None for the environment's default.
     :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
     :raises ConfigError: rotors that are no X, or turn the other way.
@@ -39,11 +41,13 @@ class Raptor:
 
     def __init__(
         self,
-        vehicle: str | Vehicle = "itm",
+        vehicle: str | Vehicle | Sequence[Vehicle] = "itm",
         observation_mean: npt.ArrayLike | None = None,
         observation_std: npt.ArrayLike | None = None,
     ) -> None:
-        self.vehicle = load_vehicle(vehicle)
+        vehicles = [load_vehicle(vehicle)] if isinstance(vehicle, (str, Vehicle)) else [*vehicle]
+        self.vehicle, limits = vehicles[0], np.array([each.thrust_limits for each in vehicles])
+        self._least_speed = np.sqrt(limits[:, :1] / limits[:, 1:])  # of a rotor, by its greatest; (1 or n, 1)
         self._mean = np.array(DEFAULT_MEAN if observation_mean is None else observation_mean, dtype=np.float32)
         self._std = np.array(DEFAULT_STD if observation_std is None else observation_std, dtype=np.float32)
         signs = [(int(np.sign(x)), int(np.sign(y))) for x, y in self.vehicle.rotor_positions]
@@ -88,6 +92,6 @@ class Raptor:
 
     def _actions(self, motors: Float32Array) -> FloatArray:
         """Actions from its own, which are linear in the rotors' speeds."""
-        low, high = self.vehicle.rotor_speed_range
-        speeds = low + (high - low) * (motors[:, self._order].astype(np.float64) + 1.0) / 2.0
-        return self.vehicle.thrust_to_action(self.vehicle.thrust_coefficient * speeds**2)
+        least = self._least_speed[np.arange(len(motors)) % len(self._least_speed)]
+        speeds = least + (1.0 - least) * (motors[:, self._order].astype(np.float64) + 1.0) / 2.0
+        return 2.0 * (speeds**2 - least**2) / (1.0 - least**2) - 1.0

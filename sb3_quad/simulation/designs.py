@@ -20,6 +20,7 @@ from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.engine.random import DESIGN, new_streams, uniforms
+from sb3_quad.simulation.episodes import count_episode
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.ranges import Range, between
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle, load_vehicle
@@ -150,6 +151,7 @@ def arm_length(column, vehicles):  # type: ignore[no-untyped-def]
 @compiled
 def _design_all(streams, given, table, nominal):  # type: ignore[no-untyped-def]
     for i in range(nominal.shape[1]):
+        count_episode(i, streams)
         design(i, streams, given, table, nominal)
 
 
@@ -157,7 +159,7 @@ def sample_vehicles(vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle
     """n vehicles of a distribution, such as ``sample_vehicles("raptor", 1000)``; each can be given to any environment.
 
     :param vehicles: as :func:`resolve_vehicles` takes it; ``vehicle`` says what it does not.
-    :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each vehicle a stream.
+    :param seed: vehicle i is that of the first episode of row i in environments of this seed.
     :raises ConfigError: see :func:`resolve_vehicles`; or some of them could not fly.
     """
     distribution, rest = resolve_vehicles(vehicles), load_vehicle(vehicle)
