@@ -122,6 +122,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `task` | by id | a name, a :class:`~sb3_quad.simulation.tasks.Task`, or a mixture `{name: weight}` |
     | `task_kwargs` | `None` | fields of the task to override |
     | `vehicle` | `"itm"` | a name, the path of a YAML file, or a :class:`~sb3_quad.vehicles.vehicle.Vehicle` |
+    | `rotor_layout` | `None` | a vehicle whose order of the rotors is kept: body axes and rotors of `vehicle` turn to it |
     | `noise` | 0.05 | relative std of the observation noise; or `{"relative": …, "additive": …}`, the second in σ |
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
     | `last_action` | `False` | whether a frame ends with the action before it, so that it has 22 numbers |

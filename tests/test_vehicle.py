@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
+from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 
 ITM = load_vehicle("itm")
@@ -247,3 +248,29 @@ def test_unknown_name_gives_the_nearest() -> None:
 def test_what_is_no_vehicle_at_all(source: Any) -> None:
     with pytest.raises(ConfigError, match="vehicle"):
         load_vehicle(source)
+
+
+def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:
+    """Where the rotors are after a turn of the body, rad, and which way they turn."""
+    places = np.array(vehicle.rotor_positions) @ (1.0, 1.0j) * np.exp(1j * turn)
+    return {(complex(np.round(place, 9)), sign) for place, sign in zip(places, vehicle.rotor_directions, strict=True)}
+
+
+@pytest.mark.parametrize("name", ["crazyflie", "hummingbird"])
+def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(name: str) -> None:
+    own = load_vehicle(name)
+    turned = own.in_layout_of(ITM)
+    assert np.sign(turned.rotor_positions).tolist() == np.sign(ITM.rotor_positions).tolist()
+    assert turned.rotor_directions == ITM.rotor_directions
+    assert any(rotors(own, k * np.pi / 4) == rotors(turned) for k in range(8))
+    assert turned.geometric_gains == own.geometric_gains and turned.in_layout_of(ITM) is turned
+    assert QuadcopterBatch(3, vehicle=name, rotor_layout="itm").vehicle_list == [turned] * 3
+
+
+def test_a_layout_that_cannot_be_had_is_refused() -> None:
+    plus = load_vehicle("hummingbird").model_copy(update={"inertia": (2e-3, 4e-3, 5e-3)})
+    with pytest.raises(ConfigError, match="Ixx and Iyy differ"):
+        plus.in_layout_of(ITM)
+    long = ITM.model_copy(update={"rotor_positions": ((0.3, 0.05), (0.3, -0.05), (-0.3, -0.05), (-0.3, 0.05))})
+    with pytest.raises(ConfigError, match="no turn brings the rotors"):
+        long.in_layout_of(ITM)

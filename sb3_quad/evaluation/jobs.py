@@ -32,6 +32,7 @@ from sb3_quad.simulation.memory import Memory
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 _SILENT = {"title", "description", "reference", "group", "cell"}  # fields of a scenario that change no flight
+YOUNGER = {*Memory.model_fields, "rotor_layout"}  # than results and their keys: left out of them where they are not set
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,8 @@ class Job:
         parts: list[Any] = [self.scenario_key, self.record.content, self.record.scaling, self.record.offset]
         if self.spec.own is not None:  # a zip holds it, or what lies beside it
             vehicle = load_vehicle(self.spec.own.vehicle) if self.scenario.vehicle is None else None
-            observed = {key: value for key, value in self.spec.observed.items() if key not in Memory.model_fields or value}
-            parts += [observed, vehicle and vehicle.model_dump(mode="json")]  # a memory is younger than results and their keys
+            observed = {key: value for key, value in self.spec.observed.items() if key not in YOUNGER or value}
+            parts += [observed, vehicle and vehicle.model_dump(mode="json")]
         return _digest(parts)
 
     @property

@@ -59,6 +59,7 @@ def flown_as(scenario: Scenario) -> FlightSettings:
         task=scenario.task,
         vehicle=scenario.flown_vehicle(),
         noise=scenario.noise,
+        vehicles=scenario.vehicles,
         randomize=scenario.randomize,
         max_episode_steps=scenario.steps,
     )

@@ -18,7 +18,7 @@ RECOVERY, NEAR = "state recovery", time_row(0.1)
 SHOWN = (SUCCESS, SURVIVAL, REWARD, NEAR, MEDIAN, QUANTILE)
 CARD = """# {name}
 
-A policy for the vehicle `{vehicle}`: it recovers from random attitudes, velocities and body rates, and flies
+A policy for {vehicle}: it recovers from random attitudes, velocities and body rates, and flies
 to targets. It reads the 18 features of `sb3_quad`'s environments, scaled as there, and gives four actions in
 [-1, 1], the thrusts of the rotors.{memory}
 
@@ -84,7 +84,7 @@ def write_card(
     return CARD.format(
         name=name,
         memory=f" It also reads what they were before, as these `env_kwargs` say:\n`{kept}`." if kept else "",
-        vehicle=settings["vehicle"],
+        vehicle=f"the vehicle `{settings['vehicle']}`" if settings.get("vehicles") is None else str(settings["vehicles"]),
         noise=in_words(settings["noise"]),
         recoveries=measured[RECOVERY].n,
         targets=next(metrics.n for task, metrics in measured.items() if task != RECOVERY),

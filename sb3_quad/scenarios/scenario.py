@@ -22,6 +22,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.scenarios.parts import Start, Target, VehicleChanges, Wrench
+from sb3_quad.simulation.designs import VehicleDistribution
 from sb3_quad.simulation.noise import Noise
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import RECOVERED, Task
@@ -85,6 +86,9 @@ class Scenario(Frozen):
         default=None, description="name, or path of a YAML file (relative to the suite's); left out: the agent's own, or itm"
     )
     vehicle_changes: VehicleChanges = Field(default=VehicleChanges(), description="unknown to the controller")
+    vehicles: VehicleDistribution | None = Field(
+        default=None, description="each episode has a vehicle of it, unknown to the controller, such as {distribution: raptor}"
+    )
     randomize: Randomization | None = Field(
         default=None, description="what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"
     )
@@ -104,6 +108,7 @@ class Scenario(Frozen):
     @model_validator(mode="after")
     def _possible(self) -> "Scenario":
         vehicle = self.flown_vehicle()
+        vehicle = self.vehicles.weakest(vehicle) if self.vehicles is not None else vehicle
         self._check_way(vehicle)
         if self.randomize is not None:
             self.randomize.check(vehicle)
@@ -194,13 +199,15 @@ class Scenario(Frozen):
         """Whether every episode has the same start, target and wrenches, so that only noise tells them apart."""
         vectors = [self.start.velocity, self.start.body_rates]
         vectors += [vector for wrench in self.wrenches for vector in (wrench.force, wrench.torque)]
-        random = self.start.attitude.distribution or self.start.attitude.tilt or self.target.distance or self.randomize
-        return not random and all(vector.value is not None or vector.largest == 0.0 for vector in vectors)
+        attitude = self.start.attitude
+        random = attitude.distribution, attitude.tilt, self.target.distance, self.randomize, self.vehicles
+        return not any(random) and all(vector.value is not None or vector.largest == 0.0 for vector in vectors)
 
     @model_serializer(mode="wrap")
     def _default_left_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """``randomize`` is younger than results and their hashes."""
-        return {key: value for key, value in handler(self).items() if (key, value) != ("randomize", None)}
+        """``randomize`` and ``vehicles`` are younger than results and their hashes."""
+        younger = ("randomize", "vehicles")
+        return {key: value for key, value in handler(self).items() if value is not None or key not in younger}
 
     def _check_way(self, vehicle: Vehicle) -> None:
         """See that start and targets lie above ground, within ``max_distance`` of each other and within reach."""

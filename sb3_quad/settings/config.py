@@ -28,7 +28,7 @@ SETTINGS = YamlFolder(
     "sb3_quad.zoo_configs",
     ".yml",
     in_name=True,
-    folders=("nominal", "pid", "thesis"),
+    folders=("any_quadcopter", "nominal", "pid", "thesis"),
     former={"geometric/": "nominal/", "robust/": ""},
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""

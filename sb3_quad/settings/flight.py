@@ -18,7 +18,7 @@ from sb3_quad.simulation.memory import Memory
 from sb3_quad.simulation.noise import NoiseLevel
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
 
@@ -30,6 +30,9 @@ class FlightSettings(Memory):
     task_kwargs: dict[str, Any] | None = Field(default=None, description="fields of the task to override")
     vehicle: Any = Field(
         default="itm", description="name, path or Vehicle; or a list, of which row i flies number i, counted round"
+    )
+    rotor_layout: str | Vehicle | None = Field(
+        default=None, description="name, path or Vehicle whose order of the rotors the agent knows"
     )
     noise: NoiseLevel = Field(default=0.05, description="relative standard deviation of the observation noise, or Noise")
     observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
@@ -51,9 +54,9 @@ class FlightSettings(Memory):
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with an agent wherever it flies: how its observations are scaled, and what it remembers."""
-        scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
-        return {**scaling, **self.model_dump(mode="json", include=set(Memory.model_fields))}
+        """What goes with an agent wherever it flies: how its observations are scaled, its rotors' order, what it remembers."""
+        own = {name: getattr(self, name) for name in ("observation_mean", "observation_std", "rotor_layout")}
+        return {**own, **self.model_dump(mode="json", include=set(Memory.model_fields))}
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
@@ -75,6 +78,7 @@ class FlightSettings(Memory):
         scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
         lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
         whole = {**lists, "vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
+        whole["rotor_layout"] = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
         setattr(model, KEY, self.with_changes(**whole).model_dump(mode="json"))
 
     @staticmethod

@@ -44,6 +44,7 @@ class BatchKeywords(TypedDict, total=False):
     """Keywords of :class:`QuadcopterBatch` that the environments pass on."""
 
     vehicle: Any
+    rotor_layout: Any
     noise: Any
     observation_mean: Any
     observation_std: Any
@@ -65,6 +66,8 @@ class QuadcopterBatch:
     :param task_kwargs: fields of the task to override.
     :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of them whose time steps agree:
         row i has number i, counted round.
+    :param rotor_layout: name, path or Vehicle whose order of the rotors a policy knows; see
+        :meth:`~sb3_quad.vehicles.vehicle.Vehicle.in_layout_of`. None: each vehicle's own.
     :param noise: relative standard deviation of the observation noise, shape () or (n_envs,); or a
         :class:`~sb3_quad.simulation.noise.Noise` or its fields.
     :param observation_mean: μ of Eq. 3.16, shape (18,) or (n_envs, 18); None: zero.
@@ -92,6 +95,7 @@ class QuadcopterBatch:
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
         vehicle: Any = "itm",
+        rotor_layout: Any = None,
         noise: Any = 0.05,
         observation_mean: Any = None,
         observation_std: Any = None,
@@ -110,7 +114,7 @@ class QuadcopterBatch:
         self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads)
         self.autoreset = autoreset
         one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
-        self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle], n)
+        self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle], n, rotor_layout)
         columns = self.vehicle_list if one_each else self.vehicle_list[:1]
         self.given = np.stack([each.parameters() for each in columns], axis=1)
         self.distribution, self.randomize = resolve_vehicles(vehicles), resolve_randomization(randomize)

@@ -79,11 +79,14 @@ def whole_number(name: str, value: Any, least: int = 1, most: int | None = None,
     return int(value)
 
 
-def row_vehicles(given: Sequence[Any], n: int) -> list[Vehicle]:
-    """The vehicles of n rows, given round, whose time steps must agree."""
+def row_vehicles(given: Sequence[Any], n: int, layout: str | Vehicle | None = None) -> list[Vehicle]:
+    """The vehicles of n rows, given round, whose time steps must agree; in the layout of another, if one is given."""
     if not 0 < len(given) <= n:
         raise ConfigError(f"vehicle: {len(given)} vehicles for {n} environments; give from one to as many")
     loaded = {key: load_vehicle(each) for key, each in {id(each): each for each in given}.items()}  # each file once
+    if layout is not None:
+        wanted = load_vehicle(layout)
+        loaded = {key: each.in_layout_of(wanted) for key, each in loaded.items()}
     vehicles = [loaded[id(each)] for each in given]
     first = vehicles[0]
     for row, each in enumerate(vehicles):

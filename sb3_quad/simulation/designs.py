@@ -87,6 +87,11 @@ class VehicleDistribution(Frozen):
         except ValidationError as error:
             raise ConfigError(f"vehicles: some could not fly ({explain(error, Vehicle)})") from None
 
+    def __str__(self) -> str:
+        """Such as ``quadcopters of mass 0.02 to 5, …``."""
+        ranges = ((name, getattr(self, name)) for name in _RANGES)
+        return "quadcopters of " + ", ".join(f"{name} {each.low:g} to {each.high:g}" for name, each in ranges)
+
     def numbers(self) -> FloatArray:
         """What :func:`design` reads, in the order of ``DESIGN_NUMBERS``."""
         ranges = [number for name in _RANGES for number in getattr(self, name).numbers()]

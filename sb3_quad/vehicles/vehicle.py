@@ -25,6 +25,7 @@ PARAMETER_NAMES = (
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
 )
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
+LAYOUT_ANGLE = math.radians(20.0)  # by which rotors in the same place may differ, seen from the centre of mass
 OTHER_LIMITS = {
     "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
     "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
@@ -132,6 +133,37 @@ class Vehicle(Frozen):
             changes = {"geometric_gains": None, **changes}
         own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & OTHER_LIMITS.keys() else None)
         return Vehicle.model_validate({**own, **changes})
+
+    def in_layout_of(self, other: "Vehicle") -> "Vehicle":
+        """The same vehicle; its body axes are turned about z and its rotors renumbered, so that each is where ``other`` has it.
+
+        A policy knows one order of the rotors. So it can fly vehicles that number theirs in another way, or whose rotors form
+        a plus instead of an X.
+
+        :raises ConfigError: no turn brings its rotors there; or it would turn axes of different moments of inertia, off which
+            there are products of inertia.
+        """
+        ours, theirs = (np.array(each.rotor_positions) @ (1.0, 1.0j) for each in (self, other))
+        for turn in theirs[0] / ours:
+            turned = ours * turn / abs(turn)
+            order = [int(np.abs(np.angle(turned / each)).argmin()) for each in theirs]
+            near = bool((np.abs(np.angle(turned[order] / theirs)) < LAYOUT_ANGLE).all())
+            if near and [self.rotor_directions[k] for k in order] == [*other.rotor_directions]:
+                break
+        else:
+            raise ConfigError(f"rotor_layout: no turn brings the rotors of {self.name} to where those of {other.name} are")
+        (cosine, sine), (ixx, iyy, izz) = (turn.real / abs(turn), turn.imag / abs(turn)), self.inertia
+        if abs(turn.imag) < 1e-9 * abs(turn) and order == [0, 1, 2, 3]:
+            return self
+        if abs((ixx - iyy) * sine * cosine) > 0.02 * min(ixx, iyy):
+            raise ConfigError(f"rotor_layout: {self.name} has to be turned, but its Ixx and Iyy differ")
+        changes = {
+            "inertia": (ixx * cosine**2 + iyy * sine**2, ixx * sine**2 + iyy * cosine**2, izz),
+            "rotor_positions": tuple((float(each.real), float(each.imag)) for each in turned[order]),
+            "rotor_directions": other.rotor_directions,
+            "geometric_gains": self.geometric_gains,
+        }
+        return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
         """Whether both have the same parameters; names and an expert's gains do not matter."""
