@@ -135,7 +135,7 @@ class Vehicle(Frozen):
         return Vehicle.model_validate({**own, **changes})
 
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
-        """The same vehicle; its body axes are turned about z and its rotors renumbered, so that each is where ``other`` has it.
+        """The same vehicle, its body axes turned about z and its rotors renumbered: each is where ``other`` has it.
 
         A policy knows one order of the rotors. So it can fly vehicles that number theirs in another way, or whose rotors form
         a plus instead of an X.
