@@ -22,12 +22,11 @@ if TYPE_CHECKING:
     from sb3_quad.settings.flight import env_kwargs
 
 __version__ = "0.1.0"
-__all__ = [
+__all__ = [  # RecurrentDAgger needs an extra
     "PPOBC",
     "DAgger",
     "GeometricExpert",
     "PIDExpert",
-    "RecurrentDAgger",
     "__version__",
     "env_kwargs",
     "load_pretrained",

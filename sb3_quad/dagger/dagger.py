@@ -427,9 +427,7 @@ class DAgger(OnPolicyAlgorithm):
         observations, labels = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(rows)))
         return common.actor_mean(self.policy, observations), self.policy.log_std, labels
 
-    def _critic_batch(
-        self, flown: npt.NDArray[Any], values: Float32Array, rows: IntArray
-    ) -> tuple[th.Tensor, th.Tensor]:
+    def _critic_batch(self, flown: npt.NDArray[Any], values: Float32Array, rows: IntArray) -> tuple[th.Tensor, th.Tensor]:
         """V now (b,), and V when it was flown with the returns (b, 2), for rows of the rollout."""
         states, bounds = (th.as_tensor(part[rows], device=self.device) for part in (flown, values))
         return common.critic_values(self.policy, states), bounds

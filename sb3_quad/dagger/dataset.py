@@ -86,8 +86,9 @@ class AggregatedDataset:
 
         :raises ConfigError: a place that cannot be written to
         """
-        arrays = zip(self._stores, self._rows(th.arange(len(self))), strict=True)
-        write_arrays(_npz(path), **{name: array.numpy() for name, array in arrays})
+        columns = zip(self._stores, self._rows(th.arange(len(self))), strict=True)
+        arrays: dict[str, Any] = {name: array.numpy() for name, array in columns}
+        write_arrays(_npz(path), **arrays)
 
     def load(self, path: str | Path) -> None:
         """Replace the pairs by the last ``capacity`` of those in a file that :meth:`save` wrote.

@@ -74,8 +74,9 @@ class RecurrentDAgger(DAgger):
         super()._check_arguments()
 
     def _empty_dataset(self, *arguments: Any) -> AggregatedDataset:
-        n_layers, _, size = self.policy.lstm_hidden_state_shape
-        return SequenceDataset(*arguments, self.n_steps, (n_layers, size))
+        policy: Any = self.policy
+        n_layers, _, size = policy.lstm_hidden_state_shape
+        return SequenceDataset(*arguments, n_steps=self.n_steps, memory_shape=(n_layers, size))
 
     # --- In flight ---
 
@@ -119,9 +120,9 @@ class RecurrentDAgger(DAgger):
 
     def _aggregate(self, labels: Float32Array) -> None:
         buffer = self.rollout_buffer
-        by_env = (array.swapaxes(0, 1) for array in (buffer.observations, labels, buffer.episode_starts))
         hidden, cell = (part.transpose(0, 1).cpu().numpy() for part in self._states_before.pi)
-        self.dataset.add_sequences(*by_env, memory=(hidden, cell))
+        starts = buffer.episode_starts.T > 0.0
+        self.dataset.add_sequences(buffer.observations.swapaxes(0, 1), labels.swapaxes(0, 1), starts, (hidden, cell))
 
     # --- Learning ---
 

@@ -28,8 +28,8 @@ class Controller:
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
     2 and 3 get the observations that a policy sees. What a ``predict`` remembers, the second thing that it returns as SB3's
-    recurrent policies do, it is given again as ``state`` when it is asked next, with ``episode_start`` (n,), the rows that have
-    just begun an episode. All rows of a new Controller begin one.
+    recurrent policies do, it is given again as ``state`` when it is asked next, with ``episode_start`` (n,): the rows that
+    have just begun an episode. All rows of a new Controller begin one.
 
     :param source: the controller, as above.
     :param action_space: a Box.
@@ -174,9 +174,7 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     return None
 
 
-def observation_function(
-    source: Any, deterministic: bool = True, remembers: bool = True
-) -> Callable[[npt.NDArray[Any]], Any]:
+def observation_function(source: Any, deterministic: bool = True, remembers: bool = True) -> Callable[[npt.NDArray[Any]], Any]:
     """A policy or a function as a function from observations (n, ...) to actions (n, ...), for one flight of n rows.
 
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
@@ -192,9 +190,7 @@ def observation_function(
         answer = source.predict(observation, deterministic=deterministic, **given)
         memory = answer[1]
         if memory is not None and not remembers:
-            raise ExpertError(
-                f"{type(source).__name__}: has a memory, so its observations cannot be scaled"
-            )
+            raise ExpertError(f"{type(source).__name__}: has a memory, so its observations cannot be scaled")
         return answer[0]
 
     return ask
