@@ -14,7 +14,7 @@ from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:
     from sb3_quad.dagger.dagger import DAgger
-    from sb3_quad.dagger.recurrent import RecurrentDAgger
+    from sb3_quad.dagger.recurrent import RecurrentDAgger as RecurrentDAgger
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
     from sb3_quad.ppo_bc.ppo_bc import PPOBC
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from sb3_quad.settings.flight import env_kwargs
 
 __version__ = "0.1.0"
-__all__ = [  # RecurrentDAgger needs an extra
+__all__ = [  # less RecurrentDAgger, which needs an extra
     "PPOBC",
     "DAgger",
     "GeometricExpert",

@@ -188,9 +188,10 @@ class DAgger(OnPolicyAlgorithm):
             np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
 
-    def _empty_dataset(self, *arguments: Any) -> AggregatedDataset:
-        """For the arguments of :class:`AggregatedDataset`."""
-        return AggregatedDataset(*arguments)
+    def _empty_dataset(
+        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike
+    ) -> AggregatedDataset:
+        return AggregatedDataset(capacity, observation_shape, action_dim, dtype)
 
     def _check_arguments(self) -> None:
         """:raises ConfigError: an argument that does not fit; one line says which and what is allowed."""

@@ -73,10 +73,12 @@ class RecurrentDAgger(DAgger):
             )
         super()._check_arguments()
 
-    def _empty_dataset(self, *arguments: Any) -> AggregatedDataset:
+    def _empty_dataset(
+        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike
+    ) -> AggregatedDataset:
         policy: Any = self.policy
         n_layers, _, size = policy.lstm_hidden_state_shape
-        return SequenceDataset(*arguments, n_steps=self.n_steps, memory_shape=(n_layers, size))
+        return SequenceDataset(capacity, observation_shape, action_dim, dtype, self.n_steps, (n_layers, size))
 
     # --- In flight ---
 
