@@ -164,7 +164,7 @@ def test_the_version_stands_in_one_place(options, wheel):
 
 
 def test_what_the_code_imports_is_declared(options):
-    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow"}
+    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow", "sb3_contrib": "sb3-contrib"}
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
     extras = [text for name, text in options["options.extras_require"].items() if name != "dev"]
     wanted = "\n".join([options["options"]["install_requires"], *extras])

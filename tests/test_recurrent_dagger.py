@@ -12,13 +12,15 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_quad import DAgger
+from sb3_quad import PPOBC, DAgger
 from sb3_quad.base.errors import ConfigError, ExpertError, MissingExtra
 from sb3_quad.cli import main
 from sb3_quad.common import CLONING_LOSSES
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.controller import Controller
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.experts.pid import PIDExpert
 
@@ -86,24 +88,40 @@ def everything(model):
 # --- Experts that remember ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("algorithm", [DAgger, RecurrentDAgger])
+class Rollouts(BaseCallback):
+    """Observations and labels of every rollout, (n_steps, n_envs)."""
+
+    def __init__(self):
+        super().__init__()
+        self.observations, self.labels = [], []
+
+    def _on_rollout_end(self):
+        buffer, labels = self.model.rollout_buffer, self.locals.get("labels")
+        self.observations += list(buffer.observations[..., 0].copy())
+        self.labels += list((buffer.expert_actions if labels is None else labels)[..., 0].copy())
+
+    def _on_step(self):
+        return True
+
+
+@pytest.mark.parametrize("algorithm", [DAgger, PPOBC, RecurrentDAgger])
 def test_labels_are_of_the_rows_own_episode_across_rollouts(algorithm):
     """Rollouts of 6 steps end within episodes of 5 to 9: the expert's memory must go on from one to the next."""
-    steps = {"n_steps": 6, "batch_size": 12}
-    if algorithm is DAgger:
-        model = DAgger("MlpPolicy", recall(), Repeat(), **{**SMALL, **steps}).learn(6 * N_ENVS * 10)
-        pairs = model.dataset.pairs(th.arange(len(model.dataset)))
-        observations, labels = (part.view(60, N_ENVS).numpy() for part in pairs)
-        starts = observations != 0.0  # as its expert has them
-    else:
-        model = build(**steps).learn(6 * N_ENVS * 10)
-        parts = (part.view(10, N_ENVS, 6).transpose(1, 2).reshape(60, N_ENVS).numpy() for part in everything(model)[:3])
-        observations, labels, starts = parts
-    assert (starts.astype(bool) == (observations != 0.0)).all() and starts[1:].any()
+    policy = "MlpLstmPolicy" if algorithm is RecurrentDAgger else "MlpPolicy"
+    model, seen = algorithm(policy, recall(), expert=Repeat(), **{**SMALL, "n_steps": 6, "batch_size": 12}), Rollouts()
+    for _ in range(2):  # nor does it end with learn
+        model.learn(6 * N_ENVS * 5, callback=seen, reset_num_timesteps=False)
     signs = np.zeros(N_ENVS)
-    for observation, label in zip(observations, labels, strict=True):
+    for observation, label in zip(seen.observations, seen.labels, strict=True):
         signs = np.where(observation != 0.0, observation, signs)
         np.testing.assert_array_equal(label, signs)
+    assert len(seen.labels) == 60
+
+
+def test_an_expert_that_remembers_is_evaluated_as_it_labels():
+    env = recall()
+    rewards, _ = evaluate_policy(Controller.for_env(Repeat(), env), env, 20, return_episode_rewards=True, warn=False)
+    assert rewards == [0.0] * 20
 
 
 @pytest.mark.skipif(importlib.util.find_spec("foundation_policy") is None, reason="needs the extra [raptor]")

@@ -11,7 +11,7 @@ from sb3_quad.training.runs import RunFolder
 
 
 def print_next(run: RunFolder) -> None:
-    """Print the commands that show, measure and, where that is possible, export a run's agent, if it is of an environment of this package."""
+    """Print the commands that show, measure and export a run's agent, as far as they know its environment and policy."""
     if run.name not in ENVIRONMENTS:
         return
     algo, number, agent = run.path.parent.name, run.path.name.removeprefix(f"{run.name}_").split("_")[0], str(run.result)
