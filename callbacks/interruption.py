@@ -14,6 +14,7 @@ from sb3_quad.base.files import model_bytes, save_model
 from sb3_quad.base.signals import StopSignals
 
 ENVIRONMENT = "environment."  # before the names of the environments' arrays
+MEMORY = "memory."  # before those of what the algorithm remembers beside its zip
 
 
 class StopOnSignal(BaseCallback):
@@ -75,7 +76,7 @@ class Snapshot(NamedTuple):
 
     timesteps: int
     model: bytes  # the zip
-    state: Arrays  # random numbers, and the environments' arrays under ``ENVIRONMENT``
+    state: Arrays  # random numbers, and arrays under ``ENVIRONMENT`` and ``MEMORY``
 
 
 class LastGoodModel(BaseCallback):
@@ -101,7 +102,9 @@ class LastGoodModel(BaseCallback):
                 raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")
         batch = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
         arrays = {} if batch is None else batch.snapshot()
+        remembered: Arrays = getattr(self.model, "memory", dict)()
         state = random_state() | {f"{ENVIRONMENT}{name}": array for name, array in arrays.items()}
+        state |= {f"{MEMORY}{name}": array for name, array in remembered.items()}
         self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model), state)
 
     def _on_step(self) -> bool:

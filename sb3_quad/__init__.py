@@ -14,6 +14,7 @@ from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:
     from sb3_quad.dagger.dagger import DAgger
+    from sb3_quad.dagger.recurrent import RecurrentDAgger as RecurrentDAgger
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
     from sb3_quad.ppo_bc.ppo_bc import PPOBC
@@ -21,13 +22,23 @@ if TYPE_CHECKING:
     from sb3_quad.settings.flight import env_kwargs
 
 __version__ = "0.1.0"
-__all__ = ["PPOBC", "DAgger", "GeometricExpert", "PIDExpert", "__version__", "env_kwargs", "load_pretrained", "pretrained"]
+__all__ = [  # less RecurrentDAgger, which needs an extra
+    "PPOBC",
+    "DAgger",
+    "GeometricExpert",
+    "PIDExpert",
+    "__version__",
+    "env_kwargs",
+    "load_pretrained",
+    "pretrained",
+]
 
 _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
     "DAgger": "sb3_quad.dagger.dagger",
     "GeometricExpert": "sb3_quad.experts.geometric",
     "PIDExpert": "sb3_quad.experts.pid",
     "PPOBC": "sb3_quad.ppo_bc.ppo_bc",
+    "RecurrentDAgger": "sb3_quad.dagger.recurrent",
     "env_kwargs": "sb3_quad.settings.flight",
     "load_pretrained": "sb3_quad.pretrained_policies",
     "pretrained": "sb3_quad.pretrained_policies",

@@ -88,6 +88,10 @@ def check_ppo_bc(scope):
     assert not np.array_equal(first, last)
 
 
+def check_recurrent(scope):
+    assert np.mean(scope["rewards"]) > -0.3  # of -1 by whom has forgotten
+
+
 def check_dynamics(scope):
     assert len(scope["difference"]) == 5 and 0.0 < max(scope["difference"].values()) < 1e-9
     assert scope["observed"] < 1e-6 and scope["fastest"] > 20.0
@@ -109,6 +113,7 @@ CHECKS = {
     "docs/dynamics.md": check_dynamics,
     "docs/environments.md": check_environments,
     "docs/ppo_bc.md": check_ppo_bc,
+    "docs/recurrent.md": check_recurrent,
     "docs/vehicles.md": check_vehicles,
 }
 

@@ -25,10 +25,11 @@ class Counter:
     """Remembers how often it was asked, as SB3's recurrent policies do, and notes what it was given."""
 
     def __init__(self):
-        self.given = []
+        self.given, self.starts = [], []
 
     def predict(self, observation, state=None, episode_start=None, deterministic=True):
         self.given.append(state)
+        self.starts.append(episode_start)
         return np.zeros((len(observation), 4)), (1 if state is None else state + 1)
 
 
@@ -51,12 +52,19 @@ def test_what_a_controller_remembers_is_of_one_flight():
     assert counter.given == [None, 1, 2, 3] * 2
 
 
-def test_who_remembers_neither_teaches_nor_is_scaled():
-    env = QuadcopterVecEnv(2, seed=0)
+def test_what_an_expert_remembers_goes_on_in_its_environment_and_says_who_begins():
+    counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
+    labeller, observation, starts = Controller.for_env(counter, env), env.reset(), np.array([True, False])
+    labeller.labels(observation, np.ones(2, dtype=bool))
+    Controller.for_env(counter, env, labeller).labels(observation, starts)
+    Controller.for_env(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)
+    assert counter.given == [None, 1, None]
+    np.testing.assert_array_equal(counter.starts[1], starts)
+
+
+def test_the_observations_of_who_remembers_are_not_scaled():
     with pytest.raises(ExpertError, match="Counter: has a memory"):
-        Controller.for_env(Counter(), env).labels(env.reset())
-    with pytest.raises(ExpertError, match="Counter: has a memory"):
-        AdaptiveScaling(Counter())(env.reset())
+        AdaptiveScaling(Counter())(QuadcopterVecEnv(2, seed=0).reset())
 
 
 def tilted(axis, degrees):

@@ -56,5 +56,5 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """
     settings = job.flight_settings
     controllers = {"agent": model, "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle)}
-    agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
+    agent = "IL-agent" if job.config.algo in ("dagger", "recurrent_dagger") else "RL-agent"
     return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))

@@ -11,18 +11,20 @@ from sb3_quad.training.runs import RunFolder
 
 
 def print_next(run: RunFolder) -> None:
-    """Print the commands that show, measure and export a run's agent, if it is of an environment of this package."""
+    """Print the commands that show, measure and export a run's agent, as far as they know its environment and policy."""
     if run.name not in ENVIRONMENTS:
         return
     algo, number, agent = run.path.parent.name, run.path.name.removeprefix(f"{run.name}_").split("_")[0], str(run.result)
     label = f"{algo}_{run.path.name}"
     picture = [] if has_display() else ["-o", f"{label}.png"]
     print("next:")
-    for command in (
+    commands = [
         ["enjoy", "--algo", algo, "--env", run.name, "-f", str(run.path.parent.parent), "--exp-id", number, *picture],
         ["evaluate", agent, "--suite", "quick", "-o", f"evaluations/{label}"],
-        ["export", agent, "--format", "torchscript"],
-    ):
+    ]
+    if algo != "recurrent_dagger":  # which no file but a zip holds
+        commands.append(["export", agent, "--format", "torchscript"])
+    for command in commands:
         print("  " + shlex.join([*_program(), *command]))
 
 

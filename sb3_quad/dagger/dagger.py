@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.base.arrays import Arrays, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
@@ -30,7 +30,9 @@ from sb3_quad.networks import shared_out
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
 _LEAST = {"n_steps": 1, "batch_size": 1, "n_epochs": 1, "gradient_steps": 1, "beta_decay": 0, "beta_final": 0}
-_CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # names of the critic's own parameters
+# Names of the critic's own parameters; the last two are those of recurrent policies.
+_CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.", "lstm_critic.", "critic.")
+Timeout = tuple[int, int, npt.NDArray[Any], Any]  # step, environment, last observation, what the critic remembered
 
 
 class DAgger(OnPolicyAlgorithm):
@@ -162,6 +164,7 @@ class DAgger(OnPolicyAlgorithm):
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
         self.expert: Any = None
+        self._labeller: Controller | None = None  # the expert, with what it remembers from rollout to rollout
         self._n_rollouts = 0
         self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
 
@@ -178,12 +181,17 @@ class DAgger(OnPolicyAlgorithm):
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.rollout_buffer.observations.dtype
-        self.dataset = AggregatedDataset(
+        self.dataset = self._empty_dataset(
             self.dataset_capacity or self.n_steps * self.n_envs,
             self.rollout_buffer.obs_shape,
             self.rollout_buffer.action_dim,
             np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
+
+    def _empty_dataset(
+        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike
+    ) -> AggregatedDataset:
+        return AggregatedDataset(capacity, observation_shape, action_dim, dtype)
 
     def _check_arguments(self) -> None:
         """:raises ConfigError: an argument that does not fit; one line says which and what is allowed."""
@@ -209,7 +217,7 @@ class DAgger(OnPolicyAlgorithm):
         :raises ExpertError: an expert that does not fit the environment
         """
         if self.env is not None:
-            Controller.for_env(expert, self.env)
+            self._labeller = Controller.for_env(expert, self.env, self._labeller)
         self.expert = expert
 
     @property
@@ -239,14 +247,15 @@ class DAgger(OnPolicyAlgorithm):
         whole rollout at the end, since it does not change before.
         """
         self.policy.set_training_mode(False)
-        labeller, rng, networks = Controller.for_env(self.expert, env), self._generator(0), common.perceptrons(self.policy)
+        self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)
+        rng, networks = self._generator(0), common.perceptrons(self.policy)
         beta = self.current_beta
         n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)
         not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
-        timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, terminal observation
+        timeouts: list[Timeout] = []
         n_by_expert = 0
 
         rollout_buffer.reset()
@@ -254,8 +263,8 @@ class DAgger(OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
-            labels[step] = labeller.labels(observations)  # of the state before the step
-            means = common.outputs(networks, self.policy, "actor", observations)
+            labels[step] = labeller.labels(observations, self._last_episode_starts)  # of the state before the step
+            means = self._means(networks, observations, step)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta
             actions = np.where(by_expert[:, None], labels[step], sampled)
@@ -273,30 +282,50 @@ class DAgger(OnPolicyAlgorithm):
             self._update_info_buffer([infos[row] for row in ended], dones[ended])
             for row in ended:
                 if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
-                    timeouts.append((step, int(row), infos[row]["terminal_observation"]))
+                    timeouts.append((step, int(row), infos[row]["terminal_observation"], self._critic_memory(int(row))))
 
             rollout_buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)  # type: ignore[arg-type]
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
 
-        flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
-        rollout_buffer.values = self._values(flown).reshape(n_rollout_steps, n_envs)
+        values, last_values, terminal_values = self._rollout_values(timeouts)
+        rollout_buffer.values = values
         if timeouts:  # a time limit is no failure: what would have followed is worth V of the last observation
-            steps, rows, terminal = zip(*timeouts, strict=True)
-            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * self._values(np.stack(terminal))
-        rollout_buffer.compute_returns_and_advantage(last_values=th.from_numpy(self._values(new_obs)), dones=dones)
+            steps, rows, *_ = zip(*timeouts, strict=True)
+            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * terminal_values
+        rollout_buffer.compute_returns_and_advantage(last_values=th.from_numpy(last_values), dones=dones)
 
         if self.dataset_capacity == 0:
             self.dataset.clear()
-        self.dataset.add(flown, labels.reshape(-1, action_dim))
+        self._aggregate(labels)
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
-        self.logger.record("dagger/dataset_size", len(self.dataset))
+        self.logger.record("dagger/dataset_size", self.dataset.n_pairs)
         self.logger.record("rollout/expert_fraction", n_by_expert / (n_rollout_steps * n_envs))
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
+
+    def _means(self, networks: common.Perceptrons | None, observations: npt.NDArray[Any], step: int) -> Float32Array:
+        """The policy's mean actions (n_envs, action_dim) for the observations of a step of the rollout."""
+        return common.outputs(networks, self.policy, "actor", observations)
+
+    def _critic_memory(self, row: int) -> Any:
+        """What the critic remembers of environment ``row`` after the step."""
+        return None
+
+    def _rollout_values(self, timeouts: list[Timeout]) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """V of the rollout's observations (n_steps, n_envs), of those after it (n_envs,), and where time limits struck."""
+        buffer = self.rollout_buffer
+        values = self._values(buffer.observations.reshape(-1, *buffer.obs_shape)).reshape(buffer.values.shape)
+        terminal = self._values(np.stack([last for _, _, last, _ in timeouts])) if timeouts else np.empty(0, np.float32)
+        return values, self._values(self._last_obs), terminal
+
+    def _aggregate(self, labels: Float32Array) -> None:
+        """Add the rollout to the dataset, with its labels (n_steps, n_envs, action_dim)."""
+        flown = self.rollout_buffer.observations.reshape(-1, *self.rollout_buffer.obs_shape)
+        self.dataset.add(flown, labels.reshape(len(flown), -1))
 
     def _values(self, observations: Any) -> Float32Array:
         """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
@@ -318,14 +347,13 @@ class DAgger(OnPolicyAlgorithm):
             groups[name.startswith(_CRITIC)].append(parameter)
         rng = self._generator(1)
         buffer = self.rollout_buffer
-        n_rows = buffer.buffer_size * buffer.n_envs
-        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
+        n_rows, batch_size = self._batch_rows()
+        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // batch_size)
         n_batches = min(n_batches, self.n_epochs * n_rows)
-        actor_batches = sample_rows(len(self.dataset), n_batches * self.batch_size, rng, self.shuffle).reshape(n_batches, -1)
-        n_critic = min(self.n_epochs * -(-n_rows // self.batch_size), n_batches)  # steps in which the critic takes part
+        actor_batches = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle).reshape(n_batches, -1)
+        n_critic = min(self.n_epochs * -(-n_rows // batch_size), n_batches)  # steps in which the critic takes part
         critic_batches = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle), n_critic))
-        flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
-        values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
+        flown, values = self._critic_data()
         networks = common.perceptrons(self.policy)
         terms = np.empty((n_batches, 4))  # of the loss; where the critic takes no part, its one is 0
         limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
@@ -358,6 +386,16 @@ class DAgger(OnPolicyAlgorithm):
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
+    def _batch_rows(self) -> tuple[int, int]:
+        """Rows of the rollout, and of a mini-batch; the dataset counts in the same rows."""
+        return self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs, self.batch_size
+
+    def _critic_data(self) -> tuple[npt.NDArray[Any], Float32Array]:
+        """Observations (n, ...) of the rollout; V when it was flown, and the returns, (n, 2)."""
+        buffer = self.rollout_buffer
+        values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
+        return buffer.observations.reshape(len(values), *buffer.obs_shape), values
+
     def _gradients(
         self,
         for_actor: IntArray,
@@ -368,24 +406,32 @@ class DAgger(OnPolicyAlgorithm):
     ) -> FloatArray:
         """Set the gradient of Eq. 4.3 for rows of the dataset, and of the rollout just flown.
 
-        :param flown: its observations (n, ...); :param values: V when it was flown, and the returns, (n, 2).
+        :param flown: see :meth:`_critic_data`; :param values: likewise.
         :param for_critic: None: the critic takes no part.
         :return: the terms of cloning, value, entropy and weights.
         """
-        policy = self.policy
-        observations, expert_actions = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(for_actor)))
-        mean, log_std = common.actor_mean(policy, observations), policy.log_std
-        bc = common.cloning_errors(self.bc_loss, mean, log_std, expert_actions).mean()
+        policy, log_std = self.policy, self.policy.log_std
+        bc = common.cloning_errors(self.bc_loss, *self._actor_batch(for_actor)).mean()
         entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
         v_loss = th.zeros((), device=self.device)
         if for_critic is not None:
-            states, bounds = (th.as_tensor(part[for_critic], device=self.device) for part in (flown, values))
-            v_loss = common.value_loss(common.critic_values(policy, states), bounds[:, 0], bounds[:, 1], clip_range_vf)
+            now, bounds = self._critic_batch(flown, values, for_critic)
+            v_loss = common.value_loss(now, bounds[:, 0], bounds[:, 1], clip_range_vf)
         loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
         policy.optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
         terms: FloatArray = th.stack([bc, v_loss, entropy_loss, l2]).detach().double().cpu().numpy()
         return terms
+
+    def _actor_batch(self, rows: IntArray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Means (b, action_dim), log_std and labels (b, action_dim) for rows of the dataset."""
+        observations, labels = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(rows)))
+        return common.actor_mean(self.policy, observations), self.policy.log_std, labels
+
+    def _critic_batch(self, flown: npt.NDArray[Any], values: Float32Array, rows: IntArray) -> tuple[th.Tensor, th.Tensor]:
+        """V now (b,), and V when it was flown with the returns (b, 2), for rows of the rollout."""
+        states, bounds = (th.as_tensor(part[rows], device=self.device) for part in (flown, values))
+        return common.critic_values(self.policy, states), bounds
 
     def _compiled_gradients(
         self,
@@ -438,4 +484,17 @@ class DAgger(OnPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
-        return [*super()._excluded_save_params(), "expert", "dataset"]
+        return [*super()._excluded_save_params(), "expert", "dataset", "_labeller"]
+
+    def memory(self) -> Arrays:
+        """What is remembered from rollout to rollout and is in no zip, as :meth:`restore_memory` takes it: by the expert."""
+        return {} if self._labeller is None else self._labeller.memory()
+
+    def restore_memory(self, memory: Arrays) -> None:
+        """Go back to a :meth:`memory`; the model needs its expert and environment.
+
+        :raises ExpertError: an expert whose memory could not be saved
+        """
+        if memory:
+            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[arg-type]
+            self._labeller.restore(memory)

@@ -8,11 +8,14 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.arrays import BoolArray, Float32Array
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
 from sb3_quad.simulation.state import QuadcopterState
 
-Ask = Callable[[npt.NDArray[Any]], Any]
+Ask = Callable[[npt.NDArray[Any], BoolArray | None], Any]  # observations (n, ...); which rows begin an episode (n,)
+
+
+UNSAVED = "unsaved"  # among the names of a memory: whose it is, of which nothing else could be saved
 
 
 class Controller:
@@ -25,8 +28,8 @@ class Controller:
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
     2 and 3 get the observations that a policy sees. What a ``predict`` remembers, the second thing that it returns as SB3's
-    recurrent policies do, it is given again when it is asked next: all rows of a new Controller begin an episode. An expert
-    that labels must remember nothing.
+    recurrent policies do, it is given again as ``state`` when it is asked next, with ``episode_start`` (n,): the rows that
+    have just begun an episode. All rows of a new Controller begin one.
 
     :param source: the controller, as above.
     :param action_space: a Box.
@@ -58,11 +61,15 @@ class Controller:
             if isinstance(theirs, spaces.Space) and ours is not None and theirs.shape != ours.shape:
                 label = what.replace("_", " ")
                 raise error(f"{kind} {self.name}: its {label} has shape {theirs.shape}, the environment's {ours.shape}")
+        self._env: VecEnv | None = None
+        self._memory: Any = None
         self.needs_state = hasattr(source, "actions") and true_state is not None
         if self.needs_state and true_state is not None:
-            self._ask: Ask = lambda observation: source.actions(true_state())
-        elif hasattr(source, "predict") or callable(source):
-            self._ask = observation_function(source, remembers=kind != "expert")
+            self._ask: Ask = lambda observation, episode_start: source.actions(true_state())
+        elif hasattr(source, "predict"):
+            self._ask = self._predict
+        elif callable(source):
+            self._ask = lambda observation, episode_start: source(observation)
         elif hasattr(source, "actions"):
             raise error(f"{kind} {self.name}: needs the true state, and this environment has no true_state()")
         else:
@@ -71,26 +78,34 @@ class Controller:
             )
 
     @staticmethod
-    def for_env(expert: Any, env: VecEnv) -> "Controller":
+    def for_env(expert: Any, env: VecEnv, present: "Controller | None" = None) -> "Controller":
         """An expert that labels the states of a vector environment; with ``VecNormalize`` it sees normalised observations.
 
+        :param present: given back, with what the expert remembers, if it is of the same expert and environment.
         :raises ExpertError: an expert that is none of the three, or whose spaces do not fit the environment.
         """
         if expert is None:
             raise ExpertError("no expert: give expert=... when building or loading the model, or call set_expert(expert)")
-        return Controller(expert, env.action_space, env.observation_space, true_state_of(env), "expert")
+        if present is not None and present.source is expert and present._env is env:
+            return present
+        controller = Controller(expert, env.action_space, env.observation_space, true_state_of(env), "expert")
+        controller._env = env
+        return controller
 
-    def actions(self, observation: npt.NDArray[Any], rows: BoolArray | None = None) -> Float32Array:
+    def actions(
+        self, observation: npt.NDArray[Any], rows: BoolArray | None = None, episode_start: BoolArray | None = None
+    ) -> Float32Array:
         """The actions for the present state, float32 of shape (n, action_dim); ask before ``env.step``.
 
         :param observation: (n, ...): the observations of that state.
         :param rows: bool (n,): the rows that matter; the others get zeros. None: all.
+        :param episode_start: bool (n,): the rows that have just begun an episode, for what a controller remembers. None: none.
         :raises ExpertError: of an expert, what it raises itself, actions that are not finite, or not of this shape;
             ``ControllerError`` of others.
         """
         error = ExpertError if self.kind == "expert" else ControllerError
         try:
-            raw = np.asarray(self._ask(observation))
+            raw = np.asarray(self._ask(observation, episode_start))
         except SB3QuadError:
             raise
         except (Exception, SystemExit) as failed:  # a controller of the user's may raise anything
@@ -108,15 +123,45 @@ class Controller:
             raise error(f"{self.kind} {self.name}: gives {actions[row].tolist()} in row {row}; every number must be finite")
         return actions
 
-    def labels(self, observation: npt.NDArray[Any]) -> Float32Array:
+    def labels(self, observation: npt.NDArray[Any], episode_start: BoolArray | None = None) -> Float32Array:
         """As :meth:`actions`, clipped to the action space: what an agent is to learn."""
-        actions = self.actions(observation)
+        actions = self.actions(observation, episode_start=episode_start)
         np.clip(actions, self._low, self._high, out=actions)
         return actions
 
-    def predict(self, observation: npt.NDArray[Any], *arguments: Any, **keywords: Any) -> tuple[Float32Array, None]:
+    def predict(
+        self,
+        observation: npt.NDArray[Any],
+        state: None = None,
+        episode_start: BoolArray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[Float32Array, None]:
         """SB3's ``predict``, for ``evaluate_policy``; the labels."""
-        return self.labels(observation), None
+        return self.labels(observation, episode_start), None
+
+    def _predict(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
+        given: dict[str, Any] = {}
+        if self._memory is not None:
+            given = {"state": self._memory} | ({} if episode_start is None else {"episode_start": episode_start})
+        actions, self._memory, *_ = self.source.predict(observation, deterministic=True, **given)
+        return actions
+
+    def memory(self) -> Arrays:
+        """What it remembers, as :meth:`restore` takes it; none where that is no tuple of arrays."""
+        if not isinstance(self._memory, tuple) or not all(isinstance(part, np.ndarray) for part in self._memory):
+            return {} if self._memory is None else {UNSAVED: np.array(self.name)}
+        return {str(number): part.copy() for number, part in enumerate(self._memory)}
+
+    def restore(self, memory: Arrays) -> None:
+        """Go back to a :meth:`memory`.
+
+        :raises ExpertError: one that could not be saved.
+        """
+        if UNSAVED in memory:
+            raise ExpertError(
+                f"{self.kind} {memory[UNSAVED]}: what it remembers was no tuple of arrays, so no snapshot holds it; begin anew"
+            )
+        self._memory = tuple(memory[str(number)] for number in range(len(memory))) if memory else None
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
@@ -129,7 +174,7 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     return None
 
 
-def observation_function(source: Any, deterministic: bool = True, remembers: bool = True) -> Ask:
+def observation_function(source: Any, deterministic: bool = True, remembers: bool = True) -> Callable[[npt.NDArray[Any]], Any]:
     """A policy or a function as a function from observations (n, ...) to actions (n, ...), for one flight of n rows.
 
     :param deterministic: whether a policy gives the mean of its actions, or a sample.
@@ -145,9 +190,7 @@ def observation_function(source: Any, deterministic: bool = True, remembers: boo
         answer = source.predict(observation, deterministic=deterministic, **given)
         memory = answer[1]
         if memory is not None and not remembers:
-            raise ExpertError(
-                f"{type(source).__name__}: has a memory, so it can be flown alone, but neither imitated nor scaled"
-            )
+            raise ExpertError(f"{type(source).__name__}: has a memory, so its observations cannot be scaled")
         return answer[0]
 
     return ask

@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.imports import require
 from sb3_quad.base.memory import check_unpacked
 from sb3_quad.base.trust import trusted
 from sb3_quad.experts.unpickle import unpickle
@@ -19,8 +20,10 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 # The module of the saved policy class tells the algorithm's family.
 _ACTOR_CRITIC = "stable_baselines3.common.policies"
+_RECURRENT = "sb3_contrib.common.recurrent.policies"
 _FAMILIES = {
     _ACTOR_CRITIC: "PPO",
+    _RECURRENT: "RecurrentPPO",
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
@@ -49,7 +52,7 @@ def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
 
 
 def saved_algorithm(path: str | Path) -> str:
-    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG or DQN, or PPOBC or DAgger of this package.
+    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG, DQN or RecurrentPPO; PPOBC, DAgger or RecurrentDAgger of ours.
 
     A zip does not name its algorithm; the policy class and the settings that were saved with it tell.
 
@@ -62,6 +65,8 @@ def saved_algorithm(path: str | Path) -> str:
         raise ConfigError(f"model {path}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
     if module not in _FAMILIES:
         raise ConfigError(f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
+    if module == _RECURRENT:
+        return "RecurrentDAgger" if "beta" in data else "RecurrentPPO"
     if module == _ACTOR_CRITIC:
         own = next((name for key, name in _OURS.items() if key in data), None)
         return own or ("PPO" if "n_epochs" in data else "A2C")
@@ -88,10 +93,14 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     """The model in an SB3 ``.zip``, of any algorithm of Stable-Baselines3 (and of this package), ready for ``predict``.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown family, or with parameters
-        that are not finite; a file that may run code of its own.
+        that are not finite; a file that may run code of its own. :class:`MissingExtra`: a recurrent one, without sb3-contrib.
     """
     algorithm = saved_algorithm(path)
-    stock: type[BaseAlgorithm] = getattr(stable_baselines3, "PPO" if algorithm in _OURS.values() else algorithm)
+    stock: type[BaseAlgorithm]
+    if algorithm.startswith("Recurrent"):
+        stock = require("sb3_contrib", "recurrent", f"model {path}").RecurrentPPO
+    else:
+        stock = getattr(stable_baselines3, "PPO" if algorithm in _OURS.values() else algorithm)
     try:
         model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
     except ConfigError:

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import require
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 foundation_policy = require("foundation_policy", "raptor", "raptor")
@@ -67,7 +67,7 @@ class Raptor:
         episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Memory]:
-        """Actions (n, 4) for observations (n, 18).
+        """Actions (n, 4) for observations (n, 18), or longer ones, of which it sees the present 18 features.
 
         :param state: what it remembers; None: all rows begin an episode.
         :param episode_start: (n,), the rows that begin one; None: none do.
@@ -83,7 +83,7 @@ class Raptor:
 
     def _seen(self, observation: npt.NDArray[Any]) -> Float32Array:
         """What it sees beside its last action, (n, 18): position, rotation row by row, velocity, body rates."""
-        features = observation * self._std + self._mean
+        features = observation[:, :OBSERVATION_SIZE] * self._std + self._mean
         part = {name: features[:, columns] for name, columns in GROUPS.items()}
         rotation = part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1)  # body to world
         position = np.clip(part["position"], -MAX_POSITION, MAX_POSITION)

@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.base.arrays import Arrays, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
 from sb3_quad.networks import shared_out
@@ -90,6 +90,7 @@ class PPOBC(PPO):
         if critic_warmup < 0:
             raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
         self.expert = expert
+        self._labeller: Controller | None = None  # the expert, with what it remembers from rollout to rollout
         self.bc_coef = bc_coef
         self.bc_loss: common.CloningLoss = bc_loss
         self.bc_filter = bc_filter
@@ -119,7 +120,20 @@ class PPOBC(PPO):
             self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "expert", "rollout_buffer_class", "rollout_buffer_kwargs"]
+        return [*super()._excluded_save_params(), "expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
+
+    def memory(self) -> Arrays:
+        """What the expert remembers from rollout to rollout and is in no zip, as :meth:`restore_memory` takes it."""
+        return {} if self._labeller is None else self._labeller.memory()
+
+    def restore_memory(self, memory: Arrays) -> None:
+        """Go back to a :meth:`memory`; the model needs its expert and environment.
+
+        :raises ExpertError: an expert whose memory could not be saved.
+        """
+        if memory:
+            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[arg-type]
+            self._labeller.restore(memory)
 
     @property
     def policy_is_idle(self) -> bool:
@@ -160,12 +174,15 @@ class PPOBC(PPO):
         # The update on this rollout comes at its end, and with the weight of that time: that weight decides about labels.
         end = self.num_timesteps + n_rollout_steps * env.num_envs
         self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
-        if self._rollout_bc_coef != 0.0:
-            labeller, buffer = Controller.for_env(self.expert, env), cast(ExpertRolloutBuffer, rollout_buffer)
+        if self._rollout_bc_coef == 0.0:
+            self._labeller = None  # an expert that has not seen a rollout remembers nothing
+        else:
+            self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)
+            buffer = cast(ExpertRolloutBuffer, rollout_buffer)
 
             def label() -> None:
                 observation: Any = self._last_obs
-                buffer.expert_actions[buffer.pos] = labeller.labels(observation)
+                buffer.expert_actions[buffer.pos] = labeller.labels(observation, self._last_episode_starts)
 
             env = _BeforeStep(env, label)
         networks = common.perceptrons(self.policy) if self._rollout_bc_coef != 0.0 else None  # else as PPO, bit for bit

@@ -12,6 +12,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 
 ALGORITHMS = {
     "dagger": "sb3_quad.dagger.dagger:DAgger",
+    "recurrent_dagger": "sb3_quad.dagger.recurrent:RecurrentDAgger",
     "ppo_bc": "sb3_quad.ppo_bc.ppo_bc:PPOBC",
     "ppo": "stable_baselines3.ppo.ppo:PPO",
 }

@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
-from sb3_quad.callbacks.interruption import ENVIRONMENT, LastGoodModel, set_random_state
+from sb3_quad.callbacks.interruption import ENVIRONMENT, MEMORY, LastGoodModel, set_random_state
 from sb3_quad.experts.models import load_zip
 from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
@@ -104,6 +104,8 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         raise ConfigError(f"{path}: holds the state of batched environments; use the run's own settings")
     if environment:
         batch.restore(environment)
+        if hasattr(model, "restore_memory"):
+            model.restore_memory(_part(state, MEMORY))
     _take_back(run, state)
     set_random_state(state)
     return cast(OnPolicyAlgorithm, model)

@@ -98,7 +98,8 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings
     :raises ConfigError: an agent whose last layer is not linear, or that does not read the 18 features.
     """
     layer = getattr(model.policy, "action_net", None)
-    if not isinstance(layer, th.nn.Linear) or model.observation_space.shape != (OBSERVATION_SIZE,):
+    reads = model.observation_space.shape == (OBSERVATION_SIZE,) and not hasattr(model.policy, "lstm_actor")
+    if not isinstance(layer, th.nn.Linear) or not reads:
         raise ConfigError("trimming needs an MlpPolicy that reads the 18 features")
     own = settings or FlightSettings()
     at_target = _latents(model, _at_target(own, np.random.default_rng(seed)))
