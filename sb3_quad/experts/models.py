@@ -11,6 +11,7 @@ import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.imports import require
 from sb3_quad.base.memory import check_unpacked
 from sb3_quad.base.trust import trusted
 from sb3_quad.experts.unpickle import unpickle
@@ -24,6 +25,8 @@ _FAMILIES = {
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
+    "sb3_contrib.common.recurrent.policies": "RecurrentPPO",
+    "sb3_quad.recurrent.raptor_policy": "RecurrentPPO",
 }
 _OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")  # what is read of the pickles of an agent
@@ -49,7 +52,7 @@ def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
 
 
 def saved_algorithm(path: str | Path) -> str:
-    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG or DQN, or PPOBC or DAgger of this package.
+    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG or DQN; RecurrentPPO; or PPOBC or DAgger of this package.
 
     A zip does not name its algorithm; the policy class and the settings that were saved with it tell.
 
@@ -88,10 +91,11 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     """The model in an SB3 ``.zip``, of any algorithm of Stable-Baselines3 (and of this package), ready for ``predict``.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown family, or with parameters
-        that are not finite; a file that may run code of its own.
+        that are not finite; a file that may run code of its own; ``MissingExtra`` of a recurrent one without sb3-contrib.
     """
     algorithm = saved_algorithm(path)
-    stock: type[BaseAlgorithm] = getattr(stable_baselines3, "PPO" if algorithm in _OURS.values() else algorithm)
+    library = require("sb3_contrib", "recurrent", f"model {path}") if algorithm == "RecurrentPPO" else stable_baselines3
+    stock: type[BaseAlgorithm] = getattr(library, "PPO" if algorithm in _OURS.values() else algorithm)
     try:
         model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
     except ConfigError:
