@@ -1,4 +1,4 @@
-"""Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out.
+"""Write a trained policy as ONNX, TorchScript, a C header or PX4's policy.tar: physical units in, rotor thrusts or speeds out.
 
 The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
 world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It returns the command for each rotor.
