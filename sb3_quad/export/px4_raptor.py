@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ExportError
@@ -171,7 +170,9 @@ def _check(reference: check.Reference, path: str | Path) -> tuple[th.nn.Linear, 
         raise ConfigError(_refusal(path, f"{a}-{b}-{deep} {c}-{d}{squashed}") + "; another needs other firmware")
     vehicle = reference.vehicle
     if reference.memory != Memory(last_action=True):
-        raise ConfigError(f"model {path}: mc_raptor shows it the last command and nothing older; fly it with last_action alone")
+        raise ConfigError(
+            f"model {path}: mc_raptor shows it the last command and nothing older; fly it with last_action alone"
+        )
     if not (np.allclose(reference.mean, DEFAULT_MEAN) and np.allclose(reference.std, DEFAULT_STD)):
         raise ConfigError(f"model {path}: RaptorPolicy undoes the scaling of Table A.2, this one was shown another")
     order, idle = motor_order(vehicle, "mc_raptor"), idle_share(vehicle)
@@ -185,7 +186,7 @@ def _check(reference: check.Reference, path: str | Path) -> tuple[th.nn.Linear, 
 
 def _parameters(first: th.nn.Linear, gru: th.nn.GRU, last: th.nn.Linear) -> dict[str, Float32Array]:
     """By path, the tensors of the network; the gates of the GRU are reset, update, new, as PyTorch has them."""
-    arrays = [
+    arrays: list[list[th.Tensor]] = [
         [first.weight, first.bias],
         [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0, th.zeros(gru.hidden_size)],
         [last.weight, last.bias],
@@ -223,14 +224,16 @@ def _write(tensors: Mapping[str, Float32Array], name: str) -> bytes:
     return buffer.getvalue()
 
 
-def _describe(path: Path, reference: check.Reference, error: float, extent: str, name: str, n_parameters: int) -> dict[str, str]:
+def _describe(
+    path: Path, reference: check.Reference, error: float, extent: str, name: str, n_parameters: int
+) -> dict[str, str]:
     vehicle = reference.vehicle
     return {
         "policy": f"{path.name}, sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}",
         "vehicle": f"{vehicle.name}: least over greatest rotor speed {idle_share(vehicle):.6g}",
         "network": f"22-16-GRU 16-4, {n_parameters} float32 parameters",
-        "observation": "22 numbers in mc_raptor's own order, frames and limits: position error (0.5 m), rotation, velocity error "
-        "(1 m/s), body rates, last command; world x forward, y left, z up",
+        "observation": "22 numbers, as mc_raptor gives them: position error, at most 0.5 m; rotation body to world; "
+        "velocity error, at most 1 m/s; body rates; last command; world x forward, y left, z up",
         "result": ROTORS,
         "checkpoint_name": name,
         "check": f"largest error {error:.2g} N in {extent}",

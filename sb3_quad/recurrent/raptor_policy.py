@@ -1,4 +1,4 @@
-"""RAPTOR's network, 22-16-GRU 16-4, as a policy that recurrent algorithms train: what PX4's ``mc_raptor`` flies (docs/px4.md)."""
+"""RAPTOR's network, 22-16-GRU 16-4, as a policy that recurrent algorithms train, and PX4's ``mc_raptor`` flies (docs/px4.md)."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -38,15 +38,15 @@ class _Actions(th.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, commands: th.Tensor, idle: float) -> th.Tensor:
-        speed = idle + (1.0 - idle) * (commands.clamp(-1.0, 1.0) + 1.0) / 2.0
-        ctx.save_for_backward(commands, speed)
-        ctx.idle = idle
-        return 2.0 * (speed.square() - idle**2) / (1.0 - idle**2) - 1.0
+        ctx.linear = linear = 2.0 * idle / (1.0 + idle)
+        share = (commands.clamp(-1.0, 1.0) + 1.0) / 2.0
+        ctx.save_for_backward(commands, share)
+        return 2.0 * share * (share + linear * (1.0 - share)) - 1.0
 
     @staticmethod
     def backward(ctx: Any, *gradients: th.Tensor) -> tuple[th.Tensor, None]:
-        commands, speed = ctx.saved_tensors
-        gradient = gradients[0] * (2.0 * speed / (1.0 + ctx.idle)).clamp(min=LEAST_SLOPE)
+        commands, share = ctx.saved_tensors
+        gradient = gradients[0] * (2.0 * (1.0 - ctx.linear) * share + ctx.linear).clamp(min=LEAST_SLOPE)
         outwards = ((commands > 1.0) & (gradient < 0.0)) | ((commands < -1.0) & (gradient > 0.0))
         return gradient.masked_fill(outwards, 0.0), None
 
@@ -91,6 +91,9 @@ class RaptorExtractor(BaseFeaturesExtractor):
     :raises ConfigError: another observation.
     """
 
+    mean: th.Tensor
+    std: th.Tensor
+
     def __init__(
         self, observation_space: spaces.Space[Any], motors: Sequence[int], idle: float, features_dim: int = UNITS
     ) -> None:
@@ -117,7 +120,7 @@ class RaptorExtractor(BaseFeaturesExtractor):
 class GatedUnit(nn.GRU):
     """A GRU that is called as sb3-contrib calls an LSTM, with (h, c); c comes back as it was."""
 
-    def forward(self, x: th.Tensor, state: Any = None) -> Any:
+    def forward(self, x: th.Tensor, state: Any = None) -> Any:  # type: ignore[override]
         """Outputs (steps, n, units), and (h, c) after them."""
         hidden, cell = state
         output, hidden = super().forward(x, hidden)
