@@ -87,7 +87,7 @@ def test_with_the_published_weights_it_acts_as_raptor_does(vehicle):
     for _ in range(500):
         actions, ours = policy.predict(seen, ours, begins, deterministic=True)
         wanted, theirs = raptor.predict(seen[:, :18], theirs, begins)
-        assert np.abs(theirs[1]).max() < 1.0  # beyond, the environment clips the last action and RAPTOR does not
+        assert np.abs(theirs[1]).max() < 1.0  # the environment clips the last action, the expert raptor does not
         np.testing.assert_allclose(actions, wanted, atol=1e-5)
         seen, _, begins, _ = env.step(wanted)
     assert np.linalg.norm(env.true_state().position - env.target, axis=1).max() < 0.1
@@ -208,13 +208,13 @@ def test_a_damaged_archive_is_refused(exported):
         TarPolicy(exported.content.replace(b"dim_1: 22", b"dim_1: 23", 1))
 
 
-def test_the_command_writes_policy_tar_and_says_what_differs(agent, tmp_path, monkeypatch, capsys):
+def test_the_command_writes_policy_tar(agent, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(["export", str(agent), "--format", "px4-raptor"]) == 0
     said = capsys.readouterr()
     assert "checkpoint_name: my_agent" in said.out and "22-16-GRU 16-4, 2084 float32 parameters" in said.out
     assert "closed-loop flights of 1000 control steps, 10 side by side" in said.out and "time:" not in said.out
-    assert "mc_raptor does not" in said.err and said.err.count("\n") == 1  # these weights saturate
+    assert not said.err
     assert TarPolicy((tmp_path / "policy.tar").read_bytes()).name == "my_agent"
 
 
@@ -268,10 +268,10 @@ def test_rotors_that_it_does_not_fly_are_refused():
     [
         (
             lambda: (untrained(algorithm=PPO, policy="MlpPolicy"), {}),
-            "its policy is PPO; mc_raptor flies 22-16-GRU 16-4 alone",
+            "its policy is ActorCriticPolicy of PPO; mc_raptor is compiled for",
         ),
         (lambda: (untrained(policy="MlpLstmPolicy"), {}), "its policy is RecurrentActorCriticPolicy"),
-        (lambda: (untrained(lstm_hidden_size=32), {}), "22-16-GRU 32-4; .*; another needs other firmware"),
+        (lambda: (untrained(lstm_hidden_size=32), {}), "its policy is 22-16-GRU 32-4; .* and loads nothing else"),
         (
             lambda: (untrained(motors=(0, 1, 2, 3)), {}),
             r"trained with motors \[0, 1, 2, 3\] .* free has motors \[3, 0, 1, 2\]",

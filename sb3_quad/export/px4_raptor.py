@@ -10,7 +10,7 @@ import re
 import tarfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -20,6 +20,7 @@ from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.experts.models import load_model, saved_algorithm
 from sb3_quad.experts.raptor_frame import idle_share, motor_order, rotor_thrusts, seen
 from sb3_quad.export import check
+from sb3_quad.export.policy import Export
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.memory import Memory
@@ -39,16 +40,6 @@ _LAYERS: tuple[tuple[str, tuple[str, ...], str], ...] = (
     ("actor/layers/2", _DENSE, "activation_function: IDENTITY\ntype: dense\n"),
 )
 ROTORS = "motor commands of front right, back right, back left, front left; (command + 1) / 2 goes to actuator_motors"
-
-
-class Px4Export(NamedTuple):
-    """A ``policy.tar``, not yet on disk."""
-
-    content: bytes
-    metadata: dict[str, str]  # what the command says about it
-    max_error: float  # the largest difference to the policy, N
-    settings: Path | None  # the file that vehicle and scaling came from, where they were not given
-    notice: str  # of what mc_raptor does otherwise than the environment; empty: nothing seen
 
 
 class TarPolicy:
@@ -94,13 +85,12 @@ class TarPolicy:
 
 
 class _Flights:
-    """A ``policy.tar`` in flight, as ``mc_raptor`` flies it but for its last command, which the environment clips."""
+    """A ``policy.tar`` in flight, as ``mc_raptor`` flies it: its executor clips the commands, also the last one that it shows."""
 
     def __init__(self, policy: TarPolicy, vehicle: Vehicle) -> None:
         self._policy, self._vehicle, self._order = policy, vehicle, motor_order(vehicle, "mc_raptor")
         self._hidden, self._last = policy.start(1), np.zeros((1, SIZES[-1]), dtype=np.float32)
         self.inputs: list[Float32Array] = []
-        self.commands: list[Float32Array] = []
 
     def __call__(self, features: Float32Array, begins: BoolArray) -> Float32Array:
         """Thrusts, (n, 4), N, of the features in physical units, (n, 18), and which flights begin."""
@@ -109,14 +99,13 @@ class _Flights:
         inputs = np.hstack([seen(th.from_numpy(features)).numpy(), np.where(rows, np.float32(0.0), self._last)])
         commands, self._hidden = self._policy.step(inputs, hidden)
         self.inputs.append(inputs)
-        self.commands.append(commands)
         self._last = commands.clip(-1.0, 1.0)
         return rotor_thrusts(self._vehicle, self._order, self._last).astype(np.float32)
 
 
 def export_px4_raptor(
     path: str | Path, vehicle: str | Path | Vehicle | None = None, n_observations: int = check.N_OBSERVATIONS
-) -> Px4Export:
+) -> Export:
     """The policy of a recurrent agent's zip as ``policy.tar``, checked in closed-loop flights.
 
     The bytes depend on the weights, the zip's name and the vehicle alone.
@@ -128,8 +117,6 @@ def export_px4_raptor(
         fly.
     :raises ExportError: the file computes something else than the policy.
     """
-    if saved_algorithm(path) != "RecurrentPPO":
-        raise ConfigError(_refusal(path, saved_algorithm(path)))
     model, (settings, source) = load_model(path), FlightSettings.of(path)
     if vehicle is not None:
         settings = settings.with_changes(vehicle=vehicle)
@@ -142,32 +129,27 @@ def export_px4_raptor(
     _, error, extent = reference.fly(flights, n_observations, f"numpy {np.__version__}")
     inputs = np.stack([each[:EXAMPLE_BATCH] for each in flights.inputs[:EXAMPLE_STEPS]])
     example = {"example/input": inputs, "example/output": _outputs(layers, inputs)}
-    beyond = np.abs(np.concatenate(flights.commands))
-    share, notice = float((beyond > 1.0).mean()), ""
-    if share:
-        said = f"{share:.1%} of the motor commands of these flights were beyond ±1, up to {beyond.max():.2f}"
-        notice = f"{said}; the environment clips the last command that the policy sees, mc_raptor does not"
     metadata = _describe(Path(path), reference, error, extent, name, sum(map(np.size, parameters.values())))
-    return Px4Export(_write({**parameters, **example}, name), metadata, error, source, notice)
+    return Export(_write({**parameters, **example}, name), metadata, error, "N", None, source)
 
 
 def _refusal(path: str | Path, found: str) -> str:
-    sizes = "22-16-GRU 16-4"
-    return f"model {path}: its policy is {found}; mc_raptor flies {sizes} alone: train one with RaptorPolicy (docs/px4.md)"
+    wanted = "mc_raptor is compiled for 22-16-GRU 16-4 and loads nothing else"
+    return f"model {path}: its policy is {found}; {wanted}: train one with RaptorPolicy (docs/px4.md)"
 
 
 def _check(reference: check.Reference, path: str | Path) -> tuple[th.nn.Linear, th.nn.GRU, th.nn.Linear]:
     """The layers of a policy that ``mc_raptor`` can fly."""
     policy: Any = reference.model.policy
     if not hasattr(policy, "layers"):
-        raise ConfigError(_refusal(path, type(policy).__name__))
+        raise ConfigError(_refusal(path, f"{type(policy).__name__} of {saved_algorithm(path)}"))
     first, gru, last = layers = policy.layers()
     sizes = (first.in_features, first.out_features, gru.hidden_size, last.out_features)
     if sizes != SIZES or gru.num_layers != 1 or policy.squash_output:
         a, b, c, d = sizes
         deep = f"{gru.num_layers} x GRU" if gru.num_layers > 1 else "GRU"
         squashed = " with tanh" * policy.squash_output
-        raise ConfigError(_refusal(path, f"{a}-{b}-{deep} {c}-{d}{squashed}") + "; another needs other firmware")
+        raise ConfigError(_refusal(path, f"{a}-{b}-{deep} {c}-{d}{squashed}"))
     vehicle = reference.vehicle
     if reference.memory != Memory(last_action=True):
         raise ConfigError(
@@ -186,7 +168,7 @@ def _check(reference: check.Reference, path: str | Path) -> tuple[th.nn.Linear, 
 
 def _parameters(first: th.nn.Linear, gru: th.nn.GRU, last: th.nn.Linear) -> dict[str, Float32Array]:
     """By path, the tensors of the network; the gates of the GRU are reset, update, new, as PyTorch has them."""
-    arrays: list[list[th.Tensor]] = [
+    arrays: list[list[Any]] = [
         [first.weight, first.bias],
         [gru.weight_ih_l0, gru.bias_ih_l0, gru.weight_hh_l0, gru.bias_hh_l0, th.zeros(gru.hidden_size)],
         [last.weight, last.bias],

@@ -1,4 +1,4 @@
-"""RAPTOR's network, 22-16-GRU 16-4, as a policy that recurrent algorithms train, and PX4's ``mc_raptor`` flies (docs/px4.md)."""
+"""RAPTOR's network, 22-16-GRU 16-4, as a policy to train and to fly in PX4's ``mc_raptor`` (docs/px4.md)."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -9,8 +9,8 @@ from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.output import output_file
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.export.c_header import c_name
-from sb3_quad.export.policy import FORMATS, Export, export_policy
-from sb3_quad.export.px4_raptor import FILE, Px4Export, export_px4_raptor
+from sb3_quad.export.policy import FORMATS, export_policy
+from sb3_quad.export.px4_raptor import FILE, export_px4_raptor
 
 PX4 = "px4-raptor"
 
@@ -33,7 +33,7 @@ def run(options: argparse.Namespace) -> int:
     if options.vehicle and (line := ControllerSpec(model.stem, str(model)).notice(options.vehicle)):
         print(f"warning: {line}", file=sys.stderr)
     if options.format == PX4:
-        exported: Export | Px4Export = export_px4_raptor(model, options.vehicle)
+        exported = export_px4_raptor(model, options.vehicle)
     else:
         exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
     write_bytes(file, exported.content)
@@ -41,9 +41,7 @@ def run(options: argparse.Namespace) -> int:
     for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "checkpoint_name", "check"):
         if key in exported.metadata:
             print(f"{key}: {exported.metadata[key]}")
-    if isinstance(exported, Export):
+    if exported.microseconds is not None:
         print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
-    elif exported.notice:
-        print(f"warning: {exported.notice}", file=sys.stderr)
     print(f"saved {file} ({len(exported.content)} bytes)")
     return 0
