@@ -164,7 +164,7 @@ def test_the_version_stands_in_one_place(options, wheel):
 
 
 def test_what_the_code_imports_is_declared(options):
-    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow"}
+    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow", "sb3_contrib": "sb3-contrib"}
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
     extras = [text for name, text in options["options.extras_require"].items() if name != "dev"]
     wanted = "\n".join([options["options"]["install_requires"], *extras])
@@ -219,6 +219,7 @@ import importlib, importlib.resources, json, pkgutil, sys, sb3_quad
 names = [found.name for found in pkgutil.walk_packages(sb3_quad.__path__, "sb3_quad.") if "__main__" not in found.name]
 names.remove("sb3_quad.zoo")  # needs rl_zoo3
 names.remove("sb3_quad.experts.raptor")  # needs foundation_policy
+names.remove("sb3_quad.recurrent.raptor_policy")  # needs sb3_contrib
 for name in names: importlib.import_module(name)
 configs = importlib.resources.files("sb3_quad.zoo_configs")
 print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs.joinpath("dagger.yml").read_text()]))

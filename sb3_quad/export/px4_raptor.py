@@ -85,7 +85,7 @@ class TarPolicy:
 
 
 class _Flights:
-    """A ``policy.tar`` in flight, as ``mc_raptor`` flies it: its executor clips the commands, also the last one that it shows."""
+    """A ``policy.tar`` in flight, as ``mc_raptor`` flies it: rl_tools' executor clips the commands, so the last ones, too."""
 
     def __init__(self, policy: TarPolicy, vehicle: Vehicle) -> None:
         self._policy, self._vehicle, self._order = policy, vehicle, motor_order(vehicle, "mc_raptor")

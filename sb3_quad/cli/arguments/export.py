@@ -4,7 +4,7 @@ The file takes 18 numbers in physical units: position relative to the target, m,
 world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It returns the command for each rotor.
 Scaling and clipping are built in. The file is checked against the policy on 10,000 observations before it is written.
 A policy that sees earlier frames, its last action or the position integral takes a state beside them, and returns the next.
-px4-raptor writes the policy.tar that PX4's mc_raptor loads from its SD card: of recurrent agents with RaptorPolicy, docs/px4.md.
+px4-raptor writes the policy.tar that PX4's mc_raptor loads from its SD card, of agents with RaptorPolicy: docs/px4.md.
 
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --format onnx
