@@ -86,7 +86,7 @@ def test_with_the_published_weights_it_acts_as_raptor_does(vehicle):
     seen, begins, ours, theirs = env.reset(), np.ones(4, dtype=bool), None, None
     for _ in range(500):
         actions, ours = policy.predict(seen, ours, begins, deterministic=True)
-        wanted, theirs = raptor.predict(seen[:, :18], theirs, begins)
+        wanted, theirs = raptor.predict(seen, theirs, begins)
         assert np.abs(theirs[1]).max() < 1.0  # the environment clips the last action, the expert raptor does not
         np.testing.assert_allclose(actions, wanted, atol=1e-5)
         seen, _, begins, _ = env.step(wanted)

@@ -14,7 +14,7 @@ import torch as th
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.imports import require
 from sb3_quad.experts.raptor_frame import motor_order, rotor_thrusts, seen
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 foundation_policy = require("foundation_policy", "raptor", "raptor")
@@ -54,7 +54,7 @@ class Raptor:
         episode_start: BoolArray | None = None,
         deterministic: bool = True,
     ) -> tuple[Float32Array, Memory]:
-        """Actions (n, 4) for observations (n, 18).
+        """Actions (n, 4) for observations (n, 18), or longer ones, of which it sees the present 18 features.
 
         :param state: what it remembers; None: all rows begin an episode.
         :param episode_start: (n,), the rows that begin one; None: none do.
@@ -65,7 +65,7 @@ class Raptor:
         if episode_start is not None:
             hidden, last = (np.where(episode_start[:, None], *each) for each in zip(new, (hidden, last), strict=True))
         self._gru.state = hidden
-        features = np.asarray(observation * self._std + self._mean, dtype=np.float32)
+        features = np.asarray(observation[:, :OBSERVATION_SIZE] * self._std + self._mean, dtype=np.float32)
         last = self._policy.evaluate_step(np.hstack([seen(th.from_numpy(features)).numpy(), last])).astype(np.float32)
         actions = self.vehicle.thrust_to_action(rotor_thrusts(self.vehicle, self._order, last))
         return actions.astype(np.float32), (self._gru.state, last)

@@ -22,7 +22,9 @@ from sb3_quad.pretrained_policies import agent_path
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    agent = "an agent of PPO, A2C, DAgger or PPOBC with MlpPolicy: a zip, a run folder, or a name such as itm-recovery"
+    agent = (
+        "an agent with MlpPolicy (PPO, A2C, DAgger, PPOBC) or RaptorPolicy: a zip, a run folder, or a name like itm-recovery"
+    )
     add("model", type=agent_path, metavar="MODEL", help=agent)
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript, c or px4-raptor")
     add(
