@@ -16,6 +16,7 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.imports import require
 from sb3_quad.dagger.dagger import DAgger, Timeout
 from sb3_quad.dagger.dataset import AggregatedDataset, SequenceDataset
+from sb3_quad.recurrent.raptor_policy import RaptorPolicy
 
 require("sb3_contrib", "recurrent", "recurrent_dagger")
 
@@ -39,14 +40,15 @@ class RecurrentDAgger(DAgger):
     backpropagates through all their ``n_steps`` steps; not beyond, nor across the start of an episode. The state before a
     sequence stays the one that it was flown with, though the policy has learnt since.
 
-    A saved model loads with ``sb3_contrib.RecurrentPPO.load``, even where this package is not installed.
+    A saved model loads with ``sb3_contrib.RecurrentPPO.load``, even where this package is not installed; but one with our
+    :class:`~sb3_quad.recurrent.raptor_policy.RaptorPolicy`, which PX4 flies, needs it.
 
     Source of the method beside those of DAgger: R. J. Williams, J. Peng, *An efficient gradient-based algorithm for on-line
     training of recurrent network trajectories*, Neural Computation 2 (4), 1990 (truncated backpropagation through time).
 
     Arguments are those of DAgger; these differ:
 
-    :param policy: ``MlpLstmPolicy``, ``CnnLstmPolicy``, or a subclass of ``RecurrentActorCriticPolicy``
+    :param policy: ``MlpLstmPolicy``, ``CnnLstmPolicy``, ``RaptorPolicy``, or a subclass of ``RecurrentActorCriticPolicy``
     :param n_steps: Steps of a rollout in each environment, which gradients go back through at most
     :param batch_size: Minibatch size, in pairs: ``batch_size // n_steps`` sequences, and one at least
     :param dataset_capacity: Most pairs kept, in whole sequences, the oldest leave first. 0: the current rollout only
@@ -54,7 +56,7 @@ class RecurrentDAgger(DAgger):
     :raises ExpertError: an expert that does not fit the environment
     """
 
-    policy_aliases = RecurrentPPO.policy_aliases
+    policy_aliases = {**RecurrentPPO.policy_aliases, "RaptorPolicy": RaptorPolicy}
     dataset: SequenceDataset
     _states: RNNStates | None = None  # what the policy remembers now
     _states_before: RNNStates  # what it remembered when the rollout began

@@ -27,6 +27,7 @@ _FAMILIES = {
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
+    "sb3_quad.recurrent.raptor_policy": "RecurrentPPO",
 }
 _OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")  # what is read of the pickles of an agent
@@ -65,7 +66,7 @@ def saved_algorithm(path: str | Path) -> str:
         raise ConfigError(f"model {path}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
     if module not in _FAMILIES:
         raise ConfigError(f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
-    if module == _RECURRENT:
+    if _FAMILIES[module] == "RecurrentPPO":
         return "RecurrentDAgger" if "beta" in data else "RecurrentPPO"
     if module == _ACTOR_CRITIC:
         own = next((name for key, name in _OURS.items() if key in data), None)

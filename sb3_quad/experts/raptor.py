@@ -2,8 +2,7 @@
 
 Source: J. Eschmann, D. Albani, G. Loianno, *RAPTOR: A Foundation Policy for Quadrotor Control* (arXiv 2509.11481). The package
 ``foundation_policy`` holds the weights and computes the layers. Observation, motor order and normalised speeds are as its
-README says: world frame, x forward, y left, z up; the target's heading is x. Far from the target, position and velocity error
-are clipped as in PX4's ``mc_raptor``.
+README says (:mod:`.raptor_frame`). Far from the target, position and velocity error are clipped as in PX4's ``mc_raptor``.
 """
 
 from collections.abc import Sequence
@@ -11,18 +10,16 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import torch as th
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import require
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.experts.raptor_frame import idle_share, motor_order, rotor_shares, seen
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 foundation_policy = require("foundation_policy", "raptor", "raptor")
 
-MAX_POSITION, MAX_VELOCITY = 0.5, 1.0  # m and m/s, each component
-PLACES = {(1, -1): 0, (-1, -1): 1, (-1, 1): 2, (1, 1): 3}  # its motor, by the signs of x and y: FR, BR, BL, FL
-DIRECTIONS = (-1, 1, -1, 1)  # signs of its motors' yaw moments
 Memory = tuple[Float32Array, Float32Array]  # the GRU's hidden state, (n, 16), and its last action, (n, 4)
 
 
@@ -46,17 +43,10 @@ class Raptor:
         observation_std: npt.ArrayLike | None = None,
     ) -> None:
         vehicles = [load_vehicle(vehicle)] if isinstance(vehicle, (str, Vehicle)) else [*vehicle]
-        self.vehicle, limits = vehicles[0], np.array([each.thrust_limits for each in vehicles])
-        self._least_speed = np.sqrt(limits[:, :1] / limits[:, 1:])  # of a rotor, by its greatest; (1 or n, 1)
+        self.vehicle, self._idle = vehicles[0], np.array([[idle_share(each)] for each in vehicles])
         self._mean = np.array(DEFAULT_MEAN if observation_mean is None else observation_mean, dtype=np.float32)
         self._std = np.array(DEFAULT_STD if observation_std is None else observation_std, dtype=np.float32)
-        signs = [(int(np.sign(x)), int(np.sign(y))) for x, y in self.vehicle.rotor_positions]
-        self._order = [PLACES.get(sign, -1) for sign in signs]
-        turning = tuple(DIRECTIONS[place] for place in self._order)
-        if sorted(self._order) != [0, 1, 2, 3] or turning != self.vehicle.rotor_directions:
-            raise ConfigError(
-                f"raptor: flies an X whose front right rotor turns anticlockwise, which {self.vehicle.name} has not"
-            )
+        self._order = motor_order(self.vehicle)
         self._policy = foundation_policy.Raptor()
         (self._gru,) = (layer for layer in self._policy.layers if hasattr(layer, "initial_hidden_state"))
 
@@ -78,20 +68,12 @@ class Raptor:
         if episode_start is not None:
             hidden, last = (np.where(episode_start[:, None], *each) for each in zip(new, (hidden, last), strict=True))
         self._gru.state = hidden
-        last = self._policy.evaluate_step(np.hstack([self._seen(observation), last])).astype(np.float32)
+        features = np.asarray(observation[:, :OBSERVATION_SIZE] * self._std + self._mean, dtype=np.float32)
+        last = self._policy.evaluate_step(np.hstack([seen(th.from_numpy(features)).numpy(), last])).astype(np.float32)
         return self._actions(last).astype(np.float32), (self._gru.state, last)
 
-    def _seen(self, observation: npt.NDArray[Any]) -> Float32Array:
-        """What it sees beside its last action, (n, 18): position, rotation row by row, velocity, body rates."""
-        features = observation[:, :OBSERVATION_SIZE] * self._std + self._mean
-        part = {name: features[:, columns] for name, columns in GROUPS.items()}
-        rotation = part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1)  # body to world
-        position = np.clip(part["position"], -MAX_POSITION, MAX_POSITION)
-        velocity = np.clip(np.einsum("nij,nj->ni", rotation, part["velocity"]), -MAX_VELOCITY, MAX_VELOCITY)
-        return np.hstack([position, rotation.reshape(-1, 9), velocity, part["body_rates"]]).astype(np.float32)
-
-    def _actions(self, motors: Float32Array) -> FloatArray:
-        """Actions from its own, which are linear in the rotors' speeds."""
-        least = self._least_speed[np.arange(len(motors)) % len(self._least_speed)]
-        speeds = least + (1.0 - least) * (motors[:, self._order].astype(np.float64) + 1.0) / 2.0
-        return 2.0 * (speeds**2 - least**2) / (1.0 - least**2) - 1.0
+    def _actions(self, commands: Float32Array) -> FloatArray:
+        """Actions (n, 4) of motor commands."""
+        idle = self._idle[np.arange(len(commands)) % len(self._idle)]
+        shares = rotor_shares(idle, commands[:, self._order].astype(np.float64))
+        return np.asarray(2.0 * (shares - idle**2) / (1.0 - idle**2) - 1.0)

@@ -34,6 +34,7 @@ _CLASSES: dict[str, tuple[type, ...]] = {  # by the beginning of a module's name
     "gymnasium.spaces.": (gymnasium.Space,),
     "numpy.": (np.generic,),
     "sb3_contrib.": _SB3,
+    "sb3_quad.recurrent.": _SB3,
     "stable_baselines3.": _SB3,
     "torch.nn.modules.": (th.nn.Module,),
     "torch.optim.": (th.optim.Optimizer,),

@@ -99,13 +99,15 @@ class Reference(NamedTuple):
         env, twin = (QuadcopterBatch(rows, tasks, **same, **each) for each in (seeing, _UNSCALED))
         limits = {"position": integral.distance, "velocity": integral.speed} if integral else {}
         seen, features, begins, sure = env.reset(), twin.reset(), np.ones(rows, bool), np.zeros(rows, bool)
+        state: Any = None  # of a recurrent policy
         errors, kept = [0.0], list[Float32Array]()
         for _ in range(FLIGHT_STEPS):
             kept.append(features)
             sure |= begins
             for group, limit in limits.items():  # so close to one, rounding may begin to integrate a step later, or earlier
                 sure &= np.abs(np.linalg.norm(features[:, GROUPS[group]], axis=1) / limit - 1.0) > _ROUNDING
-            results, actions = call(features, begins), self.model.predict(seen, deterministic=True)[0]
+            results = call(features, begins)
+            actions, state = self.model.predict(seen, state, begins, deterministic=True)
             if sure.any():
                 errors.append(self.largest_error(actions[sure], results[sure], by))
             thrusts = results if self.output == "thrusts" else self.vehicle.thrust_coefficient * np.square(results)

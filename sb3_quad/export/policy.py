@@ -34,7 +34,7 @@ class Export(NamedTuple):
     metadata: dict[str, str]  # what it says about itself
     max_error: float  # the largest difference to the policy, in `unit`
     unit: str  # N or rad/s
-    microseconds: float  # per call with one observation, on one thread
+    microseconds: float | None  # per call with one observation, on one thread; None: it runs elsewhere
     settings: Path | None  # the file that vehicle and scaling came from, where they were not given
 
 
