@@ -55,7 +55,7 @@ def test_each_flies_as_its_card_says(name):
 
 def vehicle_of(name):
     kind = name.split("-")[0]
-    return "itm" if kind == "thesis" else kind
+    return "itm" if kind in ("any", "thesis") else kind
 
 
 def survival_on_the_card(name):
@@ -76,6 +76,13 @@ def test_the_robust_one_ends_at_its_target_whatever_pushes():
         agent = sb3_quad.load_pretrained("itm-robust")
         flights = fly(agent, "target_tracking", 240, 32_000_000, **{**own, "randomize": randomize})
         assert flights.survival.mean() > 0.98 and np.quantile(flights.final_error[flights.survival], 0.95) < largest
+
+
+@pytest.mark.parametrize("vehicle", ["itm", "crazyflie", "hummingbird"])
+def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(vehicle):
+    own = {**sb3_quad.env_kwargs("any-quadcopter"), "vehicles": None, "vehicle": vehicle}
+    flights = fly(sb3_quad.load_pretrained("any-quadcopter"), "state_recovery", 240, 33_000_000, max_steps=600, **own)
+    assert flights.survival.mean() > 0.97
 
 
 class Names(pickle.Unpickler):
