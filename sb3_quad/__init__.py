@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sb3_quad.ppo_bc.ppo_bc import PPOBC
     from sb3_quad.pretrained_policies import load_pretrained, pretrained
     from sb3_quad.settings.flight import env_kwargs
+    from sb3_quad.simulation.designs import sample_vehicles
 
 __version__ = "0.1.0"
 __all__ = [  # less RecurrentDAgger, which needs an extra
@@ -31,6 +32,7 @@ __all__ = [  # less RecurrentDAgger, which needs an extra
     "env_kwargs",
     "load_pretrained",
     "pretrained",
+    "sample_vehicles",
 ]
 
 _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do not wait for torch
@@ -42,6 +44,7 @@ _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do no
     "env_kwargs": "sb3_quad.settings.flight",
     "load_pretrained": "sb3_quad.pretrained_policies",
     "pretrained": "sb3_quad.pretrained_policies",
+    "sample_vehicles": "sb3_quad.simulation.designs",
 }
 
 register_environments()

@@ -12,8 +12,8 @@ from sb3_quad.vehicles.vehicle import Vehicle
 class ClippedExpert(Expert):
     """Another expert's actions for the state whose target is no farther and whose velocity is no greater than the limits.
 
-    A policy that sees clipped errors cannot know how far its target is and how fast it flies. This expert does what is right as
-    far as both can be seen: from afar it approaches at walking pace.
+    A policy that sees clipped errors cannot know how far its target is and how fast it flies. This expert does what is right
+    as far as both can be seen: from afar it approaches at walking pace.
 
     :param expert: that is asked.
     """
