@@ -81,8 +81,8 @@ def test_the_robust_one_ends_at_its_target_whatever_pushes():
 @pytest.mark.parametrize("vehicle", ["itm", "crazyflie", "hummingbird"])
 def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(vehicle):
     own = {**sb3_quad.env_kwargs("any-quadcopter"), "vehicles": None, "vehicle": vehicle}
-    flights = fly(sb3_quad.load_pretrained("any-quadcopter"), "state_recovery", 240, 33_000_000, max_steps=600, **own)
-    assert flights.survival.mean() > 0.97
+    flights = fly(sb3_quad.load_pretrained("any-quadcopter"), "state_recovery", 480, 33_000_000, max_steps=600, **own)
+    assert flights.survival.mean() > 0.96  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 
 class Names(pickle.Unpickler):

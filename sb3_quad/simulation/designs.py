@@ -88,9 +88,9 @@ class VehicleDistribution(Frozen):
             raise ConfigError(f"vehicles: some could not fly ({explain(error, Vehicle)})") from None
 
     def __str__(self) -> str:
-        """Such as ``quadcopters of mass 0.02 to 5, …``."""
-        ranges = ((name, getattr(self, name)) for name in _RANGES)
-        return "quadcopters of " + ", ".join(f"{name} {each.low:g} to {each.high:g}" for name, each in ranges)
+        """Such as ``sampled quadcopters (SI units; mass 0.02 to 5, thrust to weight 1.5 to 5)``."""
+        ranges = ((name.replace("_", " "), getattr(self, name)) for name in _RANGES)
+        return f"sampled quadcopters (SI units; {', '.join(f'{name} {each.low:g} to {each.high:g}' for name, each in ranges)})"
 
     def numbers(self) -> FloatArray:
         """What :func:`design` reads, in the order of ``DESIGN_NUMBERS``."""
