@@ -85,6 +85,22 @@ def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(v
     assert flights.survival.mean() > 0.96  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 
+def test_any_quadcopter_is_evaluated_on_quadcopters_that_nobody_knows(tmp_path, capsys):
+    command = [
+        "evaluate",
+        "any-quadcopter",
+        "told_geometric",
+        "--suite",
+        "quadcopters",
+        "--scenario",
+        "targets",
+        "thrust_to_weight",
+    ]
+    assert main([*command, "--episodes", "2", "-o", str(tmp_path), "--no-progress"]) == 0
+    assert "Targets 10 m away, any quadcopter" in capsys.readouterr().out
+    assert (tmp_path / "report.html").is_file()
+
+
 class Names(pickle.Unpickler):
     """Unpickles, and keeps the names of all classes and functions that this takes."""
 

@@ -55,8 +55,8 @@ class FlightSettings(Memory):
     @property
     def observed(self) -> dict[str, Any]:
         """What goes with an agent wherever it flies: how its observations are scaled, its rotors' order, what it remembers."""
-        own = {name: getattr(self, name) for name in ("observation_mean", "observation_std", "rotor_layout")}
-        return {**own, **self.model_dump(mode="json", include=set(Memory.model_fields))}
+        scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
+        return {**scaling, **self.model_dump(mode="json", include={*Memory.model_fields, "rotor_layout"})}
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
