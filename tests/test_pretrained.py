@@ -85,6 +85,11 @@ def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(v
     assert flights.survival.mean() > 0.96  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 
+def test_any_quadcopter_is_not_said_to_know_another_vehicle():
+    (any_quadcopter, recovery) = parse_controllers(["any-quadcopter", "itm-recovery"])
+    assert not any_quadcopter.notice("crazyflie") and "was trained on the vehicle itm" in recovery.notice("crazyflie")
+
+
 def test_any_quadcopter_is_evaluated_on_quadcopters_that_nobody_knows(tmp_path, capsys):
     command = [
         "evaluate",

@@ -55,7 +55,7 @@ class ControllerSpec:
             silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
             return f"{silent} {flown.name}, with the scaling of Table A.2" if self.spec.endswith(".zip") else ""
         known = load_vehicle(self.own.vehicle)
-        if known.flies_as(flown):
+        if self.own.vehicles is not None or known.flies_as(flown):  # of those it knows none
             return ""
         same = " of other parameters" if known.name == flown.name else ""
         return f"{self.label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"

@@ -20,10 +20,9 @@ Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 # The module of the saved policy class tells the algorithm's family.
 _ACTOR_CRITIC = "stable_baselines3.common.policies"
-_RECURRENT = "sb3_contrib.common.recurrent.policies"
 _FAMILIES = {
     _ACTOR_CRITIC: "PPO",
-    _RECURRENT: "RecurrentPPO",
+    "sb3_contrib.common.recurrent.policies": "RecurrentPPO",
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",

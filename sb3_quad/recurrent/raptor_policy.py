@@ -19,7 +19,7 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 require("sb3_contrib", "recurrent", "RaptorPolicy")
 from sb3_contrib.common.recurrent.policies import RecurrentActorCriticPolicy  # noqa: E402
 
-INPUTS, UNITS, MOTORS = OBSERVATION_SIZE + 4, 16, 4
+INPUTS, UNITS = OBSERVATION_SIZE + 4, 16
 LEAST_SLOPE = 0.25  # of an action by its command, in the gradient: at -1 a rotor that can stand still has none
 
 
