@@ -74,6 +74,7 @@ $(PY):
 		echo "$(PYTHON) cannot make virtual environments; its venv package is missing (Debian: python3-venv)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 
+# What comes without a wheel is built by setuptools (this package) or hatchling (foundation-policy).
 # An environment that another checkout has installed itself into is used as it is: it would point here from then on.
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 	@owner=$$(cat $@ 2>/dev/null || true); \
@@ -82,7 +83,7 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 		echo "$(VENV) is that of $$owner, and is used as it is"; \
 	else \
 		echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."; \
-		$(INSTALL) setuptools && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
+		$(INSTALL) setuptools hatchling && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
 	fi
 
 # rl_zoo3 needs older versions of some packages than ours: they come first in an environment that borrows all others.
