@@ -23,8 +23,7 @@ def run(options: argparse.Namespace) -> int:
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
         how = options.backend, options.workers, options.overwrite
-        where = options.executor, options.address
-        results = evaluate(suite, controllers, folder, *how, show, _warn, *where)
+        results = evaluate(suite, controllers, folder, *how, show, _warn, options.executor, options.address)
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
     if labels:
