@@ -41,7 +41,7 @@ _MEMORY = (  # all that future flight depends on
 
 
 def share_cores(count: int) -> None:
-    """Have the batches of this process fly with no more than ``count`` threads unless told otherwise; the flights are the same."""
+    """Have the batches of this process fly with no more than ``count`` threads unless told otherwise; flights are the same."""
     use_cpus(count)
 
 

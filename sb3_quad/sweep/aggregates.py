@@ -30,9 +30,8 @@ def aggregates(groups: Mapping[str, Sequence[RunRecord]]) -> dict[str, Any] | No
     def measured(values: Any) -> Any:
         return np.array([getattr(metrics, name)(values) for name in NAMES])
 
-    found, intervals = library.get_interval_estimates(
-        scores, measured, reps=REPETITIONS, random_state=np.random.RandomState(0)
-    )
+    state = np.random.RandomState(0)
+    found, intervals = library.get_interval_estimates(scores, measured, reps=REPETITIONS, random_state=state)
     words = [name.removeprefix("aggregate_") for name in NAMES]
     return {
         name: {

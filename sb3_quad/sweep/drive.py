@@ -38,8 +38,8 @@ def execute(
 ) -> dict[str, RunRecord]:
     """Do all runs that are not finished.
 
-    A run whose worker process ends is tried once more, from its snapshot; one that fails is left, and the others go on. After a
-    signal, the runs under way save and end.
+    A run whose worker process ends is tried once more, from its snapshot; one that fails is left, and the others go on.
+    After a signal, the runs under way save and end.
 
     :param report: told of each event in one line.
     :return: the records of all runs that ended, those of earlier calls included, by name.

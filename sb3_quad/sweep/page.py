@@ -13,17 +13,20 @@ from sb3_quad.report.plots import Plot
 from sb3_quad.report.sections import Section
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.results import finished, tables
+from sb3_quad.sweep.results import finished
 
 
-def write_report(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord]) -> Path:
+def write_report(
+    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Mapping[str, Sequence[Table]]
+) -> Path:
     """Write the report of a sweep's finished runs; a later one replaces it.
 
+    :param found: the tables, by scenario.
     :return: the page.
-    :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could not
-        be written.
+    :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
+        not be written.
     """
-    parts = sections(place, plan, records)
+    parts = sections(place, plan, records, found)
     title = f"Sweep: {plan.spec.name}"
     blocks = [f"# {title}"]
     for part in parts:
@@ -38,11 +41,13 @@ def write_report(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord
     return page
 
 
-def sections(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord]) -> list[Section]:
+def sections(
+    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Mapping[str, Sequence[Table]]
+) -> list[Section]:
     """A section for each scenario, the learning curves, the runs."""
     parts = [
-        Section(f"scenario-{number}", scenario, "", found, facts=found[0].caption)
-        for number, (scenario, found) in enumerate(tables(plan, records).items())
+        Section(f"scenario-{number}", scenario, "", flown, facts=flown[0].caption)
+        for number, (scenario, flown) in enumerate(found.items())
     ]
     plots = _curves(place, plan, records)
     if plots:

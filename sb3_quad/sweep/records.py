@@ -9,7 +9,8 @@ from sb3_quad.base.validate import Frozen
 Numbers: TypeAlias = tuple[float | None, ...]
 SUCCESS, SURVIVAL, REWARD, ERROR, TIME = "success", "survival", "reward", "final_error", "time"
 MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
-"""Of an episode: 0 or 1, 0 or 1, sum, m (None: lost), s to the tightest tolerance (None: never)."""
+"""Of an episode: 0 or 1, 0 or 1, sum, m (None: lost), s to the tightest tolerance, or, where it
+starts at its target, until stable (None: never)."""
 
 
 class RunRecord(Frozen):

@@ -24,7 +24,7 @@ ROWS = {  # by measure: its row, factor and decimals
     SURVIVAL: (Row("survival", "%"), 100.0, 2),
     REWARD: (Row("mean reward"), 1.0, 2),
     ERROR: (Row("final error, median", "m"), 1.0, 3),
-    TIME: (Row("mean time to the target", "s"), 1.0, 2),
+    TIME: (Row("mean time until there, or stable", "s"), 1.0, 2),
 }
 COMPARED = (SUCCESS, REWARD)
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"

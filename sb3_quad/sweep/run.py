@@ -27,7 +27,7 @@ from sb3_quad.settings.config import build_config
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import share_cores
 from sb3_quad.sweep.expand import Run
-from sb3_quad.sweep.records import MEASURES, Numbers, RunRecord
+from sb3_quad.sweep.records import MEASURES, REWARD, Numbers, RunRecord
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import STATUS_FILE, resume_pipeline, run_pipeline
@@ -59,7 +59,7 @@ class Trained(NamedTuple):
 def work(run: Run, folder: str, flying: Flying) -> RunRecord:
     """Train a run in its folder, or what is left of it, and fly its agent; of a run that fails, why."""
     share_cores(1)
-    name = {"name": run.name, "configuration": run.configuration, "seed": run.seed}
+    name: dict[str, Any] = {"name": run.name, "configuration": run.configuration, "seed": run.seed}
     place = Path(folder)
     try:
         place.mkdir(parents=True, exist_ok=True)
@@ -192,7 +192,7 @@ def _fly(trained: Trained, flying: Flying) -> dict[str, dict[str, Numbers]]:
         with closing(make_environments(config, 1, seed_for("table", flying.seed))) as env:
             model = load_model(trained.agent)
             rewards, _ = evaluate_policy(model, env, flying.episodes, return_episode_rewards=True)
-        return {config.env_id: {"reward": tuple(float(reward) for reward in rewards)}}
+        return {config.env_id: {REWARD: tuple(np.asarray(rewards, dtype=np.float64).tolist())}}
     if flying.suite is None:
         seeds, how = row_seeds(seed_for("table", flying.seed), flying.episodes), job.flight_settings.in_any_task()
         model = load_model(trained.agent)
@@ -207,7 +207,8 @@ def _fly(trained: Trained, flying: Flying) -> dict[str, dict[str, Numbers]]:
 
 def _numbers(flights: Flights) -> dict[str, Numbers]:
     error = np.where(flights.survival, flights.final_error, np.nan)
-    time = flights.time_to[min(flights.time_to)] if flights.time_to else np.full(flights.n, np.nan)
+    arrival = flights.time_to[min(flights.time_to)] if flights.time_to else np.full(flights.n, np.nan)
+    time = np.where(np.isfinite(flights.sideways), arrival, flights.stabilised)  # who starts at the target has no way to it
     columns = (flights.success, flights.survival, flights.reward, error, time)
     return {
         name: tuple(float(value) if np.isfinite(value) else None for value in column)

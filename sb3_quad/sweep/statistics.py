@@ -2,15 +2,15 @@
 
 A resample takes as many seeds as there are, with replacement, and as many episodes; the episodes are the same in every run,
 so that seeds and episodes are crossed (Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1, 2007). Of two
-configurations it takes the same seeds and episodes (paired). Few seeds give intervals that are too narrow (Agarwal et al., Deep
-Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021): with one seed they tell of episodes alone.
+configurations it takes the same seeds and episodes (paired). Few seeds give intervals that are too narrow (Agarwal et al.,
+Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021): with one they tell of episodes alone.
 """
 
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray, IntArray
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.sweep.records import ERROR, REWARD, SUCCESS, SURVIVAL
 
 RESAMPLES = 1000
@@ -39,11 +39,21 @@ def over_seeds(values: FloatArray, measure: str) -> Interval | None:
     :param values: of a measure, (seeds, episodes), NaN where there is none.
     :return: None if a run has no number at all.
     """
-    if not np.isfinite(values).any(axis=1).all():
+    known = np.isfinite(values)
+    if not known.any(axis=1).all():
         return None
-    seeds, episodes = _resamples(*values.shape)
-    found = [_of_runs(values[np.ix_(rows, columns)], measure) for rows, columns in zip(seeds, episodes, strict=True)]
-    return _interval(_of_runs(values, measure), np.array(found))
+    seeds, episodes = _counts(*values.shape)
+    if measure == ERROR:
+        value = float(np.nanmedian(values, axis=1).mean())
+        runs = np.array([[_median(row, count) for row in values] for count in episodes])
+    else:
+        filled = np.where(known, values, 0.0)
+        value = float((filled.sum(axis=1) / known.sum(axis=1)).mean())
+        with np.errstate(invalid="ignore"):  # a resample may miss the few episodes that have a number
+            runs = (episodes @ filled.T) / (episodes @ known.T)
+    weights = np.where(np.isfinite(runs), seeds, 0.0)
+    with np.errstate(invalid="ignore"):
+        return _interval(value, (weights * np.nan_to_num(runs)).sum(axis=1) / weights.sum(axis=1))
 
 
 def compare(first: FloatArray, second: FloatArray) -> Comparison:
@@ -52,27 +62,25 @@ def compare(first: FloatArray, second: FloatArray) -> Comparison:
     :param first: of the same seeds and episodes as ``second``, (seeds, episodes), without NaN.
     """
     difference = first - second
-    seeds, episodes = _resamples(*difference.shape)
-    found = [difference[np.ix_(rows, columns)].mean() for rows, columns in zip(seeds, episodes, strict=True)]
-    interval = _interval(float(difference.mean()), np.array(found))
+    seeds, episodes = _counts(*difference.shape)
+    found = np.einsum("rs,se,re->r", seeds, difference, episodes, optimize=True) / difference.size
+    interval = _interval(float(difference.mean()), found)
     verdict: Verdict = "better" if interval.low > 0 else "worse" if interval.high < 0 else "cannot tell"
     return Comparison(interval, verdict)
 
 
-def _of_runs(values: FloatArray, measure: str) -> float:
-    finite = np.isfinite(values)
-    if not finite.all() and not finite.any(axis=1).all():  # a resample may miss the few episodes that have a number
-        values = values[finite.any(axis=1)]
-    if not len(values):
-        return float("nan")
-    each = np.nanmedian(values, axis=1) if measure == ERROR else np.nanmean(values, axis=1)
-    return float(each.mean())
+def _median(values: FloatArray, counts: FloatArray) -> float:
+    """The median of the finite values, each as often as it counts; NaN if none does."""
+    found = np.repeat(values, counts.astype(np.int64))
+    found = found[np.isfinite(found)]
+    return float(np.median(found)) if found.size else float("nan")
 
 
-def _resamples(seeds: int, episodes: int) -> tuple[IntArray, IntArray]:
-    """Rows and columns of every resample; the same for the same numbers."""
+def _counts(seeds: int, episodes: int) -> tuple[FloatArray, FloatArray]:
+    """How often each resample has each seed and each episode, (RESAMPLES, n) each; the same for the same numbers."""
     random = np.random.default_rng(0)
-    return random.integers(0, seeds, (RESAMPLES, seeds)), random.integers(0, episodes, (RESAMPLES, episodes))
+    rows, columns = (random.multinomial(n, np.full(n, 1 / n), RESAMPLES).astype(np.float64) for n in (seeds, episodes))
+    return rows, columns
 
 
 def _interval(value: float, resampled: FloatArray) -> Interval:

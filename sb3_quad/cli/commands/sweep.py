@@ -132,11 +132,11 @@ def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], se
     """Print the tables, write the report, tell what failed. Returns the exit code."""
     done = [record for record in records.values() if record.state == "finished"]
     if done:
-        for found in tables(plan, records).values():
-            for table in found:
-                console().print(table)
+        found = tables(plan, records)
+        for table in (table for each in found.values() for table in each):
+            console().print(table)
         try:
-            write_report(place, plan, records)
+            write_report(place, plan, records, found)
         except MissingExtra as error:
             print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
     failures = [record for record in records.values() if record.state == "failed"]
