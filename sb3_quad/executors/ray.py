@@ -73,6 +73,7 @@ class RayExecutor:
                 environment["env_vars"] = {"PYTHONPATH": os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}
                 local = {"num_cpus": workers * num_cpus, "include_dashboard": False}
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's warning about it is none of ours
+                os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 leaves them nothing beside other work
                 ray.init(address="local", **local, **options)
             else:
                 check_cluster(address)
