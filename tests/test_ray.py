@@ -1,6 +1,7 @@
 """Sweeps on Ray: the runs of a two-node cluster are those of this machine, also when a node is lost; run by make test-zoo."""
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -71,12 +72,13 @@ def test_a_cluster_that_loses_a_node_gives_the_table_of_one_machine(tmp_path, mo
     monkeypatch.chdir(tmp_path)
     file = write(tmp_path / "s.yaml", seed=[0, 1, 2], storage=str(tmp_path / "storage"))
     command = [sys.executable, "-m", "sb3_quad.cli", "sweep", file, "--executor", "ray", "--address", cluster.address]
-    process = subprocess.Popen([*command, "--no-progress"], cwd=tmp_path, env={**_environment()})
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen([*command, "--no-progress"], cwd=tmp_path, env=environment)
     folder, end = tmp_path / "logs/sweep/s_1", time.monotonic() + 600
     while not list(folder.glob("records/*/*.json")) and process.poll() is None:
         assert time.monotonic() < end
         time.sleep(0.2)
-    cluster.remove_node(list(cluster.worker_nodes)[0], allow_graceful=False)
+    cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
     assert process.wait(600) == 0
     assert main(["sweep", file, "--workers", "2", "--no-progress"]) == 0
     assert weights("logs/sweep/s_1") == weights("logs/sweep/s_2") and len(weights("logs/sweep/s_1")) == 3
@@ -85,9 +87,3 @@ def test_a_cluster_that_loses_a_node_gives_the_table_of_one_machine(tmp_path, mo
     assert len(list((tmp_path / "storage").rglob("*.tar"))) == 3
     for path in folder.rglob("args.yml"):  # nothing names a folder of a worker
         assert str(folder.relative_to(tmp_path)) in path.read_text()
-
-
-def _environment():
-    import os
-
-    return {**os.environ, "PYTHONPATH": str(ROOT)}

@@ -83,7 +83,7 @@ def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
 def test_entries_of_a_list_have_their_names_and_inherit():
     own = [{"name": "calm", "env_kwargs": {"noise": 0}}, {"hyperparams": {"n_epochs": 2}}]
     calm, other = expand(spec(configurations=own))
-    assert calm.name == "calm/seed_0" and calm.settings["env_kwargs"] == {"noise": 0} and calm.settings["n_epochs"] == 1
+    assert calm.name == "calm/seed_0" and calm.settings["env_kwargs"]["noise"] == 0 and calm.settings["n_epochs"] == 1
     assert other.settings["n_epochs"] == 2 and other.settings["n_steps"] == NET["n_steps"]
 
 
