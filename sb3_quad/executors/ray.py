@@ -17,6 +17,7 @@ import torch
 import sb3_quad
 from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.imports import require
+from sb3_quad.base.trust import VARIABLE, trusted
 
 RETRIES = 3  # of a task whose node or worker process dies
 ANSWER = 15.0  # s that a cluster has to answer
@@ -66,11 +67,12 @@ class RayExecutor:
         self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references: dict[Any, RayTask] = {}
         self._package = tempfile.TemporaryDirectory(prefix="sb3_quad-")
-        environment: dict[str, Any] = {}
+        variables = {VARIABLE: "1"} if trusted() else {}
+        environment: dict[str, Any] = {"env_vars": variables}
         options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "runtime_env": environment}
         try:
             if address is None:
-                environment["env_vars"] = {"PYTHONPATH": os.pathsep.join(filter(None, map(os.path.abspath, sys.path)))}
+                variables["PYTHONPATH"] = os.pathsep.join(map(os.path.abspath, sys.path))
                 local = {"num_cpus": workers * num_cpus, "include_dashboard": False}
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's warning about it is none of ours
                 os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 leaves them nothing beside other work
@@ -115,8 +117,9 @@ class RayExecutor:
 
     def close(self) -> None:
         """Leave the cluster, or end the one that was started here."""
-        for reference in self._references:
-            self._ray.cancel(reference, force=True)
+        if self._ray.is_initialized():
+            self.cancel()
+        self._references.clear()
         self._ray.shutdown()
         self._package.cleanup()
 

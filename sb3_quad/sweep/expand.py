@@ -12,8 +12,9 @@ from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.pretrained_policies import agent_path
 from sb3_quad.scenarios.load import load_suite
-from sb3_quad.scenarios.scenario import Suite
+from sb3_quad.scenarios.scenario import Scenario, Suite
 from sb3_quad.settings.config import load_config
 from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
 from sb3_quad.training.job import TrainingJob
@@ -70,7 +71,14 @@ def suite_of(spec: SweepSpec) -> Suite | None:
         if asked.scenario:
             raise ConfigError("evaluation: scenario goes with a suite")
         return None
-    return load_suite(asked.suite).with_changes(asked.scenario, asked.episodes, asked.seed)
+    suite = load_suite(asked.suite).with_changes(asked.scenario, asked.episodes, asked.seed)
+    scenarios = [each if each.vehicle is None else _with_vehicle(each) for each in suite.scenarios]
+    return suite.model_copy(update={"scenarios": tuple(scenarios)})
+
+
+def _with_vehicle(scenario: Scenario) -> Scenario:
+    """The scenario with the vehicle that it names, rather than the name of a file that other machines do not have."""
+    return scenario.model_copy(update={"vehicle": scenario.nominal_vehicle()})
 
 
 def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -121,6 +129,10 @@ def _run(configuration: Configuration, name: str, seed: int, gym_packages: tuple
     if not given["env_kwargs"]:
         del given["env_kwargs"]
     changes = {**configuration.hyperparams, **{key: given[key] for key in SETTINGS if key in given}}
+    if configuration.trained_agent is not None:
+        given["trained_agent"] = agent_path(configuration.trained_agent)
+        if not Path(given["trained_agent"]).is_file():
+            raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
     job = {key: given[key] for key in TrainingJob.model_fields if key in given}
     common: dict[str, Any] = {"name": f"{name}/seed_{seed}", "configuration": name, "seed": seed, "gym_packages": gym_packages}
     file = configuration.conf_file

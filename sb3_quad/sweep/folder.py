@@ -65,8 +65,8 @@ class SweepFolder:
         return _read(self.plan, Plan)
 
     def run(self, run: Run) -> Path:
-        """The folder of a run."""
-        return self.path / "runs" / run.name
+        """The folder of a run, absolute: what is written in it names files that are looked for from anywhere."""
+        return self.path.absolute() / "runs" / run.name
 
     def add(self, record: RunRecord) -> None:
         """Keep the record of a run that ended."""
