@@ -18,7 +18,8 @@ from sb3_quad.scenarios.scenario import Scenario, Suite
 from sb3_quad.settings.config import load_config
 from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.pipeline import Pipeline, check_pipeline, is_pipeline, load_pipeline, with_settings
+from sb3_quad.training.pipeline import Pipeline, is_pipeline, load_pipeline, stage_jobs, with_settings
+from sb3_quad.vehicles.vehicle import first_vehicle
 
 NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value says enough
 SETTINGS = ("n_timesteps", "n_envs", "vec_env", "expert", "env_kwargs")  # as commands/train puts them over a file's
@@ -141,14 +142,21 @@ def _run(configuration: Configuration, name: str, seed: int, gym_packages: tuple
             if key in given:
                 raise ConfigError(f"{key} goes with a single run; the stages of a pipeline have their own in {file}")
         pipeline = with_settings(load_pipeline(file), changes)
-        check_pipeline(pipeline, {**job, "seed": seed})
+        for stage in stage_jobs(pipeline, {**job, "seed": seed}):
+            _check_vehicle(stage)
         return Run(**common, job=job, pipeline=pipeline, stem=Path(file).stem)
     if configuration.algo is None or configuration.env is None:
         missing = "algo" if configuration.algo is None else "env"
         raise ConfigError(f"{missing} is missing; give algo and env, or a conf_file with the stages of a pipeline")
     config = load_config(configuration.algo, configuration.env, file, changes)
-    validate(TrainingJob, {**job, "seed": seed, "config": config}, "its settings")
+    _check_vehicle(validate(TrainingJob, {**job, "seed": seed, "config": config}, "its settings"))
     return Run(**common, job=job, algo=config.algo, env=config.env_id, settings=config.settings)
+
+
+def _check_vehicle(job: TrainingJob) -> None:
+    """:raises ConfigError: keywords of the environment that do not fit, a vehicle that cannot be loaded."""
+    if job.config.task is not None:
+        first_vehicle(job.flight_settings.vehicle)
 
 
 def _plain_name(configuration: Configuration) -> str:
