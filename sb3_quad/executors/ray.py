@@ -99,7 +99,7 @@ class RayExecutor:
     def submit(self, function: Callable[..., Any], *arguments: Any) -> RayTask:
         """Have a function called on the cluster, as soon as it has room."""
         call = self._ray.remote(_call).options(name=getattr(function, "__name__", "task"), **self._needs)
-        task = RayTask(call.remote(function, *arguments))
+        task = RayTask(call.remote(sys.argv, function, *arguments))
         self._references[task.reference] = task
         return task
 
@@ -172,7 +172,8 @@ def _copy_package(folder: Path) -> Path:
     return target
 
 
-def _call(function: Callable[..., Any], *arguments: Any) -> Any:
-    """On a worker."""
+def _call(argv: list[str], function: Callable[..., Any], *arguments: Any) -> Any:
+    """On a worker, for whom the command line is that of the driver, as of a process that it spawns: runs note it."""
+    sys.argv = argv
     torch.set_num_threads(1)
     return function(*arguments)
