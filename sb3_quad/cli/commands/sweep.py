@@ -66,7 +66,7 @@ def run_sweep(options: argparse.Namespace, plan: Plan, place: SweepFolder | None
     :param place: its folder; None: a new one.
     """
     start = time.perf_counter()
-    needs, workers = plan.spec.resources, options.workers or len(os.sched_getaffinity(0))
+    needs, workers = plan.spec.resources, options.workers or _cores()
     workers = min(workers, len(plan.runs))
     with start_executor(options.executor, workers, options.address, needs.num_cpus, needs.num_gpus) as executor:
         if place is None:
@@ -145,6 +145,10 @@ def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], se
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
     return 1 if failures else 0
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _what(each: Any) -> str:
