@@ -3,7 +3,6 @@
 import os
 import shutil
 import socket
-import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -135,28 +134,28 @@ def check_cluster(address: str) -> None:
 
     :raises ConfigError: nobody answers within 20 s.
     """
+    if address == "auto":  # Ray looks for one on this machine, and says at once that there is none
+        return
+    host, _, port = address.removeprefix(CLIENT).rpartition(":")
+    if not host:
+        host, port = port, str(CLIENT_PORT if address.startswith(CLIENT) else PORT)
+    if not port.isdigit() or not host:
+        raise ConfigError(f"address {address!r}: must be auto, host:port or ray://host:port")
     refused = ConfigError(
         f"address {address}: no Ray cluster answers; start one with: ray start --head --port {PORT}, or leave --address out"
     )
-    if address != "auto":
-        host, _, port = address.removeprefix(CLIENT).rpartition(":")
-        default = CLIENT_PORT if address.startswith(CLIENT) else PORT
-        if not host:
-            host, port = port, str(default)
-        if not port.isdigit() or not host:
-            raise ConfigError(f"address {address!r}: must be auto, host:port or ray://host:port")
-        try:
-            socket.create_connection((host.strip("[]"), int(port)), timeout=4.0).close()
-        except (OSError, OverflowError):
-            raise refused from None
-    # Ray itself keeps trying where something else answers; a process can be given up.
-    probe = "import sys, ray; ray.init(address=sys.argv[1], log_to_driver=False, logging_level='ERROR')"
     try:
-        asked = subprocess.run([sys.executable, "-c", probe, address], capture_output=True, timeout=ANSWER, check=False)
-    except subprocess.TimeoutExpired:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=4.0).close()
+    except (OSError, OverflowError):
         raise refused from None
-    if asked.returncode != 0:
-        raise refused
+    if os.environ.get("RAY_USE_TLS", "0") not in ("", "0"):
+        return
+    grpc = require("grpc", "ray", "--address")  # which Ray speaks; Ray itself keeps trying where something else answers
+    with grpc.insecure_channel(f"{host}:{port}") as channel:
+        try:
+            grpc.channel_ready_future(channel).result(timeout=ANSWER)
+        except grpc.FutureTimeoutError:
+            raise refused from None
 
 
 def _copy_package(folder: Path) -> Path:
