@@ -90,6 +90,14 @@ def test_any_quadcopter_is_not_said_to_know_another_vehicle():
     assert not any_quadcopter.notice("crazyflie") and "was trained on the vehicle itm" in recovery.notice("crazyflie")
 
 
+def test_any_quadcopter_is_exported_for_a_vehicle_that_is_named(tmp_path, capsys):
+    command = ["export", "any-quadcopter", "--format", "torchscript", "-o", str(tmp_path)]
+    assert main(command) == 2
+    assert "flies any vehicle; say with --vehicle" in capsys.readouterr().err
+    assert main([*command, "--vehicle", "crazyflie"]) == 0
+    assert "vehicle: crazyflie: hover thrust 0.0662" in capsys.readouterr().out
+
+
 def test_any_quadcopter_is_evaluated_on_quadcopters_that_nobody_knows(tmp_path, capsys):
     command = [
         "evaluate",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.runs import RunFolder
 
 
@@ -23,7 +24,8 @@ def print_next(run: RunFolder) -> None:
         ["evaluate", agent, "--suite", "quick", "-o", f"evaluations/{label}"],
     ]
     if algo != "recurrent_dagger":  # which no file but a zip holds
-        commands.append(["export", agent, "--format", "torchscript"])
+        vehicle = ["--vehicle", "itm"] if FlightSettings.of(agent)[0].vehicles else []  # else the one that it was trained on
+        commands.append(["export", agent, "--format", "torchscript", *vehicle])
     for command in commands:
         print("  " + shlex.join([*_program(), *command]))
 

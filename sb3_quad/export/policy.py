@@ -61,7 +61,8 @@ def export_policy(
     :param name: the C function is called ``NAME_policy``; None: as the zip.
     :param n_observations: of the check; even; of a policy with a memory, whole flights of ``check.FLIGHT_STEPS``.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are not the quadcopter's or
-        whose policy is no ``MlpPolicy``; a package or a C compiler that is not installed.
+        whose policy is no ``MlpPolicy``; one that flies any vehicle, and none is given; a package or a C compiler that is
+        not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
     """
     prefix = c_name(Path(path).stem) if name is None else name
@@ -78,6 +79,8 @@ def export_policy(
     algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), FlightSettings.of(path)
     changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
+    if settings.vehicles is not None:
+        raise ConfigError(f"model {path}: flies any vehicle; say with --vehicle which one's thrusts the file is to give")
     row = QuadcopterBatch(1, **dict(settings), n_threads=1)  # it checks them
     reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.memory)
     network = build_network(reference, f"model {path}")
