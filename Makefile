@@ -20,7 +20,7 @@ help:
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
-	@echo "make test-zoo       run the tests that need rl_zoo3, in an environment of its own"
+	@echo "make test-zoo       run the tests that need rl_zoo3 or Ray, in an environment of its own"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
 	@echo "make type           check types"
@@ -42,7 +42,7 @@ fuzz: $(INSTALLED)
 	done
 
 test-zoo: $(ZOO_INSTALLED)
-	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py $(ARGS)
+	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py $(ARGS)
 
 lint: $(INSTALLED) links
 	$(PY) -m ruff check .
@@ -86,7 +86,8 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 		$(INSTALL) setuptools hatchling && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
 	fi
 
-# rl_zoo3 needs older versions of some packages than ours: they come first in an environment that borrows all others.
+# Ray, and rl_zoo3, which needs older versions of some packages than ours: they come first in an environment
+# that borrows all others.
 $(ZOO_INSTALLED): constraints-zoo.txt $(INSTALLED)
 	$(PY) -m venv --without-pip $(ZOO_VENV)
 	@$(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \

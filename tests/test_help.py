@@ -36,8 +36,9 @@ def test_examples_are_taken(name):
             assert {*([options.algo] if isinstance(options.algo, str) else options.algo)} <= {*ALGORITHMS}
         if getattr(options, "env", None) is not None:
             assert options.env in (*ENVIRONMENTS, "Pendulum-v1")
-        if getattr(options, "conf_file", None) is not None:
-            assert options.conf_file in (*SETTINGS.names(), "my.yml") or options.conf_file.endswith("/best.yml")
+        files = getattr(options, "conf_file", None) or []
+        for file in [files] if isinstance(files, str) else files:
+            assert file in (*SETTINGS.names(), "my.yml") or file.endswith("/best.yml")
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))

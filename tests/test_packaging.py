@@ -20,6 +20,7 @@ import sb3_quad
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
 DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
+APART = ("zoo", "ray", "sweep")  # extras in the environment of make test-zoo
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 
@@ -131,18 +132,18 @@ def test_pyproject_holds_only_the_build_system():
 
 @pytest.mark.parametrize("file", ["constraints.txt", "constraints-zoo.txt"])
 def test_each_dependency_is_pinned(options, file):
-    """Those of the extra [zoo] in a file of its own: they contradict the others."""
+    """Those of some extras in a file of their own: rl_zoo3 contradicts the others, and the environment of both has it."""
     extras = dict(options["options.extras_require"])
-    zoo = extras.pop("zoo")
+    zoo = "".join(extras.pop(name) for name in APART)
     wanted = zoo if "zoo" in file else "".join([options["options"]["install_requires"], *extras.values()])
     pins = [line.split("==")[0] for line in (ROOT / file).read_text().splitlines() if "==" in line]
     assert requirements(wanted) <= set(pins)
     assert len(pins) == len(set(pins))
 
 
-def test_the_extra_for_developers_holds_all_but_rl_zoo3(options):
+def test_the_extra_for_developers_holds_all_but_those_apart(options):
     extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
-    assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", "zoo"))) - {"torch"}
+    assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", *APART))) - {"torch"}
     assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
     assert all(f"`pip install '.[{name}]'`" in (ROOT / "README.md").read_text(encoding="utf-8") for name in extras)
 

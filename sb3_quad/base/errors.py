@@ -35,6 +35,10 @@ class ControllerError(SB3QuadError, RuntimeError):
     """A controller that fails in flight: says when, and what it raised or gave."""
 
 
+class WorkerDied(SB3QuadError, RuntimeError):
+    """A worker process that ended before its task was done: killed, crashed, or out of memory."""
+
+
 class ExportError(SB3QuadError, RuntimeError):
     """An exported policy that does not compute what the trained one does, or cannot be checked."""
 

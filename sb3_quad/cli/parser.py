@@ -93,6 +93,20 @@ class Pairs(argparse.Action):
         setattr(namespace, self.dest, found)
 
 
+def add_executor(parser: argparse.ArgumentParser) -> None:
+    """The flags that say where tasks are executed."""
+    add = parser.add_argument
+    add("--executor", default="local", metavar="KIND", help="local (worker processes here, default) or ray: docs/sweeps.md")
+    add("--address", metavar="WHERE", help="Ray cluster: auto, host:port or ray://host:port (without it, one is started here)")
+
+
+class OneOrMore(argparse.Action):
+    """Keeps a single value as it is, several as a list."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        setattr(namespace, self.dest, values[0] if len(values) == 1 else values)
+
+
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
     """Those of some options that a command has and that are given."""
     return {name: value for name in names if (value := getattr(options, name, None)) is not None}

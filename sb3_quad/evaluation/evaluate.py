@@ -13,6 +13,7 @@ from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.folder import RESULTS, load_results, read_entries, write_results
 from sb3_quad.evaluation.jobs import Job, failure, run_jobs
 from sb3_quad.evaluation.records import ControllerRecord, Failure, Results
+from sb3_quad.executors import start_executor
 from sb3_quad.scenarios.scenario import DEFAULT_VEHICLE, Suite
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -28,6 +29,8 @@ def evaluate(
     overwrite: bool = False,
     progress: Progress = lambda done, total, name: None,
     report: Callable[[str], None] = lambda line: None,
+    executor: str = "local",
+    address: str | None = None,
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
@@ -35,8 +38,10 @@ def evaluate(
     interrupted call has done is kept and not flown again.
 
     :param folder: of the results.
+    :param workers: that fly side by side; with one, and no Ray, this process flies.
     :param overwrite: replace earlier results of these controllers that were flown otherwise, instead of refusing.
     :param report: told in one line of each agent that flies another vehicle than it was trained on, or does not say on which.
+    :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is ``address``.
     :return: all results in the folder, those of earlier calls included; where nothing has been flown, it is not written.
     :raises ConfigError: an unknown backend; results in the folder of the same names that were flown otherwise; a folder that
         cannot be written, or that another process is writing to.
@@ -77,11 +82,13 @@ def evaluate(
         done = len(jobs) - len(missing)
         try:
             progress(done, len(jobs), "")
-            for job, outcome in run_jobs(missing, workers):
-                done += 1
-                if isinstance(outcome, Failure):
-                    failures.append(outcome)
-                progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+            alone = executor == "local" and min(workers, len(missing)) <= 1
+            with nullcontext() if alone else start_executor(executor, workers, address) as working:
+                for job, outcome in run_jobs(missing, working):
+                    done += 1
+                    if isinstance(outcome, Failure):
+                        failures.append(outcome)
+                    progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
         finally:  # an interrupt, too, leaves what is done in order
             results = _collect(place, before, suite, [record for _, record in loaded], failures)
             if results.entries or before is not None:

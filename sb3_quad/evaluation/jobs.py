@@ -1,32 +1,26 @@
-"""The jobs of an evaluation: a controller in a scenario each, flown one after another or by worker processes."""
+"""The jobs of an evaluation: a controller in a scenario each, flown one after another or by an executor's workers."""
 
 import hashlib
 import json
-import multiprocessing
-import os
-import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
-from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
-
-import torch
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 from sb3_quad import __version__
-from sb3_quad.base.errors import ControllerError, SB3QuadError
-from sb3_quad.base.signals import ignore_interrupts
+from sb3_quad.base.arrays import Arrays
+from sb3_quad.base.errors import SB3QuadError, WorkerDied
 from sb3_quad.evaluation.controllers import ControllerSpec, build
 from sb3_quad.evaluation.flightlog import episode_arrays
 from sb3_quad.evaluation.folder import flights_path, write_entry
 from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry, Failure
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.summary import summarise
+from sb3_quad.executors import Executor, as_completed
+from sb3_quad.executors.travel import files_of, with_files
 from sb3_quad.scenarios.scenario import DEFAULT_VEHICLE, Scenario
 from sb3_quad.simulation.memory import Memory
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -77,8 +71,15 @@ class Job:
         return self.scenario.flown_by(self.spec.own and self.spec.own.vehicle)
 
 
-def run_job(job: Job) -> Entry | Failure:
-    """Fly, sum up, write; of a controller that fails, its :class:`Failure`."""
+class Flown(NamedTuple):
+    """A job that is done: its record, and the flights in numbers."""
+
+    entry: Entry
+    arrays: Arrays
+
+
+def fly_job(job: Job) -> Flown | Failure:
+    """Fly and sum up; of a controller that fails, its :class:`Failure`."""
     label, scenario = job.record.label, job.scenario
     start = time.perf_counter()
     try:
@@ -102,58 +103,66 @@ def run_job(job: Job) -> Entry | Failure:
         hit_limit=limit,
         flights=flights_path(label, scenario.name),
     )
-    write_entry(Path(job.folder), entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories})
-    return entry
+    return Flown(entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories})
 
 
-def run_jobs(jobs: Sequence[Job], workers: int) -> Iterator[tuple[Job, Entry | Failure]]:
-    """Do jobs, one after another or by worker processes, and hand out each as it is done.
+def run_job(job: Job) -> Entry | Failure:
+    """As :func:`fly_job`, and write."""
+    done = fly_job(job)
+    if isinstance(done, Failure):
+        return done
+    write_entry(Path(job.folder), *done)
+    return done.entry
+
+
+def _without_path(job: Job) -> Job:
+    """The job with the vehicle that its scenario names, rather than the name of a file."""
+    if job.scenario.vehicle is None:
+        return job
+    return replace(job, scenario=job.scenario.model_copy(update={"vehicle": job.scenario.nominal_vehicle()}))
+
+
+def _fly_elsewhere(job: Job, keys: tuple[str, str], files: dict[str, bytes]) -> Flown | Failure:
+    """As :func:`fly_job`, on a machine that has only those files of the controller that travelled along.
+
+    :param keys: of the job, by the paths that it had before.
+    """
+    with TemporaryDirectory() as folder:
+        spec = replace(job.spec, spec=with_files(job.spec.spec, files, Path(folder)))
+        done = fly_job(replace(job, spec=spec))
+    if isinstance(done, Failure):
+        return done
+    return done._replace(entry=done.entry.model_copy(update=dict(zip(("key", "scenario_key"), keys, strict=True))))
+
+
+def run_jobs(jobs: Sequence[Job], executor: Executor | None = None) -> Iterator[tuple[Job, Entry | Failure]]:
+    """Do jobs, and hand out each as it is done.
 
     A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.
 
+    :param executor: None: they are done one after another, here.
     :raises SB3QuadError: a folder that cannot be written.
     """
-    if workers <= 1 or len(jobs) <= 1:
+    if executor is None:
         yield from ((job, run_job(job)) for job in jobs)
         return
-    context = multiprocessing.get_context("spawn")
-    watched, held = context.Pipe(duplex=False)  # what holds it open is closed below, or ends with this process
-    waiting, idle, at_work = deque(jobs), list[ProcessPoolExecutor](), dict[Future[Any], tuple[Job, ProcessPoolExecutor]]()
-    try:
-        while waiting or at_work:
-            while waiting and len(at_work) < workers:
-                pool = idle.pop() if idle else ProcessPoolExecutor(1, context, _begin_worker, (watched,))
-                job = waiting.popleft()
-                at_work[pool.submit(run_job, job)] = job, pool
-            future = wait(at_work, return_when=FIRST_COMPLETED).done.pop()
-            job, pool = at_work.pop(future)
-            try:
-                outcome = future.result()
-                idle.append(pool)
-            except BrokenProcessPool:  # one process a pool, so that the job is known, and no other is lost
-                pool.shutdown()
-                ended = ControllerError("its worker process ended unexpectedly (out of memory?)")
-                outcome = failure(job.record.label, job.scenario.name, ended)
-            yield job, outcome
-    finally:
-        for pool in idle:
-            pool.shutdown()
-        held.close()
-        for _, pool in at_work.values():
-            pool.shutdown(cancel_futures=True)
-        watched.close()
-
-
-def _begin_worker(watched: Connection) -> None:
-    ignore_interrupts()  # the process that started the workers ends them
-    threading.Thread(target=_end_with_evaluation, args=(watched,), daemon=True).start()
-    torch.set_num_threads(1)
-
-
-def _end_with_evaluation(watched: Connection) -> None:
-    """End this worker as soon as the evaluation that it works for is left, also by being killed."""
-    watched.poll(None)
-    os._exit(1)
+    if executor.remote:
+        submitted = {
+            executor.submit(_fly_elsewhere, _without_path(job), (job.key, job.scenario_key), files_of(job.spec.spec)): job
+            for job in jobs
+        }
+    else:
+        submitted = {executor.submit(run_job, job): job for job in jobs}
+    for task in as_completed(executor):
+        job = submitted[task]
+        try:
+            outcome = task.result()
+        except WorkerDied as ended:
+            outcome = failure(job.record.label, job.scenario.name, ended)
+        if isinstance(outcome, Flown):
+            write_entry(Path(job.folder), *outcome)
+            outcome = outcome.entry
+        yield job, outcome
 
 
 def failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:

@@ -47,14 +47,7 @@ def render(results: Results, parts: Sequence[Section], with_pictures: bool) -> s
 
     :raises MissingExtra: Jinja2 is not installed, or Plotly, where there are flights in space.
     """
-    jinja2 = require("jinja2", "report", PAGE)
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("sb3_quad.report", "templates"),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
+    environment = _templates()
     spaces = {plot.name: plot.space for section in parts for plot in section.plots if plot.space is not None}
     text: str = environment.get_template("page.html.j2").render(
         results=results,
@@ -68,6 +61,26 @@ def render(results: Results, parts: Sequence[Section], with_pictures: bool) -> s
         plotly=_packed(require("plotly.offline", "report", PAGE).get_plotlyjs()) if spaces else "",
     )
     return text
+
+
+def render_page(title: str, facts: str, parts: Sequence[Section]) -> str:
+    """A page of sections without flights in space, its plots also in ``figures/``.
+
+    :raises MissingExtra: Jinja2 is not installed.
+    """
+    page: str = _templates().get_template("sweep.html.j2").render(title=title, facts=facts, sections=parts, pictures=PICTURES)
+    return page
+
+
+def _templates() -> Any:
+    jinja2 = require("jinja2", "report", PAGE)
+    return jinja2.Environment(
+        loader=jinja2.PackageLoader("sb3_quad.report", "templates"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
 
 
 def render_markdown(results: Results, parts: Sequence[Section]) -> str:

@@ -14,7 +14,7 @@ from sb3_quad.simulation.designs import resolve_vehicles
 from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
-from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run
+from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run, use_cpus
 from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
@@ -38,6 +38,11 @@ _MEMORY = (  # all that future flight depends on
     *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
     *("vehicles", "nominal", "gust", "frames", "integral"),
 )
+
+
+def share_cores(count: int) -> None:
+    """Have the batches of this process fly with no more than ``count`` threads unless told otherwise; flights are the same."""
+    use_cpus(count)
 
 
 class BatchKeywords(TypedDict, total=False):

@@ -193,6 +193,14 @@ def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **chang
     return _go_on(folder, status, _make_jobs(status), report, **changes)
 
 
+def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
+    """What each stage trains, checked.
+
+    :raises ConfigError: settings of a stage, or arguments of its job, that do not fit.
+    """
+    return _make_jobs(Status(stages=pipeline.stages, job=dict(job), done=(), current=None))
+
+
 def _make_jobs(status: Status) -> list[TrainingJob]:
     jobs = []
     for stage in status.stages:

@@ -193,6 +193,21 @@ class Search:
         }
 
 
+def train_trial(
+    job: TrainingJob, space: SearchSpace, name: str, storage: str, study: tuple[str, str, int, int], most: int | None
+) -> int | None:
+    """In a worker: one trial of a study that several share.
+
+    :param study: sampler, pruner, n_startup_trials, n_evaluations, as for :class:`Search`.
+    :param most: trials of the whole study; None: no limit.
+    :return: its number; None: the study has as many as it may.
+    """
+    numbers: list[int] = []
+    with StopSignals() as signals:
+        Search(job, space, name, storage, *study).run(1, most, signals, lambda trial: numbers.append(trial.number))
+    return numbers[0] if numbers else None
+
+
 def score(success: float, reward: float, n_episodes: int) -> float:
     """Success and reward as one number: any more successful episodes outweigh any reward, which decides between equals.
 

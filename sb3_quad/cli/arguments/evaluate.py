@@ -12,6 +12,7 @@ examples:
   sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip" --suite thesis -o evaluations/mine
   sb3-quad evaluate pid agent.zip --suite quick                a quick look, in less than a minute
   sb3-quad evaluate agent.zip --suite robustness --workers 2
+  sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
   sb3-quad evaluate agent.zip --scaling adaptive --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
@@ -22,7 +23,7 @@ Results are kept in a folder: the same command again flies only what is missing,
 
 import argparse
 
-from sb3_quad.cli.parser import TRUST, Parser, whole
+from sb3_quad.cli.parser import TRUST, Parser, add_executor, whole
 
 DEFAULT_FOLDER = "evaluations"
 
@@ -39,6 +40,7 @@ def add_arguments(parser: Parser) -> None:
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
+    add_executor(parser)
     add("--trust", action="store_true", help=TRUST)
     add("--overwrite", action="store_true", help="replace results of these controllers from other settings")
     add("--report", action=argparse.BooleanOptionalAction, default=True, help="update report.html and its plots (yes)")

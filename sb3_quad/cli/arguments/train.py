@@ -9,6 +9,7 @@ examples:
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
+  sb3-quad train --seed 0 1 2                             three seeds side by side, one table: a sweep
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
@@ -19,7 +20,7 @@ examples:
 
 import argparse
 
-from sb3_quad.cli.parser import BRIDGE, TRUST, Pairs, Parser, pointers, positive, seed, whole
+from sb3_quad.cli.parser import BRIDGE, TRUST, OneOrMore, Pairs, Parser, pointers, positive, seed, whole
 from sb3_quad.pretrained_policies import agent_path
 
 DEFAULT_PIPELINE = "imitation.yml"
@@ -70,7 +71,8 @@ def add_arguments(parser: Parser) -> None:
     add("--resume", metavar="RUN_FOLDER", help="continue an interrupted or killed run with all its settings")
     add("-f", "--log-folder", metavar="DIR", help="folder for the run folders (logs)")
     add("-uuid", "--uuid", action="store_true", help="add a UUID to the run folder's name")
-    add("--seed", type=seed, help="seed (0); negative: a random one, recorded in args.yml")
+    seeds = "seed (0); negative: a random one, recorded in args.yml; several: a run each, compared, as sweep does"
+    add("--seed", type=seed, nargs="+", action=OneOrMore, help=seeds)
     add("--eval-freq", type=whole, metavar="N", help="timesteps between evaluations (250000); below 1: one at the end")
     add("--eval-episodes", type=whole, metavar="N", help="episodes per evaluation (48); 0: no evaluations")
     add("--save-freq", type=whole, metavar="N", help="timesteps between checkpoints (none)")

@@ -6,6 +6,7 @@ examples:
   sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler random --pruner none --seed 1
   sb3-quad tune --algo dagger --storage logs/my_study.log           again or in another terminal: continues that study
   sb3-quad tune --algo dagger --storage sqlite:///study.db --study-name noise_free --env-kwargs noise:0
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30 --workers 4   four trials side by side
   sb3-quad tune --algo dagger --search-space my_space.yml --hyperparams n_epochs:4
   sb3-quad train --algo dagger --env QuadTargetTracking-v0 --conf-file logs/tune/dagger/QuadTargetTracking-v0_1/best.yml
 
@@ -13,7 +14,7 @@ The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. N
 """
 
 from sb3_quad.cli.arguments.train import add_settings
-from sb3_quad.cli.parser import Parser, natural, positive, seed, whole
+from sb3_quad.cli.parser import Parser, add_executor, natural, positive, seed, whole
 
 
 def add_arguments(parser: Parser) -> None:
@@ -22,6 +23,8 @@ def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("--n-trials", type=natural, default=500, metavar="N", help="trials of this process (500); 0: only write results")
     add("--max-total-trials", type=positive, metavar="N", help="trials of the whole study, failed ones excluded (no limit)")
+    add("--workers", type=positive, default=1, metavar="N", help="trials side by side, one core each (1)")
+    add_executor(parser)
     add("--sampler", default="tpe", metavar="NAME", help="proposes the trials: tpe (default), random or cmaes")
     add("--pruner", default="median", metavar="NAME", help="cuts poor trials short: median (default), halving or none")
     add("--n-startup-trials", type=whole, default=10, metavar="N", help="random trials before sampler and pruner start (10)")

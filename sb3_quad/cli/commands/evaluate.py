@@ -23,7 +23,7 @@ def run(options: argparse.Namespace) -> int:
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
         how = options.backend, options.workers, options.overwrite
-        results = evaluate(suite, controllers, folder, *how, show, lambda line: print(f"warning: {line}", file=sys.stderr))
+        results = evaluate(suite, controllers, folder, *how, show, _warn, options.executor, options.address)
     flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
     labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
     if labels:
@@ -41,3 +41,7 @@ def run(options: argparse.Namespace) -> int:
         where = "" if failure.scenario is None else f", scenario {failure.scenario}"
         print(f"failed: {failure.controller}{where}: {failure.message}", file=sys.stderr)
     return 1 if failures else 0
+
+
+def _warn(line: str) -> None:
+    print(f"warning: {line}", file=sys.stderr)

@@ -45,6 +45,8 @@ THESIS_COLUMNS = ("expert", "IL-agent", "RL-agent", REFERENCE.name)
 
 def run(options: argparse.Namespace) -> int:
     """Train, compare, tell where everything is. Returns the exit code."""
+    if isinstance(options.seed, list):
+        return _sweep(options)
     prepare(options)
     start = time.perf_counter()
     arguments = {**given(options, *TrainingJob.model_fields), "progress": shows_progress(options.progress)}
@@ -70,6 +72,23 @@ def run(options: argparse.Namespace) -> int:
     job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
     print(describe(job))
     return _finish(train(job))
+
+
+def _sweep(options: argparse.Namespace) -> int:
+    """Several seeds, one configuration. Returns the exit code."""
+    from sb3_quad.cli.commands import sweep  # only where it is asked for
+    from sb3_quad.sweep.spec import SweepSpec
+
+    for name in ("resume", "reference", "uuid", "tensorboard_log", "num_threads", "verbose", "log_interval"):
+        if getattr(options, name):
+            raise ConfigError(f"--{name.replace('_', '-')} goes with one seed; several make a sweep, docs/sweeps.md")
+    names = ("algo", "env", "conf_file", "trained_agent", "seed", "hyperparams", "n_timesteps", "n_envs", "vec_env", "expert")
+    others = ("env_kwargs", "eval_env_kwargs", "device", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq")
+    data = {"name": "train", **given(options, *names, *others, "snapshot_every"), "gym_packages": options.gym_packages}
+    spec = validate(SweepSpec, sweep.with_defaults(data), "command line")
+    defaults = {"dry_run": False, "workers": None, "executor": "local", "address": None}
+    options.log_folder = options.log_folder or "logs"
+    return sweep.run_spec(argparse.Namespace(**{**vars(options), **defaults}), spec)
 
 
 def prepare(options: argparse.Namespace) -> None:

@@ -1,13 +1,15 @@
 """``tune``: a search for an algorithm's hyperparameters."""
 
 import argparse
+import sys
+from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
 from optuna.trial import FrozenTrial
 
-from sb3_quad.base.errors import SB3QuadError
+from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError, WorkerDied
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.commands.train import make_config, prepare
@@ -15,12 +17,13 @@ from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console, progress_bar
 from sb3_quad.cli.parser import given
 from sb3_quad.evaluation.tables import text_table
+from sb3_quad.executors import start_executor
 from sb3_quad.experts.models import load_model
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import claim_folder, file_name, open_run
 from sb3_quad.tuning.results import BEST, PLOT, TRIALS, in_words, settings_of, train_command, varied, write_plot, write_results
-from sb3_quad.tuning.search import ERROR, REWARD, RUN, SUCCESS, Search
+from sb3_quad.tuning.search import ERROR, HOPELESS, REWARD, RUN, SUCCESS, Search, train_trial
 from sb3_quad.tuning.space import load_space
 
 JOURNAL = "study.log"
@@ -45,11 +48,49 @@ def run(options: argparse.Namespace) -> int:
                 show(next(done), options.n_trials, "trials")
 
             try:
-                search.run(options.n_trials, options.max_total_trials, signals, after_each)
+                if options.workers > 1 or options.executor != "local":
+                    _share(options, search, signals, after_each)
+                else:
+                    search.run(options.n_trials, options.max_total_trials, signals, after_each)
             finally:
                 write_results(search)
     _print_results(search)
     return signals.exit_code
+
+
+def _share(
+    options: argparse.Namespace, search: Search, signals: StopSignals, after_each: Callable[[FrozenTrial], None]
+) -> None:
+    """Have workers train the trials, each of which opens the study.
+
+    :raises TrainingError: the first trials of all have failed.
+    """
+    if options.address is not None and options.storage is None:
+        raise ConfigError("--address: workers elsewhere need a study that they see; name one with --storage")
+    study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
+    storage = str(search.storage) if "://" in str(search.storage) else str(Path(str(search.storage)).absolute())
+    shared = search.job.model_copy(update={"log_folder": str(Path(search.job.log_folder).absolute())})
+    ended, failures, stopped = 0, 0, False
+    with start_executor(options.executor, options.workers, options.address) as executor:
+        for _ in range(options.n_trials):
+            executor.submit(train_trial, shared, search.space, search.name, storage, study, options.max_total_trials)
+        while executor.pending:
+            for task in executor.wait(1.0):
+                try:
+                    number = task.result()
+                except WorkerDied as error:
+                    print(f"a trial is lost, and tried again by whoever goes on: {error}", file=sys.stderr)
+                    continue
+                if number is None:
+                    continue
+                trial = search.study.get_trials(deepcopy=False)[number]
+                after_each(trial)
+                ended, failures = ended + 1, failures + (trial.state.name == "FAIL")
+                if failures == ended == HOPELESS and not stopped:
+                    raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {trial.user_attrs[ERROR]}")
+            if signals.received is not None and not stopped:
+                stopped = True
+                executor.cancel()
 
 
 def _make_search(options: argparse.Namespace) -> Search:

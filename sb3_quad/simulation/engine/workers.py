@@ -25,9 +25,19 @@ REST = 100  # jobs done without workers after one kept a job waiting: its core i
 MOST = 64  # workers
 
 
+_most_cpus: int | None = None
+
+
+def use_cpus(count: int) -> None:
+    """Have this process use no more CPUs, as one of several that share a machine."""
+    global _most_cpus
+    _most_cpus = count
+
+
 def available_cpus() -> int:
     """CPUs that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return count if _most_cpus is None else min(count, _most_cpus)
 
 
 class Workers:

@@ -1,0 +1,88 @@
+"""A sweep on the disk: what it is to do, and what is done; every file appears whole or not at all.
+
+A sweep's folder holds
+
+- ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Plan`: its runs with all their settings;
+- ``runs/<configuration>/seed_<k>/``, folders as ``train`` leaves them;
+- ``records/<configuration>/seed_<k>.json``, a :class:`~sb3_quad.sweep.records.RunRecord` of each run that ended;
+- ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was measured.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import yaml
+from pydantic import Field
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import read_text, write_text
+from sb3_quad.base.validate import Frozen, Model, validate
+from sb3_quad.scenarios.scenario import Suite
+from sb3_quad.sweep.expand import Run
+from sb3_quad.sweep.records import RunRecord
+from sb3_quad.sweep.spec import SweepSpec
+
+
+class Plan(Frozen):
+    """A sweep with all that files say of it, so that it can go on when they have changed."""
+
+    spec: SweepSpec
+    runs: tuple[Run, ...] = Field(min_length=1)
+    suite: Suite | None = None
+
+    @property
+    def configurations(self) -> list[str]:
+        """Their names, in order."""
+        return [*dict.fromkeys(run.configuration for run in self.runs)]
+
+
+class SweepFolder:
+    """The files of a sweep.
+
+    :param path: the folder.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.plan = self.path / "plan.json"
+
+    def write(self, plan: Plan) -> None:
+        """Write what the sweep is to do."""
+        spec = plan.spec.model_dump(mode="json", exclude_defaults=True)
+        write_text(self.path / "sweep.yaml", yaml.safe_dump(spec, sort_keys=False))
+        write_text(self.plan, plan.model_dump_json(indent=1) + "\n")
+
+    def read(self) -> Plan:
+        """What the sweep is to do.
+
+        :raises ConfigError: a folder that holds no sweep, or a damaged file.
+        """
+        if not self.path.is_dir():
+            raise ConfigError(f"sweep folder {self.path}: no such folder")
+        if not self.plan.is_file():
+            raise ConfigError(f"sweep folder {self.path}: holds no sweep (plan.json is missing)")
+        return _read(self.plan, Plan)
+
+    def run(self, run: Run) -> Path:
+        """The folder of a run, absolute: what is written in it names files that are looked for from anywhere."""
+        return self.path.absolute() / "runs" / run.name
+
+    def add(self, record: RunRecord) -> None:
+        """Keep the record of a run that ended."""
+        write_text(self._record(record.name), record.model_dump_json() + "\n")
+
+    def records(self, runs: Sequence[Run]) -> dict[str, RunRecord]:
+        """The records of those runs that ended, by name."""
+        return {run.name: _read(self._record(run.name), RunRecord) for run in runs if self._record(run.name).is_file()}
+
+    def _record(self, name: str) -> Path:
+        return self.path / "records" / f"{name}.json"
+
+
+def _read(path: Path, model: type[Model]) -> Model:
+    text = read_text(path)
+    try:
+        return validate(model, json.loads(text), "damaged, or of another version")
+    except ValueError as error:  # no JSON, or no such record
+        raise ConfigError(f"{path}: {error}; remove it, or name another folder") from None

@@ -1,0 +1,173 @@
+"""What a sweep found: ``results.csv``, ``results.json``, and the tables that the terminal and the report show."""
+
+import csv
+import io
+import itertools
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from sb3_quad import __version__
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.files import write_text
+from sb3_quad.evaluation.tables import Cell, Column, Row, Table
+from sb3_quad.sweep.aggregates import aggregates
+from sb3_quad.sweep.folder import Plan, SweepFolder
+from sb3_quad.sweep.records import ERROR, MEASURES, REWARD, SUCCESS, SURVIVAL, TIME, RunRecord
+from sb3_quad.sweep.statistics import Comparison, Interval, compare, over_seeds
+
+CSV, JSON = "results.csv", "results.json"
+ROWS = {  # by measure: its row, factor and decimals
+    SUCCESS: (Row("success", "%"), 100.0, 2),
+    SURVIVAL: (Row("survival", "%"), 100.0, 2),
+    REWARD: (Row("mean reward"), 1.0, 2),
+    ERROR: (Row("final error, median", "m"), 1.0, 3),
+    TIME: (Row("mean time until there, or stable", "s"), 1.0, 2),
+}
+COMPARED = (SUCCESS, REWARD)
+CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
+MOST_COMPARED = 8  # configurations of which every pair is compared
+
+Records = Mapping[str, RunRecord]
+
+
+def finished(plan: Plan, records: Records) -> dict[str, list[RunRecord]]:
+    """The finished runs of each configuration that has any, by seed."""
+    groups = {name: [] for name in plan.configurations}  # type: dict[str, list[RunRecord]]
+    for run in plan.runs:
+        record = records.get(run.name)
+        if record is not None and record.state == "finished":
+            groups[run.configuration].append(record)
+    return {name: group for name, group in groups.items() if group}
+
+
+def write_results(place: SweepFolder, plan: Plan, records: Records) -> None:
+    """Write ``results.csv``, a line for each run and scenario, and ``results.json``.
+
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    text, rows = io.StringIO(), [row for run in plan.runs if run.name in records for row in _rows(records[run.name])]
+    columns = ["run", "configuration", "seed", "state", "scenario", "episodes", *MEASURES, "timesteps", "agent", "weights"]
+    writer = csv.DictWriter(text, [*columns, "message"], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(place.path / CSV, text.getvalue())
+    groups = finished(plan, records)
+    content = {
+        "sweep": plan.spec.name,
+        "package_version": __version__,
+        "runs": len(plan.runs),
+        "finished": sum(len(group) for group in groups.values()),
+        "failed": {name: record.message for name, record in records.items() if record.state == "failed"},
+        "configurations": {
+            name: {"seeds": [record.seed for record in group], "scenarios": _summary(group)} for name, group in groups.items()
+        },
+        "comparisons": [
+            {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": found.verdict}
+            | found.difference._asdict()
+            for (scenario, measure, first, second), found in comparisons(groups).items()
+        ],
+        "aggregates": aggregates(groups),
+    }
+    write_text(place.path / JSON, json.dumps(content, indent=1) + "\n")
+
+
+def tables(plan: Plan, records: Records) -> dict[str, list[Table]]:
+    """By scenario, a column for each configuration; and who is better than whom."""
+    groups = finished(plan, records)
+    pairs = comparisons(groups)
+    found: dict[str, list[Table]] = {}
+    for scenario in scenarios_of(groups):
+        rows = []
+        for measure, (row, factor, decimals) in ROWS.items():
+            cells = [_cell(_of(group, scenario, measure), factor, decimals) for group in groups.values()]
+            if any(cell != Cell() for cell in cells):
+                rows.append(Row(row.name, row.unit, cells))
+        columns = [Column(f"{name} ({_count(group)})") for name, group in groups.items()]
+        found[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
+        lines = [
+            Row(f"{first} than {second}", ROWS[measure][0].heading, [Cell(words=pair.verdict), _difference(pair, measure)])
+            for (where, measure, first, second), pair in pairs.items()
+            if where == scenario
+        ]
+        if lines:
+            heads = [Column("is", align="left"), Column("difference")]
+            note = "paired bootstrap over the seeds and episodes that both have"
+            found[scenario].append(Table(heads, lines, title=f"{scenario}: better, worse, cannot tell", caption=note))
+    return found
+
+
+def comparisons(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Comparison]:
+    """By scenario, measure and pair of configurations; of very many configurations, each against the first alone."""
+    names = list(groups)
+    pairs = list(itertools.combinations(names, 2))
+    if len(names) > MOST_COMPARED:
+        pairs = [(names[0], name) for name in names[1:]]
+    found = {}
+    for scenario, measure, (first, second) in itertools.product(scenarios_of(groups), COMPARED, pairs):
+        one, two = ({record.seed: record for record in groups[name]} for name in (first, second))
+        common = [seed for seed in one if seed in two]
+        values = [matrix([each[seed] for seed in common], scenario, measure) for each in (one, two)]
+        if common and all(each is not None and np.isfinite(each).all() for each in values):
+            found[scenario, measure, first, second] = compare(*values)  # type: ignore[arg-type]
+    return found
+
+
+def scenarios_of(groups: Mapping[str, Sequence[RunRecord]]) -> list[str]:
+    """All scenarios that were flown, in order."""
+    return [*dict.fromkeys(name for group in groups.values() for record in group for name in record.flights)]
+
+
+def matrix(records: Sequence[RunRecord], scenario: str, measure: str) -> FloatArray | None:
+    """A measure of some runs, (runs, episodes), NaN where there is no number; None: it was not measured."""
+    rows = [record.flights.get(scenario, {}).get(measure) for record in records]
+    if any(row is None for row in rows) or len({len(row or ()) for row in rows}) != 1:
+        return None
+    return np.array(rows, dtype=np.float64)
+
+
+def _of(group: Sequence[RunRecord], scenario: str, measure: str) -> Interval | None:
+    values = matrix(group, scenario, measure)
+    return None if values is None else over_seeds(values, measure)
+
+
+def _summary(group: Sequence[RunRecord]) -> dict[str, Any]:
+    names = scenarios_of({"": group})
+    found = {name: {measure: _of(group, name, measure) for measure in MEASURES} for name in names}
+    return {
+        name: {measure: None if value is None else value._asdict() for measure, value in measures.items()}
+        for name, measures in found.items()
+    }
+
+
+def _rows(record: RunRecord) -> list[dict[str, Any]]:
+    common = record.model_dump(include={"configuration", "seed", "state", "timesteps", "agent", "weights", "message"})
+    common["run"] = record.name
+    if not record.flights:
+        return [common]
+    lines = []
+    for scenario, measures in record.flights.items():
+        line = {**common, "scenario": scenario, "episodes": len(next(iter(measures.values())))}
+        for measure in measures:
+            values = matrix([record], scenario, measure)
+            if values is not None and np.isfinite(values).any():
+                line[measure] = f"{np.nanmedian(values) if measure == ERROR else np.nanmean(values):.9g}"
+        lines.append(line)
+    return lines
+
+
+def _cell(interval: Interval | None, factor: float, decimals: int) -> Cell:
+    if interval is None:
+        return Cell()
+    return Cell(factor * interval.value, (factor * interval.low, factor * interval.high), decimals)
+
+
+def _difference(pair: Comparison, measure: str) -> Cell:
+    _, factor, decimals = ROWS[measure]
+    return _cell(pair.difference, factor, decimals)
+
+
+def _count(group: Sequence[RunRecord]) -> str:
+    return f"{len(group)} seed" + ("s" if len(group) > 1 else "")

@@ -1,0 +1,99 @@
+"""What a sweep trains: settings that all runs share, a grid or a list of those that differ, and the seeds.
+
+The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted where they lie deeper, to
+lists of values, of which every combination is a configuration; ``configurations`` lists some one by one::
+
+    algo: dagger
+    env: QuadStateRecovery-v0
+    seed: [0, 1, 2]
+    grid:
+      hyperparams.learning_rate: [1e-3, 5e-3]
+      env_kwargs.noise: [0, 0.05]
+"""
+
+from pathlib import Path
+from typing import Annotated, Any, TypeAlias
+
+from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, PositiveInt
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import check_seed
+from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.settings.literals import parse_number
+from sb3_quad.settings.values import as_list
+
+SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
+MAX_RUNS = 10_000
+Whole: TypeAlias = Annotated[int, BeforeValidator(parse_number)]
+
+
+class Configuration(Frozen):
+    """What one training is given, less its seed; what is left out is as for ``train``."""
+
+    name: str | None = Field(default=None, min_length=1, description="in tables and folders; made of what differs without it")
+    algo: str | None = Field(default=None, description="algorithm of a single run")
+    env: str | None = Field(default=None, description="environment id of a single run")
+    conf_file: str | None = Field(default=None, description="settings file, of a single run or of a pipeline")
+    n_timesteps: Whole | None = Field(default=None, description="timesteps")
+    n_envs: Whole | None = Field(default=None, description="environments side by side")
+    vec_env: str | None = Field(default=None, description="batch, dummy or subproc")
+    expert: str | None = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory")
+    hyperparams: dict[str, Any] = Field(default={}, description="settings to change, such as n_steps: 500")
+    env_kwargs: dict[str, Any] = Field(default={}, description="keywords of the environment")
+    eval_env_kwargs: dict[str, Any] | None = Field(default=None, description="the same, for evaluations only")
+    vehicle: str | None = Field(default=None, description="env_kwargs' vehicle, by name or YAML file")
+    trained_agent: str | None = Field(default=None, description="agent to start from")
+    eval_freq: Whole | None = Field(default=None, description="timesteps between evaluations along the way")
+    eval_episodes: Whole | None = Field(default=None, description="episodes of each")
+    n_eval_envs: Whole | None = Field(default=None, description="environments of an evaluation along the way")
+    save_freq: Whole | None = Field(default=None, description="timesteps between checkpoints")
+    snapshot_every: NonNegativeFloat | None = Field(default=None, description="seconds between snapshots")
+    device: str | None = Field(default=None, description="cpu, cuda or auto")
+
+
+class Resources(Frozen):
+    """What a run takes, for Ray to place it."""
+
+    num_cpus: NonNegativeFloat = Field(default=1, description="cores")
+    num_gpus: NonNegativeFloat = Field(default=0, description="GPUs")
+
+
+class Evaluation(Frozen):
+    """The fresh episodes on which all agents are compared."""
+
+    suite: str | None = Field(default=None, description="name or YAML file; without it, fresh episodes of both tasks")
+    scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = Field(default=(), description="only these of the suite")
+    episodes: PositiveInt | None = Field(default=None, description="of each scenario; without a suite 240")
+    seed: Annotated[int, AfterValidator(check_seed)] | None = Field(default=None, description="of the episodes")
+
+
+class SweepSpec(Configuration):
+    """A sweep."""
+
+    seed: Annotated[tuple[Annotated[int, AfterValidator(check_seed)], ...], BeforeValidator(as_list)] = Field(
+        default=(0,), min_length=1, description="one or a list"
+    )
+    grid: dict[str, Any] = Field(default={}, description="keys, each with a list of values")
+    configurations: tuple[dict[str, Any], ...] = Field(default=(), description="a list of keys and values each")
+    evaluation: Evaluation = Field(default=Evaluation(), description="what the agents fly in the end")
+    resources: Resources = Field(default=Resources(), description="what a run takes")
+    storage: str | None = Field(default=None, description="folder or URL through which run folders travel from Ray's workers")
+    gym_packages: tuple[str, ...] = Field(default=(), description="modules that register further environments")
+
+    @property
+    def shared(self) -> dict[str, Any]:
+        """The keys that all configurations share."""
+        return self.model_dump(include={*Configuration.model_fields} - {"name"}, exclude_defaults=True)
+
+
+def load_sweep(source: str | Path) -> SweepSpec:
+    """The sweep in a YAML file, by path or by the name of one in the package.
+
+    :raises ConfigError: an unreadable file, or a key that is unknown or does not fit.
+    """
+    data, where = SWEEPS.read(source)
+    spec = validate(SweepSpec, data, where)
+    if len(set(spec.seed)) < len(spec.seed):
+        raise ConfigError(f"{where}: seed: one is there twice")
+    return spec if spec.name else spec.model_copy(update={"name": Path(str(source)).stem})

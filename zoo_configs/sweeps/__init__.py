@@ -1,0 +1,1 @@
+"""Sweeps, by which tables of docs/results.md are made."""
