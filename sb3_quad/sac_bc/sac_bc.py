@@ -37,7 +37,7 @@ class SACBC(SAC):
     ==================  ===============================================================================================
     ``expert_fraction``  a share of each mini-batch from the expert's own flights: RLPD, https://arxiv.org/abs/2302.02948
     ``bc_coef``          a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089; weighed by
-                         the mean \\|Q\\| as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every state
+                         the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every state
                          that is visited, as in DAgger, not its own flights alone
     ``bc_filter="q"``    only where the critic prefers the expert's action: the Q filter of Nair et al.
     ``expert_proposal``  the expert's action and the agent's are both proposed, and the one of greater Q is flown, and
@@ -51,7 +51,8 @@ class SACBC(SAC):
         learnt meanwhile. They are kept in a buffer of their own, ``expert_buffer``. Random actions follow only if
         ``learning_starts`` is more than that.
     :param expert_fraction: the share of each mini-batch that comes from ``expert_buffer``, 0 to 1 (RLPD: a half).
-    :param bc_coef: weight of the cloning term in units of the mean \\|Q\\|: a float or a schedule of the remaining progress.
+    :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a schedule of the remaining
+        progress.
     :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear beyond 0.05;
         ``"huber_mse"``, that and three times the squared error. Actions are those of the policy, within -1 and 1.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's action is greater than Q of the
@@ -112,8 +113,8 @@ class SACBC(SAC):
         self.bc_coef = FloatSchedule(self.bc_coef)
         if self.will_clone() and isinstance(self.observation_space, spaces.Dict):
             raise ConfigError(
-                f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the environment "
-                "in gymnasium.wrappers.FlattenObservation"
+                f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the "
+                "environment in gymnasium.wrappers.FlattenObservation"
             )
         super()._setup_model()
         # A row of actions holds the one flown; the expert's, if it is cloned; the expert's for the next state, if it proposes.

@@ -5,18 +5,22 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.memory import check_unpacked
 from sb3_quad.experts.controller import Controller
+from sb3_quad.experts.models import load_model
 
 
-def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
-    """Give ``model`` the policy and critic of an SB3 zip, of any on-policy algorithm with the same spaces and networks.
+def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
+    """Give ``model`` the policy and critic of an SB3 zip, of any algorithm with the same spaces and networks.
+
+    An off-policy ``model`` also takes an agent with other networks, such as DAgger's: its actor is made to imitate that, by
+    :func:`clone_policy`, and its critic stays new. ``model`` then needs its environment.
 
     ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that holds. The optimiser
     stays as it is, so a new model starts with a fresh one.
@@ -34,6 +38,9 @@ def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
         raise ConfigError(f"{path}: no such file") from None
     except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
+    if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
+        clone_policy(load_model(path), model, seed=model.seed or 0)
+        return
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{path}: holds parameters that are not finite")
     for layer in sorted({**ours, **theirs}, key=lambda name: name == "log_std"):  # the network's own layers say more
@@ -52,7 +59,8 @@ def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
 hand_over = transfer_policy  # its name in version 0.1
 
 
-CLONE_ROWS = 250_000  # states that are flown for a clone, at most
+CLONE_ROWS = 20_000  # states that are flown for a clone, at least
+CLONE_FLIGHT = 500  # steps of each environment, at least
 CLONE_STEPS = 2_500  # of Adam
 CLONE_BATCH = 1024
 CLONE_RATE = 2e-3  # falls to a hundredth
@@ -74,7 +82,7 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     env, policy, actor = model.get_env(), model.policy, model.actor  # type: ignore[attr-defined]
     assert env is not None
     n, labeller, rng = env.num_envs, Controller.for_env(teacher, env), np.random.default_rng(seed)
-    steps = max(CLONE_ROWS // n, 1)
+    steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     seen: list[Any] = []
     said: list[Any] = []
