@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium
+import numpy as np
 from pydantic import (
     BeforeValidator,
     Field,
@@ -181,6 +182,10 @@ class TrainingConfig(Frozen):
             raise ConfigError(f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made")
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
+        if self.is_off_policy and self.n_envs > 1 and "episode" in np.ravel(self.keyword("train_freq")):
+            raise ConfigError(
+                f"train_freq: {self.keyword('train_freq')} counts episodes, which only n_envs 1 can do; give steps"
+            )
         if self.noise_type is not None and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
         if not takes_expert(get_algorithm(self.algo)):

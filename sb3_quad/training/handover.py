@@ -9,7 +9,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.memory import check_unpacked
 from sb3_quad.experts.controller import Controller
@@ -39,7 +39,10 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
     except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
     if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
-        clone_policy(load_model(path), model, seed=model.seed or 0)
+        try:
+            clone_policy(load_model(path), model, seed=model.seed or 0)
+        except ExpertError as error:  # other spaces
+            raise ConfigError(f"{path}: {error}") from None
         return
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{path}: holds parameters that are not finite")

@@ -57,6 +57,8 @@ class SnapshotFile(LastGoodModel):
             self.snapshot.state["best_model"] = np.fromfile(self._run.best_model, dtype=np.uint8)
         if hasattr(self.model, "dataset"):
             self.snapshot.state[f"{DATASET}added"] = np.array(self.model.dataset.added)
+        for name, buffer in _replay_buffers(self.model).items():
+            self.snapshot.state.update({f"{name}.pos": np.array(buffer.pos), f"{name}.full": np.array(buffer.full)})
         due = self._written + max(self._every, self._took / SHARE)
         if self._every > 0 and self._rollout_start + (self._rollout_start - start) >= due:  # the next one would be too late
             try:
@@ -133,7 +135,7 @@ def _replay_buffers(model: Any) -> dict[str, ReplayBuffer]:
 
 
 def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
-    """What a replay buffer holds, as :func:`restore_buffer` takes it; the arrays are views.
+    """What a replay buffer holds, as :func:`restore_buffer` takes it beside its ``pos`` and ``full``; the arrays are views.
 
     :raises ConfigError: observations that are a Dict.
     """
@@ -141,12 +143,12 @@ def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
     arrays = {name: getattr(buffer, name, None) for name in BUFFER_ARRAYS}
     if isinstance(arrays["observations"], dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
-    kept = {name: array[: min(rows + 1, len(array))] for name, array in arrays.items() if array is not None}
-    return {"pos": np.array(buffer.pos), "full": np.array(buffer.full), **kept}  # one row more: the memory-efficient variant's
+    rows += 1  # the memory-efficient variant's last observation
+    return {name: array[: min(rows, len(array))] for name, array in arrays.items() if array is not None}
 
 
 def restore_buffer(buffer: ReplayBuffer, arrays: Arrays, path: str | Path) -> None:
-    """Go back to :func:`buffer_arrays`.
+    """Go back to :func:`buffer_arrays`, ``pos`` and ``full``.
 
     :param path: the file that they come from, for the message.
     :raises ConfigError: they do not fit.
