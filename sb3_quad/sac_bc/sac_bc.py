@@ -140,6 +140,11 @@ class SACBC(SAC):
         """Whether the training is still in its first ``expert_timesteps``."""
         return self.expert_buffer is not None and not self.expert_buffer.full
 
+    @property
+    def policy_is_idle(self) -> bool:
+        """Whether the policy is still the one that it began with, since only the critic has learnt (``critic_warmup``)."""
+        return 0 < self.critic_warmup >= self._n_updates
+
     def will_clone(self) -> bool:
         """Whether the expert is needed at all, for whichever of the additions."""
         return self._clones or self.expert_proposal or self.expert_timesteps > 0

@@ -5,9 +5,8 @@ resumed run is bit for bit the one that was not interrupted; elsewhere episodes 
 """
 
 import copy
-import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,6 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, one_line, save_model, write_bytes
-from sb3_quad.base.memory import check_memory
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
@@ -40,12 +38,11 @@ from sb3_quad.settings.values import instance
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.needs import check_buffer, check_networks
 from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
 
-ROLLOUT_COLUMNS = 6  # of a rollout buffer, float32 each, beside observations and actions
-REPLAY_COLUMNS = 3  # of a replay buffer, likewise
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
@@ -177,7 +174,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
-    _check_buffer(config, env)
+    check_buffer(config, env)
     keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
     if config.noise_type is not None:
         zeros = np.zeros(env.action_space.shape or ())
@@ -186,8 +183,7 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
     try:
-        weights = _weights(config.policy_kwargs.get("net_arch"), env)
-        check_memory("policy_kwargs: net_arch", 16.0 * weights)  # each with its gradient and two numbers of Adam's
+        check_networks(config, env)
         model = get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
@@ -204,29 +200,6 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         transfer_policy(job.trained_agent, model)
     env.seed(seed_for("training", job.seed))  # SB3 has seeded it with the seed of the policy
     return model
-
-
-def _check_buffer(config: TrainingConfig, env: VecEnv) -> None:
-    """:raises ConfigError: a rollout buffer, or a replay buffer, for which this machine has too little memory."""
-    seen, done = (int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space))
-    if config.is_off_policy:
-        size = config.keyword("buffer_size")
-        check_memory(f"buffer_size {size:,}", 4.0 * (2 * seen + done + REPLAY_COLUMNS) * size)
-        return
-    n_steps = config.rollout_steps
-    what = f"n_steps {n_steps:,} by n_envs {env.num_envs:,}"
-    check_memory(what, 4.0 * (seen + done + ROLLOUT_COLUMNS) * n_steps * env.num_envs)
-
-
-def _weights(net_arch: Any, env: VecEnv) -> float:
-    """About how many weights the hidden layers of actor and critics have."""
-    both = (
-        [net_arch.get(part, []) for part in ("pi", "vf", "qf", "qf")]
-        if isinstance(net_arch, Mapping)
-        else [net_arch or []] * 2
-    )
-    inputs = float(np.prod(env.observation_space.shape or (1,)))
-    return float(sum(before * after for layers in both for before, after in itertools.pairwise([inputs, *layers])))
 
 
 def _learn(
