@@ -98,7 +98,10 @@ def clone(tmp_path_factory):
     env = QuadcopterVecEnv(240, "recovery_and_tracking", seed=0, max_episode_steps=500)
     policy_kwargs = {"net_arch": {"pi": [64, 64], "qf": [8]}, "activation_fn": th.nn.Tanh}
     model = SAC("MlpPolicy", env, policy_kwargs=policy_kwargs, buffer_size=240, seed=0, device="cpu")
-    transfer_policy(pretrained("itm-recovery"), model)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(handover, "CLONE_STEPS", 1000)
+        patch.setattr(handover, "CLONE_BATCH", 512)
+        transfer_policy(pretrained("itm-recovery"), model)
     path = tmp_path_factory.mktemp("clone") / "sac.zip"
     FlightSettings().write_into(model)
     model.save(path)

@@ -214,8 +214,8 @@ class SACBC(SAC):
         n_expert = round(batch_size * self.expert_fraction)
         parts = [(self.replay_buffer, batch_size - n_expert), (self.expert_buffer, n_expert)]
         drawn = [buffer.sample(n, env=self._vec_normalize_env) for buffer, n in parts if buffer is not None and n > 0]
-        columns = zip(*drawn, strict=True)
-        data = drawn[0] if len(drawn) == 1 else ReplayBufferSamples(*(None if c[0] is None else th.cat(c) for c in columns))
+        joined: list[Any] = [None if column[0] is None else th.cat(column) for column in zip(*drawn, strict=True)]
+        data = drawn[0] if len(drawn) == 1 else ReplayBufferSamples(*joined)
         actions, *labels = data.actions.chunk(1 + self._clones + self.expert_proposal, dim=1)
         following = labels.pop() if self.expert_proposal else None
         return data._replace(actions=actions), labels.pop() if labels else None, following
@@ -255,6 +255,7 @@ class SACBC(SAC):
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                 # The coefficient of this step is that from before its update.
                 ent_coef = th.exp(self.log_ent_coef.detach())
+                assert isinstance(self.target_entropy, float)
                 ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
                 monitor(ent_coef_loss=ent_coef_loss)
                 if not warming_up:
@@ -294,7 +295,8 @@ class SACBC(SAC):
                     actor_loss = actor_loss + bc_coef * q_pi.detach().abs().mean() * bc_loss
                     monitor(bc_loss=bc_loss, bc_share=cloned)
                 self.actor.optimizer.zero_grad()
-                actor_loss.backward(inputs=[*self.actor.parameters()])  # + the critic needs no gradient of this loss
+                own = [*self.actor.parameters()]
+                actor_loss.backward(inputs=own)  # type: ignore[no-untyped-call]  # + the critic needs no gradient of this loss
                 self.actor.optimizer.step()
 
             if gradient_step % self.target_update_interval == 0:

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium
-import numpy as np
 from pydantic import (
     BeforeValidator,
     Field,
@@ -182,7 +181,7 @@ class TrainingConfig(Frozen):
             raise ConfigError(f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made")
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
-        if self.is_off_policy and self.n_envs > 1 and "episode" in np.ravel(self.keyword("train_freq")):
+        if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
             raise ConfigError(
                 f"train_freq: {self.keyword('train_freq')} counts episodes, which only n_envs 1 can do; give steps"
             )

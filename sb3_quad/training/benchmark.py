@@ -99,7 +99,7 @@ def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[
         raise ConfigError(f"{config.algo}: only loops of on-policy algorithms are measured, in rollouts and updates")
     with closing(make_environments(config, config.n_envs, 0)) as env:
         model, clock = build_model(TrainingJob(config=config), env), _Clock()
-        steps = model.n_steps * config.n_envs
+        steps = config.rollout_steps * config.n_envs
         with clock.parts_of(model):
             model.learn(steps * (rollouts + 1), callback=clock)
     rollout, update = np.diff(clock.times).reshape(-1, 2)[1:].T

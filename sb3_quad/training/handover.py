@@ -1,7 +1,7 @@
 """Starting from a trained agent: its policy and critic, in a new algorithm with a fresh optimiser."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch as th
@@ -82,7 +82,7 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     :param teacher: what :class:`~sb3_quad.experts.controller.Controller` takes.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
     """
-    env, policy, actor = model.get_env(), model.policy, model.actor  # type: ignore[attr-defined]
+    env, policy, actor = model.get_env(), model.policy, cast(Any, model.actor)
     assert env is not None
     n, labeller, rng = env.num_envs, Controller.for_env(teacher, env), np.random.default_rng(seed)
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
@@ -91,14 +91,15 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     said: list[Any] = []
     errors = []
     observation: Any = env.reset()
+    begins = np.ones(n, dtype=np.bool_)
     rounds, done = 10, 0
     for flown in range(steps):
-        labels = labeller.labels(observation)
+        labels = labeller.labels(observation, begins)
         seen.append(observation)
         said.append(policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1))  # type: ignore[misc]
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where((np.arange(n) % 2 == 0)[:, None], labels, own.reshape(n, -1)).reshape(own.shape)
-        observation, _, _, _ = env.step(actions)
+        observation, _, begins, _ = env.step(actions)
         if (flown + 1) * rounds // steps > flown * rounds // steps:  # one of ten rounds is over
             states, targets = (th.as_tensor(np.concatenate(part), device=model.device) for part in (seen, said))
             for _ in range(CLONE_STEPS // rounds):
@@ -111,6 +112,8 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
                 optimiser.step()
                 errors.append(loss.item())
                 done += 1
+    if hasattr(policy, "actor_target"):  # TD3's
+        cast(Any, policy).actor_target.load_state_dict(actor.state_dict())
     if isinstance(getattr(actor, "log_std", None), th.nn.Linear):
         with th.no_grad():
             actor.log_std.weight.zero_()
