@@ -102,6 +102,7 @@ class SACBC(SAC):
         self.bc_filter = bc_filter
         self.expert_proposal = expert_proposal
         self.critic_warmup = critic_warmup
+        self._clones = False
         self.expert_buffer: ReplayBuffer | None = None
         self._labeller: Controller | None = None  # the expert, with what it remembers
         self._labels: Float32Array | None = None  # (n_envs, action_dim): its scaled actions for the present states
@@ -111,6 +112,8 @@ class SACBC(SAC):
 
     def _setup_model(self) -> None:
         self.bc_coef = FloatSchedule(self.bc_coef)
+        # Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell.
+        self._clones = any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())
         if self.will_clone() and isinstance(self.observation_space, spaces.Dict):
             raise ConfigError(
                 f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the "
@@ -130,10 +133,6 @@ class SACBC(SAC):
                 _widen(self.expert_buffer, width)
         if self.expert is not None and self.will_clone():
             self._check_expert()
-
-    @property
-    def _clones(self) -> bool:
-        return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())  # type: ignore[operator]
 
     @property
     def expert_flies(self) -> bool:
