@@ -152,8 +152,8 @@ def test_while_the_critic_warms_up_the_actor_stands_still():
     assert not th.equal(actor, parameters(model.actor))
 
 
-def test_saved_and_resumed_with_its_buffers_it_learns_what_it_would_have(tmp_path):
-    """In memory; of a run, tests/test_value_based_runs.py."""
+def test_a_loaded_agent_is_the_same_and_needs_its_expert_to_go_on(tmp_path):
+    """A run that goes on with its buffers: tests/test_value_based.py."""
     straight = pendulum(**ALL).learn(320)
     straight.save(tmp_path / "agent.zip")
     loaded = SACBC.load(tmp_path / "agent.zip", device="cpu", expert=swing_up, env=straight.get_env())
@@ -255,8 +255,8 @@ def test_an_actor_takes_over_what_an_on_policy_zip_flies(tmp_path, monkeypatch, 
 
 
 def test_it_learns_pendulum_from_its_expert_in_seconds():
-    settings = {**ALL, "bc_coef": 5.0, "bc_loss": "huber", "expert_timesteps": 1600, "learning_rate": 3e-3, "batch_size": 128}
+    settings = {**ALL, "bc_coef": 5.0, "expert_timesteps": 1600, "learning_rate": 3e-3, "batch_size": 128}
     settings |= {"gradient_steps": 16, "train_freq": 8, "policy_kwargs": {"net_arch": [64, 64]}, "ent_coef": 0.01}
-    model = pendulum(8, **settings).learn(4000)
+    model = pendulum(8, **settings).learn(8000)
     agent, new = (evaluate_policy(each, make_vec_env("Pendulum-v1", 16, seed=1), 16)[0] for each in (model, pendulum()))
-    assert agent > -600 and new < -900
+    assert agent > -300 and new < -900  # the expert has about -150

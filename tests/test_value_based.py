@@ -117,7 +117,7 @@ def test_an_agent_is_handed_over_to_sac_and_flies(clone):
 def test_its_offset_is_trimmed(clone):
     model = load_model(clone)
     with th.no_grad():
-        model.actor.latent_pi[0].bias -= 0.2 * model.actor.latent_pi[0].weight[:, 0]  # sees itself where it is not
+        model.actor.latent_pi[0].bias -= 0.3 * model.actor.latent_pi[0].weight[:, 0]  # sees itself where it is not
     before = np.linalg.norm(hover_offset(model))
     assert trim(model).after < 0.1 * before > 0.1
 
@@ -125,7 +125,7 @@ def test_its_offset_is_trimmed(clone):
 def test_its_export_flies_where_it_flies(clone, tmp_path):
     """In closed loop: the file's thrusts lead to the same ends."""
     assert main(["export", str(clone), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 0
-    module, settings = th.jit.load(tmp_path / "agent.pt"), FlightSettings()
+    module = th.jit.load(tmp_path / "agent.pt")
     env = QuadcopterVecEnv(1)
     low, high = env.vehicle.thrust_range
     mean, std = env.batch.mean[:, 0], env.batch.std[:, 0]
@@ -134,8 +134,8 @@ def test_its_export_flies_where_it_flies(clone, tmp_path):
         thrusts = module(th.as_tensor(observation * std + mean, dtype=th.float32)).numpy()
         return (2.0 * thrusts - high - low) / (high - low)
 
-    own, theirs = (fly(each, "recovery_and_tracking", 48, 9, noise=0.0) for each in (load_model(clone), exported))
-    assert own.survival.mean() > 0.9 and (own.survival == theirs.survival).mean() > 0.95 and settings.task
+    own, theirs = (fly(each, "state_recovery", 48, 9, noise=0.0) for each in (load_model(clone), exported))
+    assert own.survival.mean() > 0.9 and (own.survival == theirs.survival).mean() > 0.95
     both = own.survival & theirs.survival
     np.testing.assert_allclose(own.final_error[both], theirs.final_error[both], atol=0.01)
 
