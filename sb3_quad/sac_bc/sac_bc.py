@@ -58,8 +58,8 @@ class SACBC(SAC):
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's action is greater than Q of the
         policy's mean action; ``"agreement"``, where both differ by less than 0.3, as of :class:`PPOBC`.
     :param expert_proposal: whether the expert's action is proposed beside the agent's. Needs ``n_steps=1``.
-    :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that comes from imitation is not
-        moved by a critic that has learnt nothing yet.
+    :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that comes from imitation is
+        not moved by a critic that has learnt nothing yet.
     :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite.
