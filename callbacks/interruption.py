@@ -1,12 +1,15 @@
 """Trainings that end before their time: neither a signal nor a diverging loss costs the model."""
 
 import random
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import TrainingError
@@ -15,6 +18,7 @@ from sb3_quad.base.signals import StopSignals
 
 ENVIRONMENT = "environment."  # before the names of the environments' arrays
 MEMORY = "memory."  # before those of what the algorithm remembers beside its zip
+PAUSE = 1.0  # s between two snapshots of an off-policy algorithm
 
 
 class StopOnSignal(BaseCallback):
@@ -80,7 +84,7 @@ class Snapshot(NamedTuple):
 
 
 class LastGoodModel(BaseCallback):
-    """Takes a :class:`Snapshot` whenever a rollout starts.
+    """Takes a :class:`Snapshot` whenever a rollout starts; of an off-policy algorithm, whose rollouts are short, one a second.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
@@ -91,12 +95,27 @@ class LastGoodModel(BaseCallback):
     >>> last_good.snapshot.timesteps, PPO.load(io.BytesIO(last_good.snapshot.model), device="cpu").num_timesteps
     (800, 800)
 
+    :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from before that update.
     """
 
     snapshot: Snapshot | None = None
+    _seconds = -np.inf  # when it was taken
+
+    def __init__(self, hurry: Callable[[], bool] = lambda: False) -> None:
+        super().__init__()
+        self._hurry = hurry
+
+    @property
+    def is_fresh(self) -> bool:
+        """Whether the rollout under way is in its first step after the snapshot, so that no buffer holds more than it."""
+        after = self.num_timesteps - self.training_env.num_envs
+        return not isinstance(self.model, OffPolicyAlgorithm) or self.snapshot is None or self.snapshot.timesteps == after
 
     def _on_rollout_start(self) -> None:
+        if isinstance(self.model, OffPolicyAlgorithm) and time.monotonic() < self._seconds + PAUSE and not self._hurry():
+            return
+        self._seconds = time.monotonic()
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
                 raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")

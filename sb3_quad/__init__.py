@@ -1,4 +1,4 @@
-"""Quadcopter environments, experts, DAgger and PPO with behavioural cloning for Stable-Baselines3."""
+"""Quadcopter environments, experts, DAgger, and PPO and SAC with behavioural cloning for Stable-Baselines3."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from sb3_quad.experts.pid import PIDExpert
     from sb3_quad.ppo_bc.ppo_bc import PPOBC
     from sb3_quad.pretrained_policies import load_pretrained, pretrained
+    from sb3_quad.sac_bc.sac_bc import SACBC
     from sb3_quad.settings.flight import env_kwargs
     from sb3_quad.simulation.designs import sample_vehicles
 
 __version__ = "0.1.0"
 __all__ = [  # less RecurrentDAgger, which needs an extra
     "PPOBC",
+    "SACBC",
     "DAgger",
     "GeometricExpert",
     "PIDExpert",
@@ -41,6 +43,7 @@ _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do no
     "PIDExpert": "sb3_quad.experts.pid",
     "PPOBC": "sb3_quad.ppo_bc.ppo_bc",
     "RecurrentDAgger": "sb3_quad.dagger.recurrent",
+    "SACBC": "sb3_quad.sac_bc.sac_bc",
     "env_kwargs": "sb3_quad.settings.flight",
     "load_pretrained": "sb3_quad.pretrained_policies",
     "pretrained": "sb3_quad.pretrained_policies",

@@ -1,4 +1,4 @@
-"""What DAgger and PPO with behavioural cloning share: the terms of Eqs. 4.3 and 4.4, and forward passes.
+"""What DAgger, PPO and SAC with behavioural cloning share: the terms of Eqs. 4.3 and 4.4, and forward passes.
 
 Every function takes and gives tensors; ``b`` is the mini-batch, ``a`` the action dimension. The forward passes leave out what
 a training step does not need, and agree with the policy's own methods to rounding.
@@ -22,6 +22,7 @@ CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
 PARTS: tuple[Literal["actor", "critic"], ...] = ("actor", "critic")
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
 MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
+AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
 
 
 def gaussian_nll(mean: th.Tensor, log_std: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -15,7 +15,7 @@ import torch
 from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
-from stable_baselines3 import A2C, PPO, SAC
+from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
@@ -35,6 +35,8 @@ MODELS = {
     "tanh": (PPO, {"net_arch": [16, 12]}),
     "relu": (A2C, {"net_arch": {"pi": [24], "vf": [8]}, "activation_fn": torch.nn.ReLU}),
     "squashed": (A2C, {"net_arch": [], "squash_output": True}),
+    "sac": (SAC, {"net_arch": {"pi": [16, 12], "qf": [8]}, "activation_fn": torch.nn.Tanh}),
+    "td3": (TD3, {"net_arch": [16]}),
 }
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler here")
@@ -42,10 +44,12 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C comp
 
 def untrained(kind, env):
     algorithm, kwargs = MODELS[kind]
-    model = algorithm("MlpPolicy", env, policy_kwargs=kwargs, use_sde=kind == "squashed", seed=1, device="cpu")
+    further = {"use_sde": True} if kind == "squashed" else {"buffer_size": 10} if algorithm in (SAC, TD3) else {}
+    model = algorithm("MlpPolicy", env, policy_kwargs=kwargs, seed=1, device="cpu", **further)
+    last = {"sac": lambda: model.actor.mu, "td3": lambda: model.actor.mu[-2]}.get(kind, lambda: model.policy.action_net)()
     with torch.no_grad():  # SB3 starts near zero, where neither order of rotors nor clipping would show
-        model.policy.action_net.weight *= 80.0
-        model.policy.action_net.bias.copy_(torch.tensor([0.3, -0.2, 0.1, 0.0]))
+        last.weight *= 8.0 if algorithm in (SAC, TD3) else 80.0
+        last.bias.copy_(torch.tensor([0.3, -0.2, 0.1, 0.0]))
     return model
 
 
@@ -347,8 +351,8 @@ SEEN, DONE = spaces.Box(-np.inf, np.inf, (18,), np.float32), spaces.Box(-1.0, 1.
         (lambda: PPO("MlpPolicy", Stub(SEEN, DONE), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu"), "ELU"),
         (lambda: PPO("CnnPolicy", Stub(spaces.Box(0, 255, (36, 36, 3), np.uint8), DONE), device="cpu"), "CnnPolicy"),
         (
-            lambda: SAC("MlpPolicy", Stub(SEEN, DONE), device="cpu", buffer_size=10),
-            "SACPolicy; only MlpPolicy of an on-policy",
+            lambda: SAC("MlpPolicy", Stub(SEEN, DONE), device="cpu", buffer_size=10, use_sde=True),
+            "Hardtanh",
         ),
     ],
 )

@@ -29,6 +29,7 @@ _FAMILIES = {
     "sb3_quad.recurrent.raptor_policy": "RecurrentPPO",
 }
 _OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
+_STOCK = {"PPOBC": "PPO", "DAgger": "PPO", "SACBC": "SAC"}  # what reads the zips of ours
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")  # what is read of the pickles of an agent
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}  # for those others that cannot be None
 
@@ -52,7 +53,7 @@ def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
 
 
 def saved_algorithm(path: str | Path) -> str:
-    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG, DQN or RecurrentPPO; PPOBC, DAgger or RecurrentDAgger of ours.
+    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG, DQN, RecurrentPPO; PPOBC, SACBC, DAgger, RecurrentDAgger of ours.
 
     A zip does not name its algorithm; the policy class and the settings that were saved with it tell.
 
@@ -70,6 +71,8 @@ def saved_algorithm(path: str | Path) -> str:
     if module == _ACTOR_CRITIC:
         own = next((name for key, name in _OURS.items() if key in data), None)
         return own or ("PPO" if "n_epochs" in data else "A2C")
+    if _FAMILIES[module] == "SAC" and "bc_coef" in data:
+        return "SACBC"
     return "DDPG" if _FAMILIES[module] == "TD3" and data.get("policy_delay") == 1 else _FAMILIES[module]
 
 
@@ -100,7 +103,7 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     if algorithm.startswith("Recurrent"):
         stock = require("sb3_contrib", "recurrent", f"model {path}").RecurrentPPO
     else:
-        stock = getattr(stable_baselines3, "PPO" if algorithm in _OURS.values() else algorithm)
+        stock = getattr(stable_baselines3, _STOCK.get(algorithm, algorithm))
     try:
         model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
     except ConfigError:

@@ -11,6 +11,8 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.sac.policies import SACPolicy
+from stable_baselines3.td3.policies import TD3Policy
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.imports import require
@@ -72,7 +74,7 @@ class Network(th.nn.Module):
 
 
 def build_network(reference: Reference, where: str = "model") -> Network:
-    """The policy of an on-policy SB3 model with ``MlpPolicy``, its scaling and its rotors.
+    """The policy of an SB3 model with ``MlpPolicy``, on-policy, SAC's or TD3's; its scaling and its rotors.
 
     :param where: what messages call the model.
     :raises ConfigError: an unknown output, other spaces than the quadcopter's, a policy that :func:`check_policy` refuses,
@@ -81,21 +83,36 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     if reference.output not in OUTPUTS:
         raise ConfigError(unknown("output", reference.output, OUTPUTS))
     policy: Any = reference.model.policy
-    check_policy(policy, where)
+    layers = deterministic_layers(policy, where)
     seen, done = reference.model.observation_space, reference.model.action_space
     if seen.shape != (reference.memory.size,):
         raise ConfigError(f"{where}: its observations are {seen}, by its settings of shape ({reference.memory.size},)")
     if done != ACTIONS:
         raise ConfigError(f"{where}: its actions are {done}, the quadcopter's are {ACTIONS}")
-    # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
-    squash = [th.nn.Tanh()] if policy.squash_output else []
-    layers = th.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net, *squash)
     for layer in layers:
         if type(layer) is not th.nn.Linear and type(layer) not in ACTIVATIONS:
             raise ConfigError(f"{where}: its network has a layer {layer}; only linear layers, Tanh and ReLU export")
     if not all(bool(parameter.isfinite().all()) for parameter in layers.parameters()):
         raise ConfigError(f"{where}: holds parameters that are not finite")
     return Network(layers, reference)
+
+
+def deterministic_layers(policy: Any, where: str) -> th.nn.Sequential:
+    """The layers from a policy's observations to its deterministic actions, before they are clipped.
+
+    :raises ConfigError: see :func:`check_policy`.
+    """
+    if type(policy) in (SACPolicy, TD3Policy) and type(policy.actor.features_extractor) is FlattenExtractor:
+        actor = policy.actor  # SAC: tanh of the mean, which gSDE bounds by a Hardtanh; TD3: all in one, its tanh included
+        return (
+            th.nn.Sequential(*actor.mu)
+            if type(policy) is TD3Policy
+            else th.nn.Sequential(*actor.latent_pi, actor.mu, th.nn.Tanh())
+        )
+    check_policy(policy, where)
+    # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
+    squash = [th.nn.Tanh()] if policy.squash_output else []
+    return th.nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net, *squash)
 
 
 def check_policy(policy: Any, where: str) -> None:

@@ -48,7 +48,7 @@ def export_policy(
     name: str | None = None,
     n_observations: int = check.N_OBSERVATIONS,
 ) -> Export:
-    """The policy of an on-policy SB3 zip (PPO, A2C, DAgger, PPOBC; ``MlpPolicy``) as a file that flies by itself.
+    """The policy of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC; ``MlpPolicy``) as a file that flies by itself.
 
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
     thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. What else the policy sees, the file keeps in a state,

@@ -27,7 +27,6 @@ from sb3_quad.networks import shared_out
 from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
 
 BC_FILTERS = ("none", "negative_advantage", "agreement")
-AGREEMENT = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
 
 
 class PPOBC(PPO):
@@ -346,7 +345,7 @@ class PPOBC(PPO):
             advantages = for_actor[index, -1]
             shift, scale = float(advantages.mean()), 1.0 / (float(advantages.std(ddof=1)) + 1e-8)
         rows: dict[str, float] = {"clip_range": clip_range, "shift": shift, "scale": scale}
-        rows |= {"filter": BC_FILTERS.index(self.bc_filter), "agreement": AGREEMENT}
+        rows |= {"filter": BC_FILTERS.index(self.bc_filter), "agreement": common.AGREEMENT}
 
         def of_actor(cloning: float, policy: float) -> FloatArray:
             terms = common.actor_terms(self.bc_loss, cloning, policy=policy, labelled=bc_coef != 0.0, **rows)
@@ -399,7 +398,7 @@ class PPOBC(PPO):
         if self.bc_filter == "negative_advantage":
             errors = errors * (advantages < 0)
         elif self.bc_filter == "agreement":
-            errors = errors * ((mean - expert_actions).square().mean(dim=1) < AGREEMENT**2)
+            errors = errors * ((mean - expert_actions).square().mean(dim=1) < common.AGREEMENT**2)
         return errors.mean()
 
     def learn(

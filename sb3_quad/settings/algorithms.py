@@ -6,7 +6,8 @@ import typing
 from types import SimpleNamespace
 from typing import Any
 
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_quad.base.errors import ConfigError, unknown
 
@@ -14,13 +15,16 @@ ALGORITHMS = {
     "dagger": "sb3_quad.dagger.dagger:DAgger",
     "recurrent_dagger": "sb3_quad.dagger.recurrent:RecurrentDAgger",
     "ppo_bc": "sb3_quad.ppo_bc.ppo_bc:PPOBC",
+    "sac_bc": "sb3_quad.sac_bc.sac_bc:SACBC",
     "ppo": "stable_baselines3.ppo.ppo:PPO",
+    "sac": "stable_baselines3.sac.sac:SAC",
+    "td3": "stable_baselines3.td3.td3:TD3",
 }
 # Set by a training job rather than by the settings of an algorithm.
 _SET_BY_JOB = {"self", "policy", "env", "expert", "policy_kwargs", "verbose", "tensorboard_log", "device", "seed"}
 
 
-def get_algorithm(name: str) -> type[OnPolicyAlgorithm]:
+def get_algorithm(name: str) -> type[BaseAlgorithm]:
     """The class of an algorithm by its name.
 
     :raises ConfigError: an unknown name.
@@ -30,7 +34,7 @@ def get_algorithm(name: str) -> type[OnPolicyAlgorithm]:
     return pkgutil.resolve_name(ALGORITHMS[name])  # type: ignore[no-any-return]
 
 
-def constructor_parameters(algorithm: type[OnPolicyAlgorithm]) -> dict[str, inspect.Parameter]:
+def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
     """What an algorithm's settings may give: its constructor's keywords, less those that a training job sets.
 
     The annotation of each is a type; Any where there is none, or where its names cannot be resolved.
@@ -53,6 +57,11 @@ def _resolve(annotation: Any, names: dict[str, Any]) -> Any:
         return Any
 
 
-def takes_expert(algorithm: type[OnPolicyAlgorithm]) -> bool:
+def is_off_policy(algorithm: type[BaseAlgorithm]) -> bool:
+    """Whether the algorithm learns from a replay buffer, such as SAC: its rollouts are ``train_freq`` steps long."""
+    return issubclass(algorithm, OffPolicyAlgorithm)
+
+
+def takes_expert(algorithm: type[BaseAlgorithm]) -> bool:
     """Whether the algorithm learns from an expert."""
     return "expert" in inspect.signature(algorithm.__init__).parameters

@@ -6,17 +6,26 @@ falls linearly to 0 over the training; a learning rate to its n-th part, in the 
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium
-from pydantic import BeforeValidator, Field, PositiveInt, StrictBool, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    NonNegativeFloat,
+    PositiveInt,
+    StrictBool,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.experts.resolve import DEFAULT_EXPERT
-from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, takes_expert
+from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, is_off_policy, takes_expert
 from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.settings.literals import parse_mapping, parse_number
 from sb3_quad.settings.values import BASES, as_list, check, convert, import_class, qualified_classes
@@ -28,13 +37,15 @@ SETTINGS = YamlFolder(
     "sb3_quad.zoo_configs",
     ".yml",
     in_name=True,
-    folders=("any_quadcopter", "nominal", "pid", "thesis"),
+    folders=("any_quadcopter", "nominal", "pid", "thesis", "value_based"),
     former={"geometric/": "nominal/", "robust/": ""},
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")
 MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as many in a process
-LIMITS = {"learning_rate": (0, 1)} | dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size"), (1, 2**40))
+LIMITS = {"learning_rate": (0, 1)} | dict.fromkeys(
+    ("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)
+)
 """Of keywords of the algorithms: the least and the greatest."""
 
 
@@ -79,6 +90,8 @@ class TrainingConfig(Frozen):
     env_wrapper: Classes = Field(default=[], description="wrappers around each environment, of dummy and subproc")
     vec_env_wrapper: Classes = Field(default=[], description="wrappers around the vectorised environment")
     normalize: Any = None
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(default=None, description="of an off-policy algorithm")
+    noise_std: NonNegativeFloat = Field(default=0.1, description="deviation of that noise, of actions within -1 and 1")
     hyperparams: dict[str, Any] = Field(description="keywords of the algorithm's constructor, converted")
     settings: dict[str, Any] = Field(repr=False)
 
@@ -96,11 +109,27 @@ class TrainingConfig(Frozen):
         """What the algorithm's constructor is given as ``name``, or its default."""
         return self.hyperparams.get(name, constructor_parameters(get_algorithm(self.algo))[name].default)
 
+    @property
+    def is_off_policy(self) -> bool:
+        """Whether it learns from a replay buffer."""
+        return is_off_policy(get_algorithm(self.algo))
+
+    @property
+    def rollout_steps(self) -> int:
+        """Control steps of each environment between two updates; 1 where ``train_freq`` counts episodes."""
+        if not self.is_off_policy:
+            return int(self.keyword("n_steps"))
+        freq = self.keyword("train_freq")
+        number, unit = freq if isinstance(freq, (tuple, list)) else (freq, "step")
+        return int(number) if unit == "step" else 1
+
     def shorter_rollout(self) -> dict[str, int]:
         """The settings that fit a rollout to a budget of less than one, which SB3 would fly whole; none otherwise."""
         n_steps = -(-self.n_timesteps // self.n_envs)
-        if n_steps >= self.keyword("n_steps"):
+        if n_steps >= self.rollout_steps:
             return {}
+        if self.is_off_policy:
+            return {"train_freq": n_steps}
         return {"n_steps": n_steps, "batch_size": min(self.keyword("batch_size"), n_steps * self.n_envs)}
 
     @field_validator("policy", mode="before")
@@ -152,6 +181,12 @@ class TrainingConfig(Frozen):
             raise ConfigError(f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made")
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
+        if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
+            raise ConfigError(
+                f"train_freq: {self.keyword('train_freq')} counts episodes, which only n_envs 1 can do; give steps"
+            )
+        if self.noise_type is not None and not self.is_off_policy:
+            raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
         if not takes_expert(get_algorithm(self.algo)):
             for key in ("expert", "eval_expert"):
                 if getattr(self, key):
@@ -167,7 +202,8 @@ def load_config(
 ) -> TrainingConfig:
     """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for ``env_kwargs``).
 
-    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size`` to no more than that.
+    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size`` to no more than that; of
+    an off-policy algorithm ``train_freq``.
 
     :param conf_file: path of a file, or the name of one that comes with the package such as ``thesis/dagger.yml``;
         None for ``<algo>.yml`` of the package.

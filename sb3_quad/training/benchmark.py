@@ -19,11 +19,12 @@ import numba
 import numpy as np
 import torch
 from gymnasium.wrappers import Autoreset
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 import sb3_quad
 from sb3_quad import common
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.controller import Controller
 from sb3_quad.networks import Perceptron
 from sb3_quad.settings.config import TrainingConfig, build_config
@@ -94,9 +95,11 @@ def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[
     :return: the rates of all of it, of its rollouts and of its updates; and the seconds that each of its ``PARTS`` takes, per
         rollout and update.
     """
+    if config.is_off_policy:
+        raise ConfigError(f"{config.algo}: only loops of on-policy algorithms are measured, in rollouts and updates")
     with closing(make_environments(config, config.n_envs, 0)) as env:
         model, clock = build_model(TrainingJob(config=config), env), _Clock()
-        steps = model.n_steps * config.n_envs
+        steps = config.rollout_steps * config.n_envs
         with clock.parts_of(model):
             model.learn(steps * (rollouts + 1), callback=clock)
     rollout, update = np.diff(clock.times).reshape(-1, 2)[1:].T
@@ -145,7 +148,7 @@ class _Clock(BaseCallback):
         return call
 
     @contextmanager
-    def parts_of(self, model: OnPolicyAlgorithm) -> Iterator[None]:
+    def parts_of(self, model: BaseAlgorithm) -> Iterator[None]:
         """Within the block, time what the model calls."""
         env, optimizer = model.get_env(), model.policy.optimizer
         forward = ("outputs", "act", "actor_mean", "critic_values", "evaluate_actions")

@@ -1,18 +1,26 @@
 """Starting from a trained agent: its policy and critic, in a new algorithm with a fresh optimiser."""
 
 from pathlib import Path
+from typing import Any, cast
 
+import numpy as np
 import torch as th
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.memory import check_unpacked
+from sb3_quad.experts.controller import Controller
+from sb3_quad.experts.models import load_model
 
 
-def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
-    """Give ``model`` the policy and critic of an SB3 zip, of any on-policy algorithm with the same spaces and networks.
+def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
+    """Give ``model`` the policy and critic of an SB3 zip, of any algorithm with the same spaces and networks.
+
+    An off-policy ``model`` also takes an agent with other networks, such as DAgger's: its actor is made to imitate that, by
+    :func:`clone_policy`, and its critic stays new. ``model`` then needs its environment.
 
     ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that holds. The optimiser
     stays as it is, so a new model starts with a fresh one.
@@ -30,6 +38,12 @@ def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
         raise ConfigError(f"{path}: no such file") from None
     except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"{path}: not a complete SB3 zip ({one_line(error)})") from None
+    if isinstance(model, OffPolicyAlgorithm) and theirs.keys() != ours.keys():
+        try:
+            clone_policy(load_model(path), model, seed=model.seed or 0)
+        except ExpertError as error:  # other spaces
+            raise ConfigError(f"{path}: {error}") from None
+        return
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{path}: holds parameters that are not finite")
     for layer in sorted({**ours, **theirs}, key=lambda name: name == "log_std"):  # the network's own layers say more
@@ -46,3 +60,62 @@ def transfer_policy(path: str | Path, model: OnPolicyAlgorithm) -> None:
 
 
 hand_over = transfer_policy  # its name in version 0.1
+
+
+CLONE_ROWS = 20_000  # states that are flown for a clone, at least
+CLONE_FLIGHT = 500  # steps of each environment, at least
+CLONE_STEPS = 2_500  # of Adam
+CLONE_BATCH = 1024
+CLONE_RATE = 2e-3  # falls to a hundredth
+CLONE_LOG_STD = -2.0  # of a clone that explores by a deviation of its own: sampled actions fly
+
+
+def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> float:
+    """Let the actor of ``model``, SAC's or TD3's, imitate ``teacher`` on states that the two of them fly in its environments.
+
+    A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped: no weights can be copied, so they
+    are fitted, by the squared error of the deterministic actions (an error of their arctanh would be all about the limits).
+    One half of the environments is flown by the teacher, the other by the present clone, as in DAgger: the states that the
+    clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e^-2 everywhere.
+    The environments are reset afterwards by whoever learns.
+
+    :param teacher: what :class:`~sb3_quad.experts.controller.Controller` takes.
+    :return: root mean squared error of the last 100 steps' actions, of a range of 2.
+    """
+    env, policy, actor = model.get_env(), model.policy, cast(Any, model.actor)
+    assert env is not None
+    n, labeller, rng = env.num_envs, Controller.for_env(teacher, env), np.random.default_rng(seed)
+    steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
+    optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
+    seen: list[Any] = []
+    said: list[Any] = []
+    errors = []
+    observation: Any = env.reset()
+    begins = np.ones(n, dtype=np.bool_)
+    rounds, done = 10, 0
+    for flown in range(steps):
+        labels = labeller.labels(observation, begins)
+        seen.append(observation)
+        said.append(policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1))  # type: ignore[misc]
+        own, _ = model.predict(observation, deterministic=True)
+        actions = np.where((np.arange(n) % 2 == 0)[:, None], labels, own.reshape(n, -1)).reshape(own.shape)
+        observation, _, begins, _ = env.step(actions)
+        if (flown + 1) * rounds // steps > flown * rounds // steps:  # one of ten rounds is over
+            states, targets = (th.as_tensor(np.concatenate(part), device=model.device) for part in (seen, said))
+            for _ in range(CLONE_STEPS // rounds):
+                for group in optimiser.param_groups:
+                    group["lr"] = CLONE_RATE * max(1.0 - done / CLONE_STEPS, 0.01)
+                rows = th.as_tensor(rng.integers(len(states), size=CLONE_BATCH), device=model.device)
+                loss = (policy._predict(states[rows], deterministic=True) - targets[rows]).square().mean()
+                optimiser.zero_grad()
+                loss.backward()  # type: ignore[no-untyped-call]
+                optimiser.step()
+                errors.append(loss.item())
+                done += 1
+    if hasattr(policy, "actor_target"):  # TD3's
+        cast(Any, policy).actor_target.load_state_dict(actor.state_dict())
+    if isinstance(getattr(actor, "log_std", None), th.nn.Linear):
+        with th.no_grad():
+            actor.log_std.weight.zero_()
+            actor.log_std.bias.fill_(CLONE_LOG_STD)
+    return float(np.mean(errors[-100:]) ** 0.5)

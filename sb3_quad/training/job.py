@@ -61,11 +61,15 @@ class TrainingJob(Frozen):
 def describe(job: TrainingJob) -> str:
     """One line that says what is about to be trained: whole rollouts, as SB3 does."""
     config = job.config
-    n_steps = config.keyword("n_steps")
+    n_steps = config.rollout_steps
     rollouts = -(-config.n_timesteps // (n_steps * config.n_envs))
     timesteps = rollouts * n_steps * config.n_envs
     asked = "" if timesteps == config.n_timesteps else f" ({config.n_timesteps:,} were asked for)"
-    warming = rollouts <= config.hyperparams.get("critic_warmup", 0)
+    updates = rollouts
+    if config.is_off_policy:
+        steps = config.keyword("gradient_steps")
+        updates *= n_steps * config.n_envs if steps < 0 else steps
+    warming = updates <= config.hyperparams.get("critic_warmup", 0)
     idle = "; critic_warmup lasts all of it, so that the policy will not learn" if warming else ""
     start = f", from {job.trained_agent}" if job.trained_agent else ""
     expert = f", expert {config.expert}" if config.expert is not None else ""

@@ -4,10 +4,12 @@ import io
 import os
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import Arrays
@@ -19,6 +21,7 @@ from sb3_quad.settings.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 DATASET = "dataset."  # before the names of the dataset's arrays
+BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")  # of a replay buffer
 SHARE = 0.03  # of the run's time that snapshots may take
 
 
@@ -31,14 +34,22 @@ class SnapshotFile(LastGoodModel):
     :param report: told of a snapshot that cannot be written; the training goes on.
     """
 
-    def __init__(self, run: RunFolder, every: float, report: Callable[[str], None] = print) -> None:
-        super().__init__()
+    def __init__(
+        self,
+        run: RunFolder,
+        every: float,
+        report: Callable[[str], None] = print,
+        hurry: Callable[[], bool] = lambda: False,
+    ) -> None:
+        super().__init__(hurry)
         self._run, self._every, self._report = run, every, report
         self._written, self._took, self._rollout_start = -np.inf, 0.0, time.monotonic()
 
     def _on_rollout_start(self) -> None:
+        before = self.snapshot
         super()._on_rollout_start()
-        assert self.snapshot is not None
+        if self.snapshot is None or self.snapshot is before:
+            return
         start, self._rollout_start = self._rollout_start, time.monotonic()
         if self._run.episodes.is_file():
             self.snapshot.state["episodes"] = np.array(self._run.episodes.stat().st_size)
@@ -46,6 +57,8 @@ class SnapshotFile(LastGoodModel):
             self.snapshot.state["best_model"] = np.fromfile(self._run.best_model, dtype=np.uint8)
         if hasattr(self.model, "dataset"):
             self.snapshot.state[f"{DATASET}added"] = np.array(self.model.dataset.added)
+        for name, buffer in _replay_buffers(self.model).items():
+            self.snapshot.state.update({f"{name}.pos": np.array(buffer.pos), f"{name}.full": np.array(buffer.full)})
         due = self._written + max(self._every, self._took / SHARE)
         if self._every > 0 and self._rollout_start + (self._rollout_start - start) >= due:  # the next one would be too late
             try:
@@ -66,10 +79,12 @@ class SnapshotFile(LastGoodModel):
         if hasattr(self.model, "dataset"):
             dataset = self.model.dataset.snapshot(int(state[f"{DATASET}added"]))
             arrays |= {f"{DATASET}{name}": array for name, array in dataset.items()}
+        for name, buffer in _replay_buffers(self.model).items():
+            arrays |= {f"{name}.{key}": array for key, array in buffer_arrays(buffer).items()}
         write_arrays(self._run.resume_state, **arrays)
 
 
-def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> OnPolicyAlgorithm:
+def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> BaseAlgorithm:
     """The model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``; what came after it is taken back.
 
     :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
@@ -99,6 +114,8 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         )
     if hasattr(model, "dataset"):
         model.dataset.restore(dataset, path) if in_one_file else model.load_dataset(run.dataset)
+    for name, buffer in _replay_buffers(model).items():
+        restore_buffer(buffer, _part(state, f"{name}."), path)
     batch: Any = getattr(env.unwrapped, "batch", None)
     if environment and batch is None:
         raise ConfigError(f"{path}: holds the state of batched environments; use the run's own settings")
@@ -108,7 +125,42 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
             model.restore_memory(_part(state, MEMORY))
     _take_back(run, state)
     set_random_state(state)
-    return cast(OnPolicyAlgorithm, model)
+    return cast(BaseAlgorithm, model)
+
+
+def _replay_buffers(model: Any) -> dict[str, ReplayBuffer]:
+    """By name; those of an off-policy algorithm."""
+    buffers = {name: getattr(model, name, None) for name in ("replay_buffer", "expert_buffer")}
+    return {name: buffer for name, buffer in buffers.items() if isinstance(buffer, ReplayBuffer)}
+
+
+def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
+    """What a replay buffer holds, as :func:`restore_buffer` takes it beside its ``pos`` and ``full``; the arrays are views.
+
+    :raises ConfigError: observations that are a Dict.
+    """
+    rows = buffer.size()
+    arrays = {name: getattr(buffer, name, None) for name in BUFFER_ARRAYS}
+    if isinstance(arrays["observations"], dict):
+        raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
+    rows += 1  # the memory-efficient variant's last observation
+    return {name: array[: min(rows, len(array))] for name, array in arrays.items() if array is not None}
+
+
+def restore_buffer(buffer: ReplayBuffer, arrays: Arrays, path: str | Path) -> None:
+    """Go back to :func:`buffer_arrays`, ``pos`` and ``full``.
+
+    :param path: the file that they come from, for the message.
+    :raises ConfigError: they do not fit.
+    """
+    for name in BUFFER_ARRAYS:
+        store, given = getattr(buffer, name, None), arrays.get(name)
+        if store is None:
+            continue
+        if given is None or given.shape[1:] != store.shape[1:] or len(given) > len(store):
+            raise ConfigError(f"{path}: its replay buffer is not of this model ({name})")
+        store[: len(given)] = given
+    buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
 
 
 def _part(state: Arrays, prefix: str) -> Arrays:

@@ -5,9 +5,8 @@ resumed run is bit for bit the one that was not interrupted; elsewhere episodes 
 """
 
 import copy
-import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +15,14 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, one_line, save_model, write_bytes
-from sb3_quad.base.memory import check_memory
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
@@ -39,11 +38,12 @@ from sb3_quad.settings.values import instance
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.needs import check_buffer, check_networks
 from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
 
-ROLLOUT_COLUMNS = 6  # of a rollout buffer, float32 each, beside observations and actions
+NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 Report = Callable[[str], None]
 ShouldContinue = Callable[[float, float], bool]
 EvalEnvs = dict[str | None, VecEnv]
@@ -60,7 +60,7 @@ class TrainingResult:
 
     job: TrainingJob
     run: RunFolder
-    model: OnPolicyAlgorithm
+    model: BaseAlgorithm
     seconds: float
     signal: str = ""
     exit_code: int = 0
@@ -167,23 +167,23 @@ def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
     return [instance(path, "callback", **kwargs) for path, kwargs in config.callback]
 
 
-def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
+def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """The algorithm of a job, new, with the policy that it starts from.
 
     :raises ConfigError: settings that it refuses, or for which this machine has too little memory; an agent that does not fit.
     :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
-    numbers = sum(int(np.prod(space.shape or ())) for space in (env.observation_space, env.action_space)) + ROLLOUT_COLUMNS
-    n_steps = config.keyword("n_steps")
-    check_memory(f"n_steps {n_steps:,} by n_envs {env.num_envs:,}", 4.0 * numbers * n_steps * env.num_envs)
+    check_buffer(config, env)
     keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
+    if config.noise_type is not None:
+        zeros = np.zeros(env.action_space.shape or ())
+        keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
     try:
-        weights = _weights(config.policy_kwargs.get("net_arch"), env)
-        check_memory("policy_kwargs: net_arch", 16.0 * weights)  # each with its gradient and two numbers of Adam's
+        check_networks(config, env)
         model = get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
@@ -195,31 +195,26 @@ def build_model(job: TrainingJob, env: VecEnv) -> OnPolicyAlgorithm:
         Controller.for_env(keywords["expert"], env).labels(observation)
     rate = keywords.get("learning_rate")
     if isinstance(rate, LinearSchedule):  # SB3's last update has its end: at 0 it would do nothing
-        rate.end = rate.start / -(-config.n_timesteps // (model.n_steps * env.num_envs))
-    env.seed(seed_for("training", job.seed))  # SB3 has just seeded it with the seed of the policy
+        rate.end = rate.start / -(-config.n_timesteps // (config.rollout_steps * env.num_envs))
     if job.trained_agent is not None:
         transfer_policy(job.trained_agent, model)
+    env.seed(seed_for("training", job.seed))  # SB3 has seeded it with the seed of the policy
     return model
-
-
-def _weights(net_arch: Any, env: VecEnv) -> float:
-    """About how many weights the hidden layers of both networks have."""
-    both = [net_arch.get(part, []) for part in ("pi", "vf")] if isinstance(net_arch, Mapping) else [net_arch or []] * 2
-    inputs = float(np.prod(env.observation_space.shape or (1,)))
-    return float(sum(before * after for layers in both for before, after in itertools.pairwise([inputs, *layers])))
 
 
 def _learn(
     job: TrainingJob,
     run: RunFolder,
-    model: OnPolicyAlgorithm,
+    model: BaseAlgorithm,
     eval_envs: EvalEnvs,
     own_callbacks: list[BaseCallback],
     signals: StopSignals,
     report: Report,
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
-    last_good, best = SnapshotFile(run, job.snapshot_every, report), None
+    last_good, best = SnapshotFile(run, job.snapshot_every, report, lambda: signals.received is not None), None
+    # An off-policy algorithm counts episodes: about as many as rows end their episodes once.
+    log_interval = job.log_interval * (job.config.n_envs if job.config.is_off_policy else 1)
     if job.config.task is not None and not (job.config.env_wrapper or job.config.vec_env_wrapper):  # flights have none
         job.flight_settings.write_into(model)
     callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
@@ -242,14 +237,14 @@ def _learn(
     callbacks += own_callbacks
     if job.progress:
         callbacks.append(ProgressBar())
-    callbacks.append(ConvertCallback(lambda local, _: signals.received is None))
+    callbacks.append(ConvertCallback(lambda local, _: signals.received is None or not last_good.is_fresh))
     start = time.perf_counter()
     try:
         try:
             model.learn(
                 job.config.n_timesteps - model.num_timesteps,
                 callback=callbacks,
-                log_interval=job.log_interval,
+                log_interval=log_interval,
                 tb_log_name=f"{job.config.algo}_{run.path.name}",
                 reset_num_timesteps=model.num_timesteps == 0,
             )
@@ -279,7 +274,7 @@ def _learn(
     return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
 
 
-def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, model: OnPolicyAlgorithm) -> None:
+def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, model: BaseAlgorithm) -> None:
     """Save the last good model, and say so in ``error``; a numerical breakdown becomes a TrainingError."""
     snapshot = last_good.snapshot
     if snapshot is None:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
@@ -53,7 +53,7 @@ class Trim(NamedTuple):
     after: float
 
 
-def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0) -> Trim:
+def trim(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0) -> Trim:
     """Find μ for an agent and fold it into its first layer, and α before it.
 
     :param scale: α.
@@ -73,7 +73,7 @@ def trim(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | Non
     return Trim(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
 
 
-def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray) -> None:
+def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) -> None:
     """Let the actor see its position moved by ``offset`` (m, world frame).
 
     :param std: σ of the position features, shape (3,).
@@ -84,13 +84,13 @@ def shift_position(model: OnPolicyAlgorithm, offset: FloatArray, std: FloatArray
         layer.bias.add_(layer.weight[:, _POSITION] @ shift)
 
 
-def scale_position(model: OnPolicyAlgorithm, scale: float) -> None:
+def scale_position(model: BaseAlgorithm, scale: float) -> None:
     """Let the actor see its distance from the target divided by ``scale`` (α)."""
     with th.no_grad():
         _first_layer(model).weight[:, _POSITION] /= scale
 
 
-def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
+def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
     """Correct an agent's last layer so that it hovers at its target with every heading.
 
     :param seed: of the flights and of the observation noise.
@@ -120,8 +120,12 @@ def trim_hover(model: OnPolicyAlgorithm, seed: int = 0, settings: FlightSettings
     return Trim(*(float(action.square().mean().sqrt()) for action in (before, after)))
 
 
-def _first_layer(model: OnPolicyAlgorithm) -> th.nn.Linear:
-    layer = next(iter(getattr(model.policy.mlp_extractor, "policy_net", [None])))
+def _first_layer(model: BaseAlgorithm) -> th.nn.Linear:
+    actor = getattr(model.policy, "actor", None)  # of SAC or TD3
+    layers = getattr(model.policy, "mlp_extractor", None) if actor is None else actor
+    layer = next(
+        iter(next((getattr(layers, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(layers, name)), [None]))
+    )
     if not isinstance(layer, th.nn.Linear) or layer.in_features != OBSERVATION_SIZE:
         raise ConfigError("trimming needs an MlpPolicy whose first layer reads the 18 features")
     return layer
@@ -140,7 +144,7 @@ class _Observations(Hook):
         self._steps += 1
 
 
-def _latents(model: OnPolicyAlgorithm, observations: Float32Array) -> th.Tensor:
+def _latents(model: BaseAlgorithm, observations: Float32Array) -> th.Tensor:
     """Inputs of the actor's last layer and a 1, float64, (n, inputs + 1)."""
     policy: Any = model.policy
     with th.no_grad():

@@ -19,7 +19,7 @@ from sb3_quad.base.signals import StopSignals
 from sb3_quad.settings.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
-from sb3_quad.tuning.space import SearchSpace, current
+from sb3_quad.tuning.space import SearchSpace
 from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, dead_trials, open_study, owned
 
 BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
@@ -141,7 +141,7 @@ class Search:
         settings = self.space.suggest(trial)
         trial.set_user_attr(SETTINGS, json.dumps(settings))
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
-        rollout = int(current(config.algo, config.hyperparams, "n_steps")) * config.n_envs
+        rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
         every = total // count + 1 if count > 1 else -1  # never due with the last timestep: that one follows the last update
         evaluations: list[tuple[float, float]] = []

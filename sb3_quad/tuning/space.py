@@ -26,7 +26,7 @@ from pydantic import Field, model_validator
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
+from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, is_off_policy
 from sb3_quad.settings.literals import parse_number, parse_value
 from sb3_quad.settings.values import takes_whole
 
@@ -159,7 +159,8 @@ def load_space(algo: str, settings: Mapping[str, Any], source: str | Path | None
     if not content:
         raise ConfigError(f"{where}: must hold settings with their ranges, such as 'learning_rate: {{around: 5}}'")
     parameters = constructor_parameters(get_algorithm(algo))
-    divides = [MINIBATCHES] if {"n_steps", "batch_size"} <= parameters.keys() else []
+    on_policy = {"n_steps", "batch_size"} <= parameters.keys() and not is_off_policy(get_algorithm(algo))
+    divides = [MINIBATCHES] if on_policy else []
     valid = [*parameters, *JOB_SETTINGS, *divides]
     for name in content:
         outer, dot, inner = str(name).partition(".")

@@ -15,7 +15,7 @@ from sb3_quad.settings.values import convert
 from sb3_quad.tuning.space import load_space
 
 Settings = dict[str, Any]
-OWN_ALGORITHMS = ("dagger", "ppo_bc", "recurrent_dagger")
+OWN_ALGORITHMS = ("dagger", "ppo_bc", "recurrent_dagger", "sac_bc")
 
 
 def register() -> None:

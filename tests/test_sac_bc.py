@@ -1,0 +1,262 @@
+"""SAC with an expert: what each addition does, and switched off it is SAC."""
+
+import inspect
+import json
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_quad import SACBC, PIDExpert
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.training import handover
+from sb3_quad.training.handover import transfer_policy
+
+SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 32, "buffer_size": 2000, "seed": 3, "device": "cpu"}
+ALL = {"expert_timesteps": 64, "expert_fraction": 0.25, "bc_coef": 0.5, "expert_proposal": True}
+
+
+def swing_up(observation):
+    """A simple expert for Pendulum-v1: pumps energy in, then holds."""
+    cosine, sine, rate = observation.T
+    hold = -10.0 * np.arctan2(sine, cosine) - 2.0 * rate
+    missing = 15.0 * (1.0 - cosine) - 0.5 * rate**2  # of the energy at rest on top
+    return np.where(cosine > 0.9, hold, 2.0 * np.sign(rate * missing))[:, None].clip(-2.0, 2.0)
+
+
+def parameters(module):
+    return th.cat([p.detach().flatten() for p in module.parameters()])
+
+
+def pendulum(n_envs=4, **settings):
+    given = {**SMALL, "learning_starts": 0, "train_freq": 4, "gradient_steps": 2, "expert": swing_up, **settings}
+    return SACBC("MlpPolicy", make_vec_env("Pendulum-v1", n_envs, seed=0), **given)
+
+
+@pytest.mark.parametrize("settings", [{}, {"use_sde": True}, {"ent_coef": 0.1, "n_steps": 3}, {"target_update_interval": 2}])
+def test_without_additions_it_is_sac_bit_for_bit(monkeypatch, settings):
+    stock = SAC("MlpPolicy", "Pendulum-v1", **SMALL, **settings).learn(160)
+    ours = SACBC("MlpPolicy", "Pendulum-v1", **SMALL, **settings)
+    monkeypatch.delattr(SAC, "train")
+    ours.learn(160)
+    assert th.equal(parameters(stock.policy), parameters(ours.policy)) and ours._n_updates == stock._n_updates > 50
+    for name, value in stock.logger.name_to_value.items():
+        if name.startswith("train/"):
+            assert ours.logger.name_to_value[name] == pytest.approx(value), name
+
+
+def test_its_signature_is_sacs_and_the_additions_all_off():
+    theirs, ours = (inspect.signature(each.__init__).parameters for each in (SAC, SACBC))
+    added = {name: each.default for name, each in ours.items() if name not in theirs}
+    assert [name for name in ours if name in theirs] == list(theirs)
+    assert (added["expert_fraction"], added["bc_coef"], added["bc_filter"], added["expert_proposal"]) == (0, 0, "none", False)
+
+
+def test_the_expert_flies_first_and_its_share_of_a_batch_is_its_own():
+    model = pendulum(expert_timesteps=40, expert_fraction=0.25).learn(400)
+    buffer = model.expert_buffer
+    assert buffer.size() * 4 == 40 and buffer.full and not model.expert_flies
+    assert model.replay_buffer.size() * 4 == 360  # and nothing of it in the agent's own
+    flown = buffer.observations.reshape(-1, 3)
+    np.testing.assert_allclose(2.0 * buffer.actions.reshape(-1, 1), swing_up(flown), atol=1e-6)
+    data, labels, following = model._sample(32)
+    of_expert = (data.observations[:, None] == th.as_tensor(flown)).all(dim=2).any(dim=1)
+    assert labels is following is None and data.observations.shape == (32, 3)
+    assert of_expert.tolist() == [False] * 24 + [True] * 8
+
+
+def test_labels_lie_beside_the_actions_of_the_same_state_and_of_the_next():
+    model = pendulum(bc_coef=0.5, expert_proposal=True).learn(1200)  # the episodes end after 800
+    data, labels, following = model._sample(500)
+    np.testing.assert_allclose(2.0 * labels.numpy(), swing_up(data.observations.numpy()), atol=1e-5)
+    known = following.isfinite().all(dim=1).numpy()
+    ended = model.replay_buffer.dones[:300].astype(bool)
+    np.testing.assert_array_equal(np.isnan(model.replay_buffer.actions[:300, :, 2]), ended)  # no state is left to ask about
+    assert ended.sum() == 4 and known.mean() > 0.9
+    np.testing.assert_allclose(2.0 * following.numpy()[known], swing_up(data.next_observations.numpy()[known]), atol=1e-5)
+
+
+def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone():
+    def trained(bc_coef):
+        model = pendulum(bc_coef=1e-9, gradient_steps=0, learning_rate=3e-3, ent_coef=0.01).learn(400)
+        model.bc_coef = lambda progress: bc_coef
+        th.manual_seed(0)
+        np.random.seed(0)  # noqa: NPY002 - SB3 samples from it
+        model.train(1, 64)
+        critic = parameters(model.critic).clone()
+        model.train(150, 64)
+        observations = th.as_tensor(model.replay_buffer.observations.reshape(-1, 3))
+        with th.no_grad():
+            error = 2.0 * model.actor(observations, deterministic=True).numpy() - swing_up(observations.numpy())
+        return critic, np.sqrt(np.mean(error**2))
+
+    (critic, without), (same, cloned) = trained(1e-9), trained(100.0)
+    assert th.equal(critic, same) and cloned < 0.7 * without
+
+
+@pytest.mark.parametrize("prefers", [True, False])
+def test_the_q_filter_clones_where_the_critic_prefers_the_expert(prefers):
+    model = pendulum(bc_coef=0.5, bc_filter="q")
+    labels = th.tensor([[0.5], [-0.5]])
+    model.critic.forward = lambda observations, actions: (actions if prefers else -actions,) * 2
+    loss, share = model._bc_loss(th.zeros(2, 3), th.zeros(2, 1), labels)  # of the two, one is greater than the mean
+    assert share == 0.5 and loss == pytest.approx(0.125)
+    model.bc_filter = "none"
+    assert model._bc_loss(th.zeros(2, 3), th.zeros(2, 1), labels)[1] == 1.0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_proposal_of_greater_q_is_flown(sign):
+    model = pendulum(expert_proposal=True, train_freq=1, gradient_steps=0, expert=lambda seen: np.full((len(seen), 1), 1.0))
+    model.critic_target.forward = lambda observations, actions: (sign * actions,) * 2
+    model.learn(400)
+    flown = model.replay_buffer.actions[:100, :, 0]
+    assert (flown >= 0.5).all() if sign > 0 else (flown <= 0.5).all()  # 1 of 2 is 0.5 of 1
+    assert 0.2 < (flown == 0.5).mean() < 0.8  # each is taken at times
+
+
+def test_the_target_bootstraps_from_the_better_proposal():
+    model = pendulum(expert_proposal=True, gradient_steps=0, ent_coef=0.0, gamma=0.5, critic_warmup=10**6).learn(80)
+    data, _, following = model._sample(32)
+    data = data._replace(rewards=th.zeros(32, 1), dones=th.zeros(32, 1))
+    model._sample = lambda batch_size: (data, None, following)
+    model.critic_target.forward = lambda observations, actions: (actions, actions)
+    nothing = 0.0 * sum(parameter.sum() for parameter in model.critic.parameters())  # for the backward pass to go through
+    model.critic.forward = lambda observations, actions: (nothing + actions,)
+    own = []
+    sample = model.actor.action_log_prob
+    model.actor.action_log_prob = lambda observations: (own.append(sample(observations)), own[-1])[1]
+    model.train(1, 32)
+    target = 0.5 * th.max(own[1][0], following)
+    expected = 0.5 * (data.actions - target).square().mean()
+    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected.item(), rel=1e-5)
+
+
+def test_while_the_critic_warms_up_the_actor_stands_still():
+    model = pendulum(critic_warmup=20, bc_coef=0.5)
+    actor, critic = parameters(model.actor).clone(), parameters(model.critic).clone()
+    model.learn(160)
+    assert model._n_updates == 20
+    assert th.equal(actor, parameters(model.actor)) and not th.equal(critic, parameters(model.critic))
+    model.learn(16, reset_num_timesteps=False)
+    assert not th.equal(actor, parameters(model.actor))
+
+
+def test_a_loaded_agent_is_the_same_and_needs_its_expert_to_go_on(tmp_path):
+    """A run that goes on with its buffers: tests/test_value_based.py."""
+    straight = pendulum(**ALL).learn(320)
+    straight.save(tmp_path / "agent.zip")
+    loaded = SACBC.load(tmp_path / "agent.zip", device="cpu", expert=swing_up, env=straight.get_env())
+    assert th.equal(parameters(straight.policy), parameters(loaded.policy)) and loaded.expert is swing_up
+    with pytest.raises(ExpertError, match="set_expert"):
+        SACBC.load(tmp_path / "agent.zip", device="cpu", env=straight.get_env()).learn(8)
+
+
+FLY = """
+import json, sys
+sys.modules["sb3_quad"] = None  # importing it, or unpickling anything of it, fails
+import numpy as np
+from stable_baselines3 import SAC
+model = SAC.load(sys.argv[1], device="cpu")
+json.dump(model.predict(np.load(sys.argv[2]), deterministic=True)[0].tolist(), sys.stdout)
+"""
+
+
+def test_sac_loads_its_zip_where_sb3_quad_cannot_be_imported(tmp_path):
+    env = QuadcopterVecEnv(8, "state_recovery", seed=0, max_episode_steps=20)
+    settings = {**SMALL, **ALL, "bc_coef": LinearSchedule(0.5, 0.0, 1.0), "bc_filter": "q"}
+    model = SACBC("MlpPolicy", env, expert=PIDExpert(), learning_starts=0, train_freq=4, **settings).learn(320)
+    model.save(tmp_path / "agent.zip")
+    np.save(tmp_path / "seen.npy", env.reset())
+    command = [sys.executable, "-W", "error", "-c", FLY, "agent.zip", "seen.npy"]
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, check=False)
+    assert result.returncode == 0, result.stderr
+    expected = model.predict(np.load(tmp_path / "seen.npy"), deterministic=True)[0]
+    np.testing.assert_array_equal(np.float32(json.loads(result.stdout)), expected)
+
+
+def test_the_batch_gives_the_buffer_what_sb3_wants_of_ends():
+    """A time limit is no end of the values; the state before it is the last of the same flight."""
+    env = QuadcopterVecEnv(4, "target_tracking", seed=0, max_episode_steps=6)
+    model = SACBC("MlpPolicy", env, expert=PIDExpert(), **{**SMALL, **ALL, "expert_timesteps": 48, "learning_starts": 0})
+    model.learn(48)
+    buffer = model.expert_buffer
+    assert buffer.dones[:, 0].nonzero()[0].tolist() == [5, 11] and (buffer.dones == buffer.timeouts).all()
+    data, *_ = model.expert_buffer.sample(64), None
+    assert (data.dones == 0).all()
+    same = np.isclose(buffer.next_observations[:-1], buffer.observations[1:]).all(axis=(1, 2))
+    assert same.tolist() == [True] * 5 + [False] + [True] * 5
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({"bc_filter": "Q"}, ConfigError, "bc_filter"),
+        ({"bc_loss": "nll"}, ConfigError, "bc_loss"),
+        ({"bc_coef": -1.0}, ConfigError, "bc_coef is -1.0"),
+        ({"expert_fraction": 1.5, "expert_timesteps": 8}, ConfigError, "from 0 to 1"),
+        ({"expert_fraction": 0.5}, ConfigError, "expert_timesteps is 0"),
+        ({"critic_warmup": -1}, ConfigError, "critic_warmup is -1"),
+        ({"expert_proposal": True, "n_steps": 3}, ConfigError, "n_steps 1"),
+        ({"bc_coef": 0.5, "expert": None}, ExpertError, "needs an expert"),
+        ({"bc_coef": 0.5, "expert": lambda seen: np.zeros((4, 2))}, ExpertError, "shape"),
+    ],
+)
+def test_bad_input_is_said_in_one_line(settings, error, message):
+    with pytest.raises(error, match=message) as raised:
+        pendulum(**settings).learn(8)
+    assert "\n" not in str(raised.value)
+
+
+def test_observations_that_are_a_dict_are_refused_with_an_expert_only():
+    env = DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")])
+    env.observation_space = spaces.Dict({"state": env.observation_space})
+    with pytest.raises(ConfigError, match="FlattenObservation"):
+        SACBC("MultiInputPolicy", env, expert=swing_up, bc_coef=0.5, **SMALL)
+    SACBC("MultiInputPolicy", env, **SMALL)
+
+
+def test_a_loss_that_is_not_finite_ends_the_training():
+    model = pendulum(bc_coef=0.5).learn(16)
+    model.replay_buffer.rewards[:] = np.nan
+    with pytest.raises(TrainingError, match="lower learning_rate"):
+        model.train(1, 32)
+
+
+@pytest.mark.parametrize("algorithm", [SACBC, TD3])
+def test_an_actor_takes_over_what_an_on_policy_zip_flies(tmp_path, monkeypatch, algorithm):
+    for name, value in {"CLONE_STEPS": 500, "CLONE_BATCH": 128, "CLONE_ROWS": 4000}.items():
+        monkeypatch.setattr(handover, name, value)
+    env = make_vec_env("Pendulum-v1", 8, seed=0)
+    teacher = PPO("MlpPolicy", env, seed=0, device="cpu")
+    with th.no_grad():
+        teacher.policy.action_net.weight *= 200.0  # SB3 begins near zero
+    teacher.save(tmp_path / "ppo.zip")
+    model = algorithm("MlpPolicy", env, **{**SMALL, "policy_kwargs": {"net_arch": [64, 64]}})
+    seen = env.reset()
+    taught, before = (each.predict(seen, deterministic=True)[0] for each in (teacher, model))
+    transfer_policy(tmp_path / "ppo.zip", model)
+    after = model.predict(seen, deterministic=True)[0]
+    assert np.abs(after - taught).max() < 0.2 * np.abs(before - taught).max()
+    model.save(tmp_path / "own.zip")
+    again = algorithm("MlpPolicy", env, **{**SMALL, "policy_kwargs": {"net_arch": [64, 64]}, "seed": 4})
+    transfer_policy(tmp_path / "own.zip", again)  # of its own kind: the same weights, the critic's too
+    assert th.equal(parameters(again.policy), parameters(model.policy))
+
+
+def test_it_learns_pendulum_from_its_expert_in_seconds():
+    settings = {**ALL, "bc_coef": 5.0, "expert_timesteps": 1600, "learning_rate": 3e-3, "batch_size": 128}
+    settings |= {"gradient_steps": 16, "train_freq": 8, "policy_kwargs": {"net_arch": [64, 64]}, "ent_coef": 0.01}
+    model = pendulum(8, **settings).learn(8000)
+    agent, new = (evaluate_policy(each, make_vec_env("Pendulum-v1", 16, seed=1), 16)[0] for each in (model, pendulum()))
+    assert agent > -300 and new < -900  # the expert has about -150

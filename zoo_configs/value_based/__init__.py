@@ -1,0 +1,1 @@
+"""Pipelines whose second stage learns by values: SAC from an imitation."""
