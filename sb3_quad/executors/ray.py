@@ -159,10 +159,13 @@ def check_cluster(address: str) -> None:
 
 
 def _copy_package(folder: Path) -> Path:
-    """This package as a wheel lays it out, so that a checkout's ``envs/`` and its like are where others find them."""
+    """This package as a wheel lays it out, so that a checkout's ``envs/`` and its like are where others find them.
+
+    What is compiled already comes along; a node of another kind compiles anew.
+    """
     target = folder / "sb3_quad"
     roots = [Path(path) for path in sb3_quad.__path__]
-    ignored = shutil.ignore_patterns("__pycache__")
+    ignored = shutil.ignore_patterns("*.pyc")
     shutil.copytree(roots[0], target, ignore=ignored)
     for root in roots[1:]:
         for name in ("envs", "callbacks", "zoo_configs"):

@@ -4,6 +4,8 @@ A block (:mod:`.block`) is reached through one pointer, and every array in it ha
 each distance between two rows, needs no test for overlap, and vectorises the loops over lanes.
 """
 
+import functools
+import hashlib
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -36,11 +38,14 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     return dispatcher
 
 
-def _source_stamp() -> tuple[tuple[str, float, int], ...]:
-    package = Path(__file__).resolve().parents[2]
-    folders = ("base", "vehicles", "simulation", "experts", "networks")
-    files = sorted(path for folder in folders for path in (package / folder).rglob("*.py"))
-    return tuple((path.name, path.stat().st_mtime, path.stat().st_size) for path in files)
+@functools.cache
+def _source_stamp() -> str:
+    """A digest of what is compiled in: the same for copies of it, such as those that a cluster's nodes are sent."""
+    package, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
+    for folder in ("base", "vehicles", "simulation", "experts", "networks"):
+        for path in sorted((package / folder).rglob("*.py")):
+            digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 @intrinsic
