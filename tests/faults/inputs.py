@@ -54,6 +54,7 @@ BASES = {
     "publish": "itm-recovery --name mine --episodes 1",
     "record-video": "pid -n 3 --size 64x64",
     "report": "no_results",
+    "sweep": "sweep.yaml --dry-run",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
     "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 --n-evaluations 1",
     "tune-expert": "-n 1 --starts 60 --targets 1 --no-progress",
@@ -65,6 +66,7 @@ def cases() -> list[Case]:
     """All of them, in a fixed order."""
     found: list[Case] = []
     files = {"settings.yml": _yaml({"QuadTargetTracking-v0": SETTINGS}), "suite.yaml": _yaml(SUITE)}
+    files["sweep.yaml"] = _yaml({"algo": "dagger", "env": "QuadTargetTracking-v0", "seed": [0, 1]})
     subparsers: Any = next(each for each in make_parser()._actions if isinstance(each, argparse._SubParsersAction))
     assert {*COMMANDS} == {*BASES}
     for command, base in BASES.items():
