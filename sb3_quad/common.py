@@ -14,7 +14,8 @@ from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
 from torch.nn import functional as F
 
-from sb3_quad.base.arrays import Float32Array
+from sb3_quad.base.arrays import Arrays, Float32Array
+from sb3_quad.experts.controller import Controller
 from sb3_quad.networks import LOSS, Perceptron
 
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
@@ -75,6 +76,30 @@ def value_loss(values: th.Tensor, old_values: th.Tensor, returns: th.Tensor, cli
 def l2_loss(policy: ActorCriticPolicy) -> th.Tensor:
     """½ Σ w² over the weight matrices of actor and critic (Eq. 2.25), a scalar; biases and log_std are left out."""
     return 0.5 * th.stack([weights.square().sum() for weights in policy.parameters() if weights.ndim > 1]).sum()
+
+
+class Taught:
+    """What an expert teaches, mixed into an algorithm: what the expert remembers from rollout to rollout."""
+
+    expert: Any
+    _labeller: Controller | None = None  # the expert, with what it remembers
+
+    def _excluded_save_params(self) -> list[str]:
+        # Nothing of this package may be pickled: PPO.load must work where it is not installed.
+        return [*super()._excluded_save_params(), "expert", "_labeller"]  # type: ignore[misc]
+
+    def memory(self) -> Arrays:
+        """What is remembered from rollout to rollout and is in no zip, as :meth:`restore_memory` takes it: by the expert."""
+        return {} if self._labeller is None else self._labeller.memory()
+
+    def restore_memory(self, memory: Arrays) -> None:
+        """Go back to a :meth:`memory`; the model needs its expert and environment.
+
+        :raises ExpertError: an expert whose memory could not be saved.
+        """
+        if memory:
+            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[attr-defined]
+            self._labeller.restore(memory)
 
 
 class Perceptrons(NamedTuple):

@@ -2,10 +2,10 @@
 
 import importlib
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
-from sb3_quad.base.errors import MissingExtra
+from sb3_quad.base.errors import ConfigError, MissingExtra
 
 
 def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -24,6 +24,19 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str]
         return sorted({*vars(sys.modules[package]), *modules})
 
     return get, names
+
+
+def import_packages(packages: Iterable[str], where: str) -> None:
+    """Import modules that the user names, as those that register further environments.
+
+    :param where: they are named, for the message.
+    :raises ConfigError: one that cannot be imported.
+    """
+    for package in packages:
+        try:
+            importlib.import_module(package)
+        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+            raise ConfigError(f"{where} {package}: cannot be imported ({type(error).__name__}: {error})") from None
 
 
 def require(module: str, extra: str, what: str) -> Any:

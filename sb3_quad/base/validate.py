@@ -1,13 +1,16 @@
 """Validated data: one base class for records and settings, and errors of one line."""
 
+import json
 import typing
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.files import read_text
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -35,6 +38,18 @@ def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -
         kind = next((each for each in kinds if len(kinds) == 1 and issubclass(each, ConfigError)), ConfigError)
         place = where if isinstance(where, str) else where(str((error.errors()[0]["loc"] or ("",))[0]))
         raise kind(f"{place}: {explain(error, model)}") from None
+
+
+def read_record(path: Path, model: type[Model]) -> Model:
+    """The record in a JSON file.
+
+    :raises ConfigError: the file is missing, holds no JSON, or no such record.
+    """
+    text = read_text(path)
+    try:
+        return validate(model, json.loads(text), "damaged, or of another version")
+    except ValueError as error:  # no JSON, or no such record
+        raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:

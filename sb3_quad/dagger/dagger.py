@@ -21,7 +21,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Arrays, Float32Array, FloatArray, IntArray
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 from sb3_quad.experts.controller import Controller
@@ -35,7 +35,7 @@ _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.", "
 Timeout = tuple[int, int, npt.NDArray[Any], Any]  # step, environment, last observation, what the critic remembered
 
 
-class DAgger(OnPolicyAlgorithm):
+class DAgger(common.Taught, OnPolicyAlgorithm):
     """Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
 
     In every control step and every environment, independently, the expert's action flies with probability β, else the agent's
@@ -164,7 +164,6 @@ class DAgger(OnPolicyAlgorithm):
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
         self.expert: Any = None
-        self._labeller: Controller | None = None  # the expert, with what it remembers from rollout to rollout
         self._n_rollouts = 0
         self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
 
@@ -483,18 +482,4 @@ class DAgger(OnPolicyAlgorithm):
         self.dataset.load(path)
 
     def _excluded_save_params(self) -> list[str]:
-        # Nothing of this package may be pickled: PPO.load must work where it is not installed.
-        return [*super()._excluded_save_params(), "expert", "dataset", "_labeller"]
-
-    def memory(self) -> Arrays:
-        """What is remembered from rollout to rollout and is in no zip, as :meth:`restore_memory` takes it: by the expert."""
-        return {} if self._labeller is None else self._labeller.memory()
-
-    def restore_memory(self, memory: Arrays) -> None:
-        """Go back to a :meth:`memory`; the model needs its expert and environment.
-
-        :raises ExpertError: an expert whose memory could not be saved
-        """
-        if memory:
-            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[arg-type]
-            self._labeller.restore(memory)
+        return [*super()._excluded_save_params(), "dataset"]

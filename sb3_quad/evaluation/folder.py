@@ -2,7 +2,6 @@
 
 import csv
 import io
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,8 +10,8 @@ import numpy as np
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, read_text, write_arrays, write_text
-from sb3_quad.base.validate import Frozen, Model, validate
+from sb3_quad.base.files import read_arrays, write_arrays, write_text
+from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.controllers import file_name
 from sb3_quad.evaluation.records import Entry, Results
 
@@ -32,7 +31,7 @@ def load_results(folder: str | Path) -> Results:
     path = Path(folder) / RESULTS
     if not path.is_file():
         raise ConfigError(f"{path}: no such file; evaluate writes it")
-    return _read(path, Results)
+    return read_record(path, Results)
 
 
 def read_entries(folder: Path) -> Iterator[Entry]:
@@ -42,7 +41,7 @@ def read_entries(folder: Path) -> Iterator[Entry]:
     """
     for path in sorted((folder / FLIGHTS).glob("*/*.json")):
         if path.with_suffix(".npz").is_file():
-            yield _read(path, Entry)
+            yield read_record(path, Entry)
 
 
 def flights_path(controller: str, scenario: str) -> str:
@@ -104,11 +103,3 @@ def _rows(entry: Entry, arrays: Arrays) -> Iterator[dict[str, Any]]:
 
 def _write(path: Path, record: Frozen) -> None:
     write_text(path, record.model_dump_json(indent=2) + "\n")
-
-
-def _read(path: Path, model: type[Model]) -> Model:
-    text = read_text(path)
-    try:
-        return validate(model, json.loads(text), "damaged, or of another version")
-    except ValueError as error:  # no JSON, or no such record
-        raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None

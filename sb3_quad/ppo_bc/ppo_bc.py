@@ -20,7 +20,7 @@ from torch.nn import functional as F
 from typing_extensions import Self
 
 from sb3_quad import common
-from sb3_quad.base.arrays import Arrays, Float32Array, FloatArray, IntArray
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.experts.controller import Controller
 from sb3_quad.networks import shared_out
@@ -29,7 +29,7 @@ from sb3_quad.ppo_bc.buffer import ExpertRolloutBuffer
 BC_FILTERS = ("none", "negative_advantage", "agreement")
 
 
-class PPOBC(PPO):
+class PPOBC(common.Taught, PPO):
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
     The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H · entropy + c_BC · L_BC.
@@ -89,7 +89,6 @@ class PPOBC(PPO):
         if critic_warmup < 0:
             raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
         self.expert = expert
-        self._labeller: Controller | None = None  # the expert, with what it remembers from rollout to rollout
         self.bc_coef = bc_coef
         self.bc_loss: common.CloningLoss = bc_loss
         self.bc_filter = bc_filter
@@ -119,20 +118,7 @@ class PPOBC(PPO):
             self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "expert", "_labeller", "rollout_buffer_class", "rollout_buffer_kwargs"]
-
-    def memory(self) -> Arrays:
-        """What the expert remembers from rollout to rollout and is in no zip, as :meth:`restore_memory` takes it."""
-        return {} if self._labeller is None else self._labeller.memory()
-
-    def restore_memory(self, memory: Arrays) -> None:
-        """Go back to a :meth:`memory`; the model needs its expert and environment.
-
-        :raises ExpertError: an expert whose memory could not be saved.
-        """
-        if memory:
-            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[arg-type]
-            self._labeller.restore(memory)
+        return [*super()._excluded_save_params(), "rollout_buffer_class", "rollout_buffer_kwargs"]
 
     @property
     def policy_is_idle(self) -> bool:

@@ -25,7 +25,7 @@ BC_FILTERS = ("none", "q", "agreement")
 LABELS = "labels"  # among what is remembered: the expert's actions for the present states
 
 
-class SACBC(SAC):
+class SACBC(common.Taught, SAC):
     """Soft Actor-Critic with an expert (SAC+BC): its transitions, its actions and its proposals, each a switch of its own.
 
     All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the additions at their defaults it is
@@ -104,7 +104,6 @@ class SACBC(SAC):
         self.critic_warmup = critic_warmup
         self._clones = False
         self.expert_buffer: ReplayBuffer | None = None
-        self._labeller: Controller | None = None  # the expert, with what it remembers
         self._labels: Float32Array | None = None  # (n_envs, action_dim): its scaled actions for the present states
 
         if _init_setup_model:
@@ -341,22 +340,15 @@ class SACBC(SAC):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "expert", "expert_buffer", "_labeller", "_labels"]
+        return [*super()._excluded_save_params(), "expert_buffer", "_labels"]
 
     def memory(self) -> Arrays:
-        """What the expert has said and remembers, and is in no zip, as :meth:`restore_memory` takes it."""
-        said = {} if self._labels is None else {LABELS: self._labels}
-        return said | ({} if self._labeller is None else self._labeller.memory())
+        """As of any algorithm that an expert teaches, and what the expert has said."""
+        return super().memory() | ({} if self._labels is None else {LABELS: self._labels})
 
     def restore_memory(self, memory: Arrays) -> None:
-        """Go back to a :meth:`memory`; the model needs its expert and environment.
-
-        :raises ExpertError: an expert whose memory could not be saved.
-        """
         self._labels = memory.get(LABELS)
-        if memory:
-            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[arg-type]
-            self._labeller.restore({name: array for name, array in memory.items() if name != LABELS})
+        super().restore_memory({name: array for name, array in memory.items() if name != LABELS})
 
 
 def _widen(buffer: ReplayBuffer, width: int) -> None:

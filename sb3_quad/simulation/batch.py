@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.base.cores import available_cpus, use_cpus
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
@@ -14,7 +15,7 @@ from sb3_quad.simulation.designs import resolve_vehicles
 from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.random import new_streams
 from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
-from sb3_quad.simulation.engine.workers import available_cpus, batch_lock, compilation_notice, run, use_cpus
+from sb3_quad.simulation.engine.workers import batch_lock, compilation_notice, run
 from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE

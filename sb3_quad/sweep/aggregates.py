@@ -3,7 +3,6 @@
 Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Precipice, NeurIPS 2021.
 """
 
-import importlib
 import importlib.util
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -25,7 +24,7 @@ def aggregates(groups: Mapping[str, Sequence[RunRecord]]) -> dict[str, Any] | No
     scores = {name: score for name, score in scores.items() if score is not None}
     if not scores or importlib.util.find_spec("rliable") is None:
         return None
-    library, metrics = importlib.import_module("rliable.library"), importlib.import_module("rliable.metrics")
+    from rliable import library, metrics
 
     def measured(values: Any) -> Any:
         return np.array([getattr(metrics, name)(values) for name in NAMES])

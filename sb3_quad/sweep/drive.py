@@ -1,7 +1,6 @@
 """Doing the runs of a sweep by an executor: what is left of them, in order, whatever ends on the way."""
 
-from collections.abc import Callable
-from pathlib import Path
+from collections.abc import Callable, Mapping
 
 from sb3_quad.base.errors import WorkerDied
 from sb3_quad.base.signals import StopSignals
@@ -17,9 +16,9 @@ TICK = 1.0  # s between two looks for a signal
 TRIES = 2  # of a run whose worker process dies
 
 
-def what_is_left(place: SweepFolder, plan: Plan, report: Callable[[str], None]) -> list[Run]:
+def what_is_left(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], report: Callable[[str], None]) -> list[Run]:
     """The runs of a sweep that are not finished; told of each in one line that is there in part."""
-    records, left = place.records(plan.runs), []
+    left = []
     for run in plan.runs:
         record = records.get(run.name)
         if record is not None and record.state == "finished":
@@ -45,8 +44,9 @@ def execute(
     :return: the records of all runs that ended, those of earlier calls included, by name.
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    left = what_is_left(place, plan, report)
-    records = {name: record for name, record in place.records(plan.runs).items() if record.state == "finished"}
+    records = place.records(plan.runs)
+    left = what_is_left(place, plan, records, report)
+    records = {name: record for name, record in records.items() if record.state == "finished"}
     flying = Flying(plan.suite, plan.spec.evaluation.episodes or EPISODES, plan.spec.evaluation.seed or 0)
     tasks = {_submit(place, plan, run, flying, executor): run for run in left}
     tries = dict.fromkeys((run.name for run in left), 1)
@@ -105,7 +105,7 @@ def _storage(place: SweepFolder, plan: Plan) -> str | None:
     """Where the runs of this sweep travel through, apart from those of others."""
     if plan.spec.storage is None:
         return None
-    return f"{plan.spec.storage.rstrip('/')}/{Path(place.path).resolve().name}"
+    return f"{plan.spec.storage.rstrip('/')}/{place.path.resolve().name}"
 
 
 def _collect(place: SweepFolder, run: Run, task: Task) -> RunRecord:

@@ -8,7 +8,6 @@ A sweep's folder holds
 - ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was measured.
 """
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,8 +15,8 @@ import yaml
 from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_text, write_text
-from sb3_quad.base.validate import Frozen, Model, validate
+from sb3_quad.base.files import write_text
+from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.scenarios.scenario import Suite
 from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.records import RunRecord
@@ -62,7 +61,7 @@ class SweepFolder:
             raise ConfigError(f"sweep folder {self.path}: no such folder")
         if not self.plan.is_file():
             raise ConfigError(f"sweep folder {self.path}: holds no sweep (plan.json is missing)")
-        return _read(self.plan, Plan)
+        return read_record(self.plan, Plan)
 
     def run(self, run: Run) -> Path:
         """The folder of a run, absolute: what is written in it names files that are looked for from anywhere."""
@@ -74,15 +73,7 @@ class SweepFolder:
 
     def records(self, runs: Sequence[Run]) -> dict[str, RunRecord]:
         """The records of those runs that ended, by name."""
-        return {run.name: _read(self._record(run.name), RunRecord) for run in runs if self._record(run.name).is_file()}
+        return {run.name: read_record(self._record(run.name), RunRecord) for run in runs if self._record(run.name).is_file()}
 
     def _record(self, name: str) -> Path:
         return self.path / "records" / f"{name}.json"
-
-
-def _read(path: Path, model: type[Model]) -> Model:
-    text = read_text(path)
-    try:
-        return validate(model, json.loads(text), "damaged, or of another version")
-    except ValueError as error:  # no JSON, or no such record
-        raise ConfigError(f"{path}: {error}; remove it, or name another folder") from None

@@ -13,15 +13,13 @@ from sb3_quad.report.plots import Plot
 from sb3_quad.report.sections import Section
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.results import finished
+from sb3_quad.sweep.results import Found, tables
 
 
-def write_report(
-    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Mapping[str, Sequence[Table]]
-) -> Path:
+def write_report(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found) -> Path:
     """Write the report of a sweep's finished runs; a later one replaces it.
 
-    :param found: the tables, by scenario.
+    :param found: what :func:`~sb3_quad.sweep.results.evaluate` says of them.
     :return: the page.
     :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
         not be written.
@@ -37,35 +35,33 @@ def write_report(
         write_bytes(place.path / PICTURES / f"{plot.name}.png", plot.png)
         write_bytes(place.path / PICTURES / f"{plot.name}.svg", plot.svg)
     page = place.path / PAGE
-    write_text(page, render_page(title, _facts(plan, records), parts))
+    write_text(page, render_page(title, _facts(plan, found), parts))
     return page
 
 
-def sections(
-    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Mapping[str, Sequence[Table]]
-) -> list[Section]:
+def sections(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found) -> list[Section]:
     """A section for each scenario, the learning curves, the runs."""
     parts = [
         Section(f"scenario-{number}", scenario, "", flown, facts=flown[0].caption)
-        for number, (scenario, flown) in enumerate(found.items())
+        for number, (scenario, flown) in enumerate(tables(found).items())
     ]
-    plots = _curves(place, plan, records)
+    plots = _curves(place, found)
     if plots:
         parts.append(Section("curves", "Learning curves", "Mean over seeds, with their range.", [], plots))
     parts.append(Section("runs", "Runs", "", [_runs(plan, records)]))
     return parts
 
 
-def _curves(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord]) -> list[Plot]:
+def _curves(place: SweepFolder, found: Found) -> list[Plot]:
     """A plot of the evaluations along the way; of pipelines, one for each algorithm and environment of a stage."""
-    found: dict[str, dict[str, list[Curve]]] = {}
-    for name, group in finished(plan, records).items():
+    curves: dict[str, dict[str, list[Curve]]] = {}
+    for name, group in found.groups.items():
         for record in group:
             for path in sorted((place.path / "runs" / record.name).glob("*/*/evaluations.npz")):
                 kind = f"{path.parent.parent.name} {path.parent.name.rpartition('_')[0]}"
-                found.setdefault(kind, {}).setdefault(name, []).append(read_curve(path.parent))
+                curves.setdefault(kind, {}).setdefault(name, []).append(read_curve(path.parent))
     plots = []
-    for number, (kind, groups) in enumerate(found.items()):
+    for number, (kind, groups) in enumerate(curves.items()):
         try:
             figure = plot_curves(groups, {}, kind)
         except ConfigError:  # nothing of what is shown was measured
@@ -86,6 +82,6 @@ def _runs(plan: Plan, records: Mapping[str, RunRecord]) -> Table:
     return text_table("", ("run", "state", "timesteps", "agent"), rows, align="left")
 
 
-def _facts(plan: Plan, records: Mapping[str, RunRecord]) -> str:
-    done = sum(len(group) for group in finished(plan, records).values())
+def _facts(plan: Plan, found: Found) -> str:
+    done = sum(len(group) for group in found.groups.values())
     return f"{done} of {len(plan.runs)} runs of {len(plan.configurations)} configurations are finished."

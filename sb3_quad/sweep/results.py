@@ -5,7 +5,7 @@ import io
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -33,17 +33,33 @@ MOST_COMPARED = 8  # configurations of which every pair is compared
 Records = Mapping[str, RunRecord]
 
 
-def finished(plan: Plan, records: Records) -> dict[str, list[RunRecord]]:
-    """The finished runs of each configuration that has any, by seed."""
-    groups = {name: [] for name in plan.configurations}  # type: dict[str, list[RunRecord]]
+class Found(NamedTuple):
+    """What a sweep found.
+
+    :param groups: by configuration, its finished runs, in the order of the seeds; only configurations that have any.
+    :param intervals: by configuration, scenario and measure; None: not measured.
+    :param comparisons: by scenario, measure and pair of configurations.
+    """
+
+    groups: dict[str, list[RunRecord]]
+    intervals: dict[tuple[str, str, str], Interval | None]
+    comparisons: dict[tuple[str, str, str, str], Comparison]
+
+
+def evaluate(plan: Plan, records: Records) -> Found:
+    """Means, intervals and comparisons of all runs that are finished."""
+    groups: dict[str, list[RunRecord]] = {name: [] for name in plan.configurations}
     for run in plan.runs:
         record = records.get(run.name)
         if record is not None and record.state == "finished":
             groups[run.configuration].append(record)
-    return {name: group for name, group in groups.items() if group}
+    groups = {name: group for name, group in groups.items() if group}
+    keys = itertools.product(groups, scenarios_of(groups), MEASURES)
+    intervals = {key: _over_seeds(matrix(groups[key[0]], *key[1:]), key[2]) for key in keys}
+    return Found(groups, intervals, comparisons(groups))
 
 
-def write_results(place: SweepFolder, plan: Plan, records: Records) -> None:
+def write_results(place: SweepFolder, plan: Plan, records: Records, found: Found) -> None:
     """Write ``results.csv``, a line for each run and scenario, and ``results.json``.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
@@ -54,49 +70,47 @@ def write_results(place: SweepFolder, plan: Plan, records: Records) -> None:
     writer.writeheader()
     writer.writerows(rows)
     write_text(place.path / CSV, text.getvalue())
-    groups = finished(plan, records)
     content = {
         "sweep": plan.spec.name,
         "package_version": __version__,
         "runs": len(plan.runs),
-        "finished": sum(len(group) for group in groups.values()),
+        "finished": sum(len(group) for group in found.groups.values()),
         "failed": {name: record.message for name, record in records.items() if record.state == "failed"},
         "configurations": {
-            name: {"seeds": [record.seed for record in group], "scenarios": _summary(group)} for name, group in groups.items()
+            name: {"seeds": [record.seed for record in group], "scenarios": _summary(found, name)}
+            for name, group in found.groups.items()
         },
         "comparisons": [
-            {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": found.verdict}
-            | found.difference._asdict()
-            for (scenario, measure, first, second), found in comparisons(groups).items()
+            {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": pair.verdict}
+            | pair.difference._asdict()
+            for (scenario, measure, first, second), pair in found.comparisons.items()
         ],
-        "aggregates": aggregates(groups),
+        "aggregates": aggregates(found.groups),
     }
     write_text(place.path / JSON, json.dumps(content, indent=1) + "\n")
 
 
-def tables(plan: Plan, records: Records) -> dict[str, list[Table]]:
+def tables(found: Found) -> dict[str, list[Table]]:
     """By scenario, a column for each configuration; and who is better than whom."""
-    groups = finished(plan, records)
-    pairs = comparisons(groups)
-    found: dict[str, list[Table]] = {}
-    for scenario in scenarios_of(groups):
+    made: dict[str, list[Table]] = {}
+    for scenario in scenarios_of(found.groups):
         rows = []
         for measure, (row, factor, decimals) in ROWS.items():
-            cells = [_cell(_of(group, scenario, measure), factor, decimals) for group in groups.values()]
+            cells = [_cell(found.intervals[name, scenario, measure], factor, decimals) for name in found.groups]
             if any(cell != Cell() for cell in cells):
                 rows.append(Row(row.name, row.unit, cells))
-        columns = [Column(f"{name} ({_count(group)})") for name, group in groups.items()]
-        found[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
+        columns = [Column(f"{name} ({_count(group)})") for name, group in found.groups.items()]
+        made[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
         lines = [
             Row(f"{first} than {second}", ROWS[measure][0].heading, [Cell(words=pair.verdict), _difference(pair, measure)])
-            for (where, measure, first, second), pair in pairs.items()
+            for (where, measure, first, second), pair in found.comparisons.items()
             if where == scenario
         ]
         if lines:
             heads = [Column("is", align="left"), Column("difference")]
             note = "paired bootstrap over the seeds and episodes that both have"
-            found[scenario].append(Table(heads, lines, title=f"{scenario}: better, worse, cannot tell", caption=note))
-    return found
+            made[scenario].append(Table(heads, lines, title=f"{scenario}: better, worse, cannot tell", caption=note))
+    return made
 
 
 def comparisons(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Comparison]:
@@ -128,18 +142,16 @@ def matrix(records: Sequence[RunRecord], scenario: str, measure: str) -> FloatAr
     return np.array(rows, dtype=np.float64)
 
 
-def _of(group: Sequence[RunRecord], scenario: str, measure: str) -> Interval | None:
-    values = matrix(group, scenario, measure)
+def _over_seeds(values: FloatArray | None, measure: str) -> Interval | None:
     return None if values is None else over_seeds(values, measure)
 
 
-def _summary(group: Sequence[RunRecord]) -> dict[str, Any]:
-    names = scenarios_of({"": group})
-    found = {name: {measure: _of(group, name, measure) for measure in MEASURES} for name in names}
-    return {
-        name: {measure: None if value is None else value._asdict() for measure, value in measures.items()}
-        for name, measures in found.items()
-    }
+def _summary(found: Found, configuration: str) -> dict[str, Any]:
+    def entry(interval: Interval | None) -> dict[str, float] | None:
+        return None if interval is None else interval._asdict()
+
+    names = scenarios_of({"": found.groups[configuration]})
+    return {name: {measure: entry(found.intervals[configuration, name, measure]) for measure in MEASURES} for name in names}
 
 
 def _rows(record: RunRecord) -> list[dict[str, Any]]:

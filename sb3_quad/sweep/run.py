@@ -1,7 +1,6 @@
 """What a worker does: train a run of a sweep as ``train`` does, or what is left of it, and fly its agent."""
 
 import hashlib
-import importlib
 import shutil
 from collections.abc import Mapping
 from contextlib import closing
@@ -14,7 +13,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.imports import require
+from sb3_quad.base.imports import import_packages, require
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import validate
 from sb3_quad.evaluation.controllers import ControllerSpec, build
@@ -63,8 +62,7 @@ def work(run: Run, folder: str, flying: Flying) -> RunRecord:
     place = Path(folder)
     try:
         place.mkdir(parents=True, exist_ok=True)
-        for module in run.gym_packages:
-            importlib.import_module(module)
+        import_packages(run.gym_packages, "gym_packages:")
         trained = _train_pipeline(run, place) if run.pipeline is not None else _train_single(run, place)
         if trained is None:
             return RunRecord(**name, state="interrupted")

@@ -1,7 +1,6 @@
 """Control steps per second of every way to fly, and of a whole training loop, measured in one process after another."""
 
 import itertools
-import os
 import platform
 import re
 import time
@@ -24,6 +23,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 import sb3_quad
 from sb3_quad import common
+from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.controller import Controller
 from sb3_quad.networks import Perceptron
@@ -174,7 +174,7 @@ def machine() -> dict[str, Any]:
     named = re.search(r"model name\s*: (.*)", cpuinfo.read_text(encoding="utf-8")) if cpuinfo.is_file() else None
     return {
         "processor": named[1] if named else platform.processor() or platform.machine(),
-        "cores": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "cores": available_cpus(),
         "system": platform.platform(),
         "python": platform.python_version(),
         "versions": {"sb3_quad": sb3_quad.__version__, **{package: metadata.version(package) for package in PACKAGES}},

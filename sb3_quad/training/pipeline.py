@@ -175,7 +175,7 @@ def run_pipeline(
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was missed.
     """
     status = Status(stages=pipeline.stages, job=dict(job), done=(), current=None)
-    jobs = _make_jobs(status)
+    jobs = stage_jobs(status, status.job)
     check_tensorboard(jobs[0])
     return _go_on(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
@@ -190,7 +190,7 @@ def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **chang
     """
     status = validate(Status, *SETTINGS.read(folder / STATUS_FILE))
     status = status.model_copy(update={"job": {**status.job, **changes}})
-    return _go_on(folder, status, _make_jobs(status), report, **changes)
+    return _go_on(folder, status, stage_jobs(status, status.job), report, **changes)
 
 
 def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
@@ -198,12 +198,8 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
 
     :raises ConfigError: settings of a stage, or arguments of its job, that do not fit.
     """
-    return _make_jobs(Status(stages=pipeline.stages, job=dict(job), done=(), current=None))
-
-
-def _make_jobs(status: Status) -> list[TrainingJob]:
     jobs = []
-    for stage in status.stages:
+    for stage in pipeline.stages:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
@@ -214,7 +210,7 @@ def _make_jobs(status: Status) -> list[TrainingJob]:
                 f"{where}: trim {stage.trim} is for agents that read the 18 features, not for ones that remember"
             )
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
-        jobs.append(validate(TrainingJob, {**status.job, **own, "config": config}, where))
+        jobs.append(validate(TrainingJob, {**job, **own, "config": config}, where))
     return jobs
 
 

@@ -1,16 +1,16 @@
 """``sweep``: many trainings, compared on the same fresh episodes."""
 
 import argparse
-import importlib
-import os
 import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.base.files import locked
+from sb3_quad.base.imports import import_packages
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
@@ -22,7 +22,7 @@ from sb3_quad.sweep.expand import expand, suite_of
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.page import write_report
 from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.results import tables, write_results
+from sb3_quad.sweep.results import Found, evaluate, tables, write_results
 from sb3_quad.sweep.spec import SweepSpec, load_sweep
 from sb3_quad.training.pipeline import is_pipeline
 from sb3_quad.training.runs import claim_folder
@@ -46,11 +46,7 @@ def run(options: argparse.Namespace) -> int:
 
 def run_spec(options: argparse.Namespace, spec: SweepSpec) -> int:
     """A new sweep, or with ``--dry-run`` the list of its runs. Returns the exit code."""
-    for package in spec.gym_packages:
-        try:
-            importlib.import_module(package)
-        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-            raise ConfigError(f"gym_packages: {package}: cannot be imported ({type(error).__name__}: {error})") from None
+    import_packages(spec.gym_packages, "gym_packages:")
     plan = Plan(spec=spec, runs=tuple(expand(spec)), suite=suite_of(spec))
     if options.dry_run:
         for each in plan.runs:
@@ -66,7 +62,7 @@ def run_sweep(options: argparse.Namespace, plan: Plan, place: SweepFolder | None
     :param place: its folder; None: a new one.
     """
     start = time.perf_counter()
-    needs, workers = plan.spec.resources, options.workers or _cores()
+    needs, workers = plan.spec.resources, options.workers or available_cpus()
     workers = min(workers, len(plan.runs))
     with start_executor(options.executor, workers, options.address, needs.num_cpus, needs.num_gpus) as executor:
         if place is None:
@@ -79,8 +75,9 @@ def run_sweep(options: argparse.Namespace, plan: Plan, place: SweepFolder | None
             records = execute(place, plan, executor, signals, show, print)
             signals.hold()
             executor.close()
-            write_results(place, plan, records)
-            code = _finish(place, plan, records, time.perf_counter() - start)
+            found = evaluate(plan, records)
+            write_results(place, plan, records, found)
+            code = _finish(place, plan, records, found, time.perf_counter() - start)
     if signals.received is not None:
         print(f"to go on: --resume {place.path}")
         return signals.exit_code
@@ -128,12 +125,11 @@ def with_defaults(data: Mapping[str, Any]) -> dict[str, Any]:
     return whole
 
 
-def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], seconds: float) -> int:
+def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, seconds: float) -> int:
     """Print the tables, write the report, tell what failed. Returns the exit code."""
     done = [record for record in records.values() if record.state == "finished"]
     if done:
-        found = tables(plan, records)
-        for table in (table for each in found.values() for table in each):
+        for table in (table for each in tables(found).values() for table in each):
             console().print(table)
         try:
             write_report(place, plan, records, found)
@@ -145,10 +141,6 @@ def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], se
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
     return 1 if failures else 0
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _what(each: Any) -> str:

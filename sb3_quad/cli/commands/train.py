@@ -1,7 +1,6 @@
 """``train``: one training run, and its agent beside the expert at the end; or a pipeline of several."""
 
 import argparse
-import importlib
 import time
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from typing import Any
 import torch
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.imports import import_packages
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.validate import validate
 from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
@@ -96,11 +96,7 @@ def prepare(options: argparse.Namespace) -> None:
 
     :raises ConfigError: a module that cannot be imported.
     """
-    for package in options.gym_packages:
-        try:
-            importlib.import_module(package)
-        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-            raise ConfigError(f"--gym-packages {package}: cannot be imported ({type(error).__name__}: {error})") from None
+    import_packages(options.gym_packages, "--gym-packages")
     if options.num_threads is None:
         share_out()
     else:

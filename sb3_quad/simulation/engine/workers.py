@@ -16,6 +16,7 @@ import numpy as np
 from numba.core import event
 
 from sb3_quad.base.arrays import IntArray
+from sb3_quad.base.cores import available_cpus
 from sb3_quad.simulation.engine.lowlevel import LANES
 from sb3_quad.simulation.engine.work import AWAKE, BUSY, JOB, LATE, LINE, NOT_FINITE, StepArrays, step_arrays, work
 
@@ -23,21 +24,6 @@ PATIENCE = 20_000  # looks for a block before a worker sleeps: some 30 microseco
 WORTHWHILE = 3  # blocks; fewer are done before a worker has woken
 REST = 100  # jobs done without workers after one kept a job waiting: its core is busy with something else
 MOST = 64  # workers
-
-
-_most_cpus: int | None = None
-
-
-def use_cpus(count: int) -> None:
-    """Have this process use no more CPUs, as one of several that share a machine."""
-    global _most_cpus
-    _most_cpus = count
-
-
-def available_cpus() -> int:
-    """CPUs that this process may use."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return count if _most_cpus is None else min(count, _most_cpus)
 
 
 class Workers:
