@@ -4,11 +4,13 @@ Agarwal et al., Deep Reinforcement Learning at the Edge of the Statistical Preci
 """
 
 import importlib.util
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from sb3_quad.base.files import one_line
 from sb3_quad.sweep.records import SUCCESS, RunRecord
 
 REPETITIONS = 2000
@@ -18,13 +20,19 @@ NAMES = ("aggregate_median", "aggregate_iqm", "aggregate_mean", "aggregate_optim
 def aggregates(groups: Mapping[str, Sequence[RunRecord]]) -> dict[str, Any] | None:
     """Median, interquartile mean, mean and optimality gap of the success rates, with 95 % intervals, by configuration.
 
-    The intervals are rliable's stratified bootstrap over runs. None: rliable is not installed, or nothing has success rates.
+    The intervals are rliable's stratified bootstrap over runs. None: rliable cannot be imported, or nothing has success
+    rates.
     """
     scores = {name: _scores(group) for name, group in groups.items()}
     scores = {name: score for name, score in scores.items() if score is not None}
     if not scores or importlib.util.find_spec("rliable") is None:
         return None
-    from rliable import library, metrics
+    try:
+        from rliable import library, metrics
+    except Exception as error:  # with another pandas than it knows, a TypeError
+        why = one_line(error)
+        warnings.warn(f"no aggregate metrics: rliable cannot be imported ({why}); pip install 'pandas<3'", stacklevel=2)
+        return None
 
     def measured(values: Any) -> Any:
         return np.array([getattr(metrics, name)(values) for name in NAMES])
