@@ -64,10 +64,16 @@ def main() -> None:
         print(f"one by one {alone:.1f} s, two at a time {both:.1f} s, start-up {begin:.1f} s; load {os.getloadavg()[0]:.1f}")
         return
     seconds = timed(folder, "sweep.yaml", "--workers", "2")
-    whole, moments, kept = table(folder, 1), random.Random(options.seed), 0
+    whole, moments, kept, first = table(folder, 1), random.Random(options.seed), 0, 2
+    if options.kind == "node":
+        seconds, on_nodes = node(folder, 2, None)
+        if on_nodes != whole:
+            sys.exit("the undisturbed sweep on two nodes has another table than that on this machine")
+        first = 3
     for number in range(options.sweeps):
         moment = moments.uniform(0.1, 0.9) * seconds
-        same = (driver if options.kind == "driver" else node)(folder, number + 2, moment) == whole
+        found = driver(folder, number + first, moment) if options.kind == "driver" else node(folder, number + first, moment)[1]
+        same = found == whole
         kept += same
         print(f"sweep {number + 1}: killed after {moment:.1f} s: {'the same table' if same else 'ANOTHER TABLE'}", flush=True)
     print(f"{kept} of {options.sweeps} end with all runs and the same table; load {os.getloadavg()[0]:.1f}")
@@ -85,8 +91,8 @@ def driver(folder: Path, number: int, moment: float) -> str:
     return table(folder, number)
 
 
-def node(folder: Path, number: int, moment: float) -> str:
-    """The table of a sweep on two nodes, of which one is killed."""
+def node(folder: Path, number: int, moment: float | None) -> tuple[float, str]:
+    """Seconds and table of a sweep on two nodes, of which one is killed, unless ``moment`` is None."""
     import ray
     from ray.cluster_utils import Cluster
 
@@ -94,14 +100,16 @@ def node(folder: Path, number: int, moment: float) -> str:
     cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": settings})
     lost = cluster.add_node(num_cpus=1)
     try:
-        process = start(folder, "sweep.yaml", "--executor", "ray", "--address", cluster.address)
-        time.sleep(moment)
-        cluster.remove_node(lost, allow_graceful=False)
+        begin, process = time.monotonic(), start(folder, "sweep.yaml", "--executor", "ray", "--address", cluster.address)
+        if moment is not None:
+            time.sleep(moment)
+            cluster.remove_node(lost, allow_graceful=False)
         process.wait()
+        seconds = time.monotonic() - begin
     finally:
         ray.shutdown()
         cluster.shutdown()
-    return table(folder, number)
+    return seconds, table(folder, number)
 
 
 if __name__ == "__main__":
