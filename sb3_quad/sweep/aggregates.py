@@ -38,7 +38,9 @@ def aggregates(groups: Mapping[str, Sequence[RunRecord]]) -> dict[str, Any] | No
         return np.array([getattr(metrics, name)(values) for name in NAMES])
 
     state = np.random.RandomState(0)
-    found, intervals = library.get_interval_estimates(scores, measured, reps=REPETITIONS, random_state=state)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # what rliable calls will once want another generator
+        found, intervals = library.get_interval_estimates(scores, measured, reps=REPETITIONS, random_state=state)
     words = [name.removeprefix("aggregate_") for name in NAMES]
     return {
         name: {
