@@ -14,7 +14,7 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install install-zoo train test fuzz test-zoo lint format type links commit-checks clean
+.PHONY: help install train test fuzz test-zoo lint format type links commit-checks clean
 
 help:
 	@echo "make train          train with the default settings"
@@ -40,8 +40,6 @@ fuzz: $(INSTALLED)
 	@end=$$(($$(date +%s) + 60 * $(MINUTES))); while [ $$(date +%s) -lt $$end ]; do \
 		$(PY) -m pytest -m hypothesis --hypothesis-profile fuzz -o timeout=0 $(ARGS) || exit 1; \
 	done
-
-install-zoo: $(ZOO_INSTALLED)
 
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py $(ARGS)
