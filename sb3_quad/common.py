@@ -4,6 +4,7 @@ Every function takes and gives tensors; ``b`` is the mini-batch, ``a`` the actio
 a training step does not need, and agree with the policy's own methods to rounding.
 """
 
+import inspect
 import math
 from typing import Any, Literal, NamedTuple
 
@@ -12,6 +13,7 @@ import torch as th
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.policies import ActorCriticPolicy, BasePolicy
 from stable_baselines3.common.torch_layers import FlattenExtractor, MlpExtractor
+from stable_baselines3.common.type_aliases import Schedule
 from torch.nn import functional as F
 
 from sb3_quad.base.arrays import Arrays, Float32Array
@@ -78,11 +80,32 @@ def l2_loss(policy: ActorCriticPolicy) -> th.Tensor:
     return 0.5 * th.stack([weights.square().sum() for weights in policy.parameters() if weights.ndim > 1]).sum()
 
 
+def agree(mean: th.Tensor, actions: th.Tensor) -> th.Tensor:
+    """Where policy and expert are near enough to one another for the filter ``"agreement"``, bool (b,)."""
+    return (mean - actions).square().mean(dim=1) < AGREEMENT**2
+
+
+def is_ever_nonzero(schedule: Schedule) -> bool:
+    """Whether a schedule gives its term a weight anywhere, as far as a hundred samples of it tell."""
+    return any(schedule(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())
+
+
+def full_signature(stock: type, extended: type) -> inspect.Signature:
+    """The parameters of a constructor that hands all but its own keywords on: those of ``stock``, then its own."""
+    theirs, ours = (inspect.signature(each.__init__).parameters for each in (stock, extended))  # type: ignore[misc]
+    own = [parameter for parameter in ours.values() if parameter.kind is parameter.KEYWORD_ONLY]
+    return inspect.Signature([each for name, each in theirs.items() if name not in ours or name == "self"] + own)
+
+
 class Taught:
     """What an expert teaches, mixed into an algorithm: what the expert remembers from rollout to rollout."""
 
     expert: Any
     _labeller: Controller | None = None  # the expert, with what it remembers
+
+    def set_expert(self, expert: Any) -> None:
+        """Learn from ``expert`` from now on, as a model must that was loaded without one."""
+        self.expert = expert
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.

@@ -19,17 +19,20 @@ from sb3_quad.experts.unpickle import unpickle
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)
 
 # The module of the saved policy class tells the algorithm's family.
-_ACTOR_CRITIC = "stable_baselines3.common.policies"
 _FAMILIES = {
-    _ACTOR_CRITIC: "PPO",
+    "stable_baselines3.common.policies": "PPO",
     "sb3_contrib.common.recurrent.policies": "RecurrentPPO",
     "stable_baselines3.sac.policies": "SAC",
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
     "sb3_quad.recurrent.raptor_policy": "RecurrentPPO",
 }
-_OURS = {"bc_coef": "PPOBC", "beta": "DAgger"}  # settings that only these save; their zips are stock PPO's otherwise
-_STOCK = {"PPOBC": "PPO", "DAgger": "PPO", "SACBC": "SAC"}  # what reads the zips of ours
+_OURS = {  # by family, settings that only these save; their zips are the stock algorithm's otherwise
+    "PPO": {"bc_coef": "PPOBC", "beta": "DAgger"},
+    "RecurrentPPO": {"beta": "RecurrentDAgger"},
+    "SAC": {"bc_coef": "SACBC"},
+}
+_STOCK = {name: family for family, names in _OURS.items() for name in names.values()}  # what reads the zips of ours
 _TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")  # what is read of the pickles of an agent
 _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}  # for those others that cannot be None
 
@@ -66,14 +69,13 @@ def saved_algorithm(path: str | Path) -> str:
         raise ConfigError(f"model {path}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
     if module not in _FAMILIES:
         raise ConfigError(f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}")
-    if _FAMILIES[module] == "RecurrentPPO":
-        return "RecurrentDAgger" if "beta" in data else "RecurrentPPO"
-    if module == _ACTOR_CRITIC:
-        own = next((name for key, name in _OURS.items() if key in data), None)
-        return own or ("PPO" if "n_epochs" in data else "A2C")
-    if _FAMILIES[module] == "SAC" and "bc_coef" in data:
-        return "SACBC"
-    return "DDPG" if _FAMILIES[module] == "TD3" and data.get("policy_delay") == 1 else _FAMILIES[module]
+    family = _FAMILIES[module]
+    for key, name in _OURS.get(family, {}).items():
+        if key in data:
+            return name
+    if family == "PPO" and "n_epochs" not in data:
+        return "A2C"
+    return "DDPG" if family == "TD3" and data.get("policy_delay") == 1 else family
 
 
 def load_zip(algorithm: type[Algorithm], path: str | Path | io.BytesIO, to_fly: bool = False, **kwargs: Any) -> Algorithm:
@@ -99,11 +101,10 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
         that are not finite; a file that may run code of its own. :class:`MissingExtra`: a recurrent one, without sb3-contrib.
     """
     algorithm = saved_algorithm(path)
-    stock: type[BaseAlgorithm]
-    if algorithm.startswith("Recurrent"):
-        stock = require("sb3_contrib", "recurrent", f"model {path}").RecurrentPPO
-    else:
-        stock = getattr(stable_baselines3, _STOCK.get(algorithm, algorithm))
+    name = _STOCK.get(algorithm, algorithm)
+    recurrent = name == "RecurrentPPO"
+    library = require("sb3_contrib", "recurrent", f"model {path}") if recurrent else stable_baselines3
+    stock: type[BaseAlgorithm] = getattr(library, name)
     try:
         model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
     except ConfigError:

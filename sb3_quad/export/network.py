@@ -103,12 +103,10 @@ def deterministic_layers(policy: Any, where: str) -> th.nn.Sequential:
     :raises ConfigError: see :func:`check_policy`.
     """
     if type(policy) in (SACPolicy, TD3Policy) and type(policy.actor.features_extractor) is FlattenExtractor:
-        actor = policy.actor  # SAC: tanh of the mean, which gSDE bounds by a Hardtanh; TD3: all in one, its tanh included
-        return (
-            th.nn.Sequential(*actor.mu)
-            if type(policy) is TD3Policy
-            else th.nn.Sequential(*actor.latent_pi, actor.mu, th.nn.Tanh())
-        )
+        actor = policy.actor
+        if type(policy) is TD3Policy:
+            return th.nn.Sequential(*actor.mu)  # its tanh included
+        return th.nn.Sequential(*actor.latent_pi, actor.mu, th.nn.Tanh())  # gSDE bounds the mean by a Hardtanh
     check_policy(policy, where)
     # gSDE's squashed actions are the tanh of the mean; without squashing the mean is clipped.
     squash = [th.nn.Tanh()] if policy.squash_output else []

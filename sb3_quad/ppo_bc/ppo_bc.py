@@ -1,7 +1,6 @@
 """PPO with a weighted behavioural-cloning loss towards an expert: stage two of the thesis (4.2.2, Eq. 4.4)."""
 
 import functools
-import inspect
 from collections.abc import Callable, Mapping
 from typing import Any, cast
 from unittest.mock import patch
@@ -125,10 +124,6 @@ class PPOBC(common.Taught, PPO):
         """Whether the policy is still the one that it began with, since only the critic has learnt (``critic_warmup``)."""
         return 0 < self.critic_warmup >= self._n_rollouts_trained
 
-    def set_expert(self, expert: Any) -> None:
-        """Clone ``expert`` from the next rollout on, as a model must that was loaded without one."""
-        self.expert = expert
-
     def set_bc_coef(self, bc_coef: float) -> None:
         """Weigh the cloning term with ``bc_coef`` from the next rollout on, instead of the schedule given before.
 
@@ -143,7 +138,7 @@ class PPOBC(common.Taught, PPO):
 
     def will_clone(self) -> bool:
         """Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell."""
-        return any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())  # type: ignore[operator]
+        return common.is_ever_nonzero(self.bc_coef)  # type: ignore[arg-type]
 
     def _check_cloning(self) -> None:
         if self.expert is None:
@@ -384,7 +379,7 @@ class PPOBC(common.Taught, PPO):
         if self.bc_filter == "negative_advantage":
             errors = errors * (advantages < 0)
         elif self.bc_filter == "agreement":
-            errors = errors * ((mean - expert_actions).square().mean(dim=1) < common.AGREEMENT**2)
+            errors = errors * common.agree(mean, expert_actions)
         return errors.mean()
 
     def learn(
@@ -440,11 +435,4 @@ def _norm(parameters: list[th.nn.Parameter]) -> float:
     return float(th.stack([each.grad.norm() for each in parameters if each.grad is not None]).norm())
 
 
-def _full_signature() -> inspect.Signature:
-    """The constructor's parameters: those of PPO, then what ``PPOBC`` adds, by keyword."""
-    theirs, ours = (inspect.signature(each.__init__).parameters for each in (PPO, PPOBC))
-    own = [parameter for parameter in ours.values() if parameter.kind is parameter.KEYWORD_ONLY]
-    return inspect.Signature([each for name, each in theirs.items() if name not in ours or name == "self"] + own)
-
-
-PPOBC.__init__.__signature__ = _full_signature()  # type: ignore[attr-defined]
+PPOBC.__init__.__signature__ = common.full_signature(PPO, PPOBC)  # type: ignore[attr-defined]

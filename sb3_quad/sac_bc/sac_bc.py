@@ -1,6 +1,5 @@
 """Soft actor-critic that also learns from an expert: a value-based stage two."""
 
-import inspect
 from typing import Any
 
 import numpy as np
@@ -111,8 +110,7 @@ class SACBC(common.Taught, SAC):
 
     def _setup_model(self) -> None:
         self.bc_coef = FloatSchedule(self.bc_coef)
-        # Whether the schedule gives the cloning term a weight anywhere, as far as a hundred samples of it tell.
-        self._clones = any(self.bc_coef(progress) for progress in np.linspace(1.0, 0.0, 101).tolist())
+        self._clones = common.is_ever_nonzero(self.bc_coef)
         if self.will_clone() and isinstance(self.observation_space, spaces.Dict):
             raise ConfigError(
                 f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the "
@@ -130,8 +128,6 @@ class SACBC(common.Taught, SAC):
             self.expert_buffer = self.replay_buffer_class(*arguments, **self.replay_buffer_kwargs)
             if width > 1:
                 _widen(self.expert_buffer, width)
-        if self.expert is not None and self.will_clone():
-            self._check_expert()
 
     @property
     def expert_flies(self) -> bool:
@@ -147,13 +143,10 @@ class SACBC(common.Taught, SAC):
         """Whether the expert is needed at all, for whichever of the additions."""
         return self._clones or self.expert_proposal or self.expert_timesteps > 0
 
-    def _check_expert(self) -> None:
-        if self.expert is None:
-            raise ExpertError("SACBC needs an expert: SACBC(..., expert=GeometricExpert()) or model.set_expert(...)")
-
-    def set_expert(self, expert: Any) -> None:
-        """Learn from ``expert`` from now on, as a model must that was loaded without one."""
-        self.expert = expert
+    @property
+    def _needs_labels(self) -> bool:
+        """Whether the expert is asked about the present states."""
+        return self._clones or self.expert_proposal or self.expert_flies
 
     def _ask(self, observation: Any, episode_start: BoolArray | None) -> Float32Array:
         """The expert's actions for the present states, scaled to -1 to 1 as a replay buffer holds actions: (n_envs, dim)."""
@@ -167,7 +160,7 @@ class SACBC(common.Taught, SAC):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
         shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
-        if self._labels is None and (self._clones or self.expert_proposal or self.expert_flies):
+        if self._labels is None and self._needs_labels:
             self._labels = self._ask(self._last_obs, None)
         if self.expert_flies:
             assert self._labels is not None
@@ -204,7 +197,7 @@ class SACBC(common.Taught, SAC):
                 parts.append(np.where(dones[:, None], np.float32(np.nan), following))
             buffer_action, self._labels = np.hstack(parts), following
         super()._store_transition(buffer, buffer_action, new_obs, reward, dones, infos)
-        if not (self._clones or self.expert_proposal or self.expert_flies):
+        if not self._needs_labels:
             self._labels = None
 
     def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, th.Tensor | None, th.Tensor | None]:
@@ -320,7 +313,7 @@ class SACBC(common.Taught, SAC):
                 theirs, own = (self._least_q(self.critic, observations, each) for each in (labels, mean))
                 kept = (theirs > own).flatten()
             elif self.bc_filter == "agreement":
-                kept = (mean - labels).square().mean(dim=1) < common.AGREEMENT**2
+                kept = common.agree(mean, labels)
         return (errors * kept).mean(), kept.float().mean()
 
     def learn(
@@ -333,8 +326,8 @@ class SACBC(common.Taught, SAC):
         progress_bar: bool = False,
     ) -> Self:
         """As ``SAC.learn``; see the class for what it raises."""
-        if self.will_clone():
-            self._check_expert()
+        if self.will_clone() and self.expert is None:
+            raise ExpertError("SACBC needs an expert: SACBC(..., expert=GeometricExpert()) or model.set_expert(...)")
         if reset_num_timesteps or self._last_obs is None:  # the environments begin anew
             self._labels = self._labeller = None
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
@@ -357,11 +350,4 @@ def _widen(buffer: ReplayBuffer, width: int) -> None:
     buffer.actions = np.zeros((*buffer.actions.shape[:2], buffer.action_dim), dtype=np.float32)
 
 
-def _full_signature() -> inspect.Signature:
-    """The constructor's parameters: those of SAC, then what ``SACBC`` adds, by keyword."""
-    theirs, ours = (inspect.signature(each.__init__).parameters for each in (SAC, SACBC))
-    own = [parameter for parameter in ours.values() if parameter.kind is parameter.KEYWORD_ONLY]
-    return inspect.Signature([each for name, each in theirs.items() if name not in ours or name == "self"] + own)
-
-
-SACBC.__init__.__signature__ = _full_signature()  # type: ignore[attr-defined]
+SACBC.__init__.__signature__ = common.full_signature(SAC, SACBC)  # type: ignore[attr-defined]

@@ -13,18 +13,21 @@ from sb3_quad.report.plots import Plot
 from sb3_quad.report.sections import Section
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.results import Found, tables
+from sb3_quad.sweep.results import Found
 
 
-def write_report(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found) -> Path:
+def write_report(
+    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, shown: Mapping[str, Sequence[Table]]
+) -> Path:
     """Write the report of a sweep's finished runs; a later one replaces it.
 
     :param found: what :func:`~sb3_quad.sweep.results.evaluate` says of them.
+    :param shown: its tables, by scenario.
     :return: the page.
     :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
         not be written.
     """
-    parts = sections(place, plan, records, found)
+    parts = sections(place, plan, records, found, shown)
     title = f"Sweep: {plan.spec.name}"
     blocks = [f"# {title}"]
     for part in parts:
@@ -39,11 +42,13 @@ def write_report(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord
     return page
 
 
-def sections(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found) -> list[Section]:
+def sections(
+    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, shown: Mapping[str, Sequence[Table]]
+) -> list[Section]:
     """A section for each scenario, the learning curves, the runs."""
     parts = [
         Section(f"scenario-{number}", scenario, "", flown, facts=flown[0].caption)
-        for number, (scenario, flown) in enumerate(tables(found).items())
+        for number, (scenario, flown) in enumerate(shown.items())
     ]
     plots = _curves(place, found)
     if plots:
@@ -83,5 +88,4 @@ def _runs(plan: Plan, records: Mapping[str, RunRecord]) -> Table:
 
 
 def _facts(plan: Plan, found: Found) -> str:
-    done = sum(len(group) for group in found.groups.values())
-    return f"{done} of {len(plan.runs)} runs of {len(plan.configurations)} configurations are finished."
+    return f"{found.n_finished} of {len(plan.runs)} runs of {len(plan.configurations)} configurations are finished."

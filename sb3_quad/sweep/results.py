@@ -45,6 +45,11 @@ class Found(NamedTuple):
     intervals: dict[tuple[str, str, str], Interval | None]
     comparisons: dict[tuple[str, str, str, str], Comparison]
 
+    @property
+    def n_finished(self) -> int:
+        """How many runs are finished."""
+        return sum(len(group) for group in self.groups.values())
+
 
 def evaluate(plan: Plan, records: Records) -> Found:
     """Means, intervals and comparisons of all runs that are finished."""
@@ -74,7 +79,7 @@ def write_results(place: SweepFolder, plan: Plan, records: Records, found: Found
         "sweep": plan.spec.name,
         "package_version": __version__,
         "runs": len(plan.runs),
-        "finished": sum(len(group) for group in found.groups.values()),
+        "finished": found.n_finished,
         "failed": {name: record.message for name, record in records.items() if record.state == "failed"},
         "configurations": {
             name: {"seeds": [record.seed for record in group], "scenarios": _summary(found, name)}

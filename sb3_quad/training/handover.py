@@ -65,6 +65,7 @@ hand_over = transfer_policy  # its name in version 0.1
 CLONE_ROWS = 20_000  # states that are flown for a clone, at least
 CLONE_FLIGHT = 500  # steps of each environment, at least
 CLONE_STEPS = 2_500  # of Adam
+CLONE_ROUNDS = 10  # of flying, then fitting
 CLONE_BATCH = 1024
 CLONE_RATE = 2e-3  # falls to a hundredth
 CLONE_LOG_STD = -2.0  # of a clone that explores by a deviation of its own: sampled actions fly
@@ -89,10 +90,9 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     seen: list[Any] = []
     said: list[Any] = []
-    errors = []
+    errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
-    rounds, done = 10, 0
     for flown in range(steps):
         labels = labeller.labels(observation, begins)
         seen.append(observation)
@@ -100,18 +100,18 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where((np.arange(n) % 2 == 0)[:, None], labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
-        if (flown + 1) * rounds // steps > flown * rounds // steps:  # one of ten rounds is over
-            states, targets = (th.as_tensor(np.concatenate(part), device=model.device) for part in (seen, said))
-            for _ in range(CLONE_STEPS // rounds):
-                for group in optimiser.param_groups:
-                    group["lr"] = CLONE_RATE * max(1.0 - done / CLONE_STEPS, 0.01)
-                rows = th.as_tensor(rng.integers(len(states), size=CLONE_BATCH), device=model.device)
-                loss = (policy._predict(states[rows], deterministic=True) - targets[rows]).square().mean()
-                optimiser.zero_grad()
-                loss.backward()  # type: ignore[no-untyped-call]
-                optimiser.step()
-                errors.append(loss.item())
-                done += 1
+        if (flown + 1) * CLONE_ROUNDS // steps == flown * CLONE_ROUNDS // steps:
+            continue
+        states, targets = (th.as_tensor(np.concatenate(part), device=model.device) for part in (seen, said))
+        for _ in range(CLONE_STEPS // CLONE_ROUNDS):
+            for group in optimiser.param_groups:
+                group["lr"] = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
+            rows = th.as_tensor(rng.integers(len(states), size=CLONE_BATCH), device=model.device)
+            loss = (policy._predict(states[rows], deterministic=True) - targets[rows]).square().mean()
+            optimiser.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            optimiser.step()
+            errors.append(loss.item())
     if hasattr(policy, "actor_target"):  # TD3's
         cast(Any, policy).actor_target.load_state_dict(actor.state_dict())
     if isinstance(getattr(actor, "log_std", None), th.nn.Linear):

@@ -139,11 +139,10 @@ def buffer_arrays(buffer: ReplayBuffer) -> Arrays:
 
     :raises ConfigError: observations that are a Dict.
     """
-    rows = buffer.size()
     arrays = {name: getattr(buffer, name, None) for name in BUFFER_ARRAYS}
     if isinstance(arrays["observations"], dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
-    rows += 1  # the memory-efficient variant's last observation
+    rows = buffer.size() + 1  # with the memory-efficient variant's last observation
     return {name: array[: min(rows, len(array))] for name, array in arrays.items() if array is not None}
 
 

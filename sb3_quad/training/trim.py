@@ -121,11 +121,9 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
 
 
 def _first_layer(model: BaseAlgorithm) -> th.nn.Linear:
-    actor = getattr(model.policy, "actor", None)  # of SAC or TD3
-    layers = getattr(model.policy, "mlp_extractor", None) if actor is None else actor
-    layer = next(
-        iter(next((getattr(layers, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(layers, name)), [None]))
-    )
+    owner = getattr(model.policy, "actor", None) or getattr(model.policy, "mlp_extractor", None)  # an actor: of SAC or TD3
+    found = [getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)]
+    layer = next(iter(found[0]), None) if found else None
     if not isinstance(layer, th.nn.Linear) or layer.in_features != OBSERVATION_SIZE:
         raise ConfigError("trimming needs an MlpPolicy whose first layer reads the 18 features")
     return layer

@@ -127,17 +127,17 @@ def with_defaults(data: Mapping[str, Any]) -> dict[str, Any]:
 
 def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, seconds: float) -> int:
     """Print the tables, write the report, tell what failed. Returns the exit code."""
-    done = [record for record in records.values() if record.state == "finished"]
-    if done:
-        for table in (table for each in tables(found).values() for table in each):
+    if found.groups:
+        shown = tables(found)
+        for table in (table for each in shown.values() for table in each):
             console().print(table)
         try:
-            write_report(place, plan, records, found)
+            write_report(place, plan, records, found, shown)
         except MissingExtra as error:
             print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
     failures = [record for record in records.values() if record.state == "failed"]
-    print(f"{len(done)} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed; {seconds:.1f} s")
-    print(f"saved in {place.path}: results.csv, results.json, runs/" + (", report.md, report.html" if done else ""))
+    print(f"{found.n_finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed; {seconds:.1f} s")
+    print(f"saved in {place.path}: results.csv, results.json, runs/" + (", report.md, report.html" if found.groups else ""))
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
     return 1 if failures else 0
