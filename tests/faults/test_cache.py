@@ -1,5 +1,6 @@
 """Compiled code: kept where it can be, made anew where it is damaged, and nothing fails where it can be neither."""
 
+import multiprocessing
 import os
 import shutil
 import subprocess
@@ -83,24 +84,23 @@ def test_a_file_that_cannot_be_written_is_done_without(folder, capfd):
     assert "cannot be kept" in capfd.readouterr().err
 
 
-TRAINING = """
-import hashlib
-from sb3_quad import DAgger, GeometricExpert
-from sb3_quad.envs import QuadcopterVecEnv
-
-worlds = {"mass": [0.7, 1.3], "force": [0, 3], "gusts": {"std": 1.0}, "delay": [1, 3]}
-env = QuadcopterVecEnv(70, task="recovery_and_tracking", randomize=worlds, history=[0, 1], last_action=True)
-model = DAgger("MlpPolicy", env, GeometricExpert(), n_steps=20, batch_size=600, n_epochs=2, seed=0).learn(2 * 70 * 20)
-print(hashlib.sha256(b"".join(part.numpy().tobytes() for part in model.policy.state_dict().values())).hexdigest())
-"""
+def first_call(barrier, hits):
+    function = compiled(double)
+    barrier.wait()
+    with cache.compiled_by_one(function):
+        assert function(3.0) == 6.0
+    hits.put(sum(function.stats.cache_hits.values()))
 
 
-def test_what_is_compiled_now_computes_what_the_cache_holds_to_the_last_bit(tmp_path):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    command = [sys.executable, "-W", "ignore", "-c", TRAINING]
-    first, second = (subprocess.run(command, env=environment, capture_output=True, text=True, check=True) for _ in range(2))
-    assert "compiling" in first.stderr and "compiling" not in second.stderr
-    assert first.stdout == second.stdout
+def test_of_processes_that_start_together_one_compiles(folder):
+    context = multiprocessing.get_context("fork")
+    barrier, hits = context.Barrier(3), context.Queue()
+    processes = [context.Process(target=first_call, args=(barrier, hits)) for _ in range(3)]
+    for process in processes:
+        process.start()
+    assert sorted(hits.get(timeout=60) for _ in processes) == [0, 1, 1]
+    for process in processes:
+        process.join()
 
 
 CODE = """

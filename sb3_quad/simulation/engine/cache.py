@@ -1,12 +1,14 @@
 """Where compiled code is kept: numba's cache, which here outlives damaged files, and folders that cannot be written."""
 
+import fcntl
 import functools
 import hashlib
 import os
 import stat
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -102,3 +104,18 @@ class Cache(FunctionCache):
 def tell_unkept(why: str) -> None:
     """Say that compiled code is not kept."""
     _tell(f"compiled code cannot be kept ({why}) and is made at every start, in about 15 s; {_WAY_OUT}")
+
+
+@contextmanager
+def compiled_by_one(function: Any) -> Iterator[None]:
+    """Keep other processes from calling ``function`` for the first time meanwhile: they wait, and load what this one has kept.
+
+    :param function: a compiled one. Nothing is done where it is ready in this process, is not kept, or folders have no locks.
+    """
+    with ExitStack() as lock:
+        with suppress(OSError):
+            if not function.signatures:
+                folder = os.open(function._cache.cache_path or "", os.O_RDONLY)  # OSError: not kept
+                lock.callback(os.close, folder)  # which ends the lock, as the end of the process does
+                fcntl.flock(folder, fcntl.LOCK_EX)
+        yield
