@@ -10,6 +10,7 @@ import yaml
 from stable_baselines3 import PPO
 
 from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.seeds import LARGEST
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
@@ -17,7 +18,7 @@ from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.ppo_bc import PPOBC
 from sb3_quad.pretrained_policies import load_pretrained
 from sb3_quad.training import pipeline as pipeline_module
-from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, with_settings
+from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs, with_settings
 from sb3_quad.training.trainer import train
 from sb3_quad.training.trim import scale_position, shift_position, trim
 
@@ -165,6 +166,12 @@ def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, mo
         one, two = (next((tmp_path / name / algo).rglob("Quad*.zip")) for name in ("whole", "interrupted"))
         for ours, theirs in zip(policy(one).values(), policy(two).values(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
+    pipeline = load_pipeline(write(tmp_path, [STAGES[0], {**STAGES[0], "name": "two", "seed_offset": 10}]))
+    assert [job.seed for job in stage_jobs(pipeline, {"seed": 3})] == [3, 13]
+    assert all(0 <= job.seed < LARGEST for job in stage_jobs(pipeline, {"seed": LARGEST - 1}))
 
 
 def two_stages(tmp_path):

@@ -20,11 +20,11 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
-from sb3_quad.base.seeds import seed_for
+from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.experts.models import load_zip, saved_data
@@ -60,6 +60,9 @@ class Stage(Frozen):
     env: str = Field(description="as for a single run")
     conf_file: str | None = Field(default=None, description="settings file; <algo>.yml of the package without it")
     settings: dict[str, Any] = Field(default={}, description="changes to these settings, such as n_timesteps: 5_000_000")
+    seed_offset: NonNegativeInt = Field(
+        default=0, description="added to the seed, so that a stage sees other episodes than one before it on the same task"
+    )
     begin: Literal["before", "new"] = Field(default="before", description="from the agent of the stage before, or a new one")
     pass_on: Literal["best", "last"] = Field(default="best", description="the best evaluation, by success, then by reward")
     trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
@@ -210,7 +213,8 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
                 f"{where}: trim {stage.trim} is for agents that read the 18 features, not for ones that remember"
             )
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
-        jobs.append(validate(TrainingJob, {**job, **own, "config": config}, where))
+        made = validate(TrainingJob, {**job, **own, "config": config}, where)
+        jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
     return jobs
 
 
