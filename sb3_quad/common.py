@@ -1,7 +1,7 @@
-"""What DAgger, PPO and SAC with behavioural cloning share: the terms of Eqs. 4.3 and 4.4, and forward passes.
+"""What DAgger, PPO and SAC with behavioural cloning share: the terms of Eqs. 4.3 and 4.4, forward passes, being taught.
 
-Every function takes and gives tensors; ``b`` is the mini-batch, ``a`` the action dimension. The forward passes leave out what
-a training step does not need, and agree with the policy's own methods to rounding.
+In shapes, ``b`` is the mini-batch, ``a`` the action dimension. The forward passes leave out what a training step does not
+need, and agree with the policy's own methods to rounding.
 """
 
 import inspect

@@ -13,21 +13,9 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
 from sb3_quad.simulation.designs import resolve_vehicles
 from sb3_quad.simulation.engine.block import P
-from sb3_quad.simulation.engine.cache import compiled_by_one
 from sb3_quad.simulation.engine.random import new_streams
-from sb3_quad.simulation.engine.work import (
-    ARRAYS,
-    FLY,
-    LOOK,
-    OUTCOME,
-    SCORE,
-    StepArrays,
-    check_arrays,
-    new_jobs,
-    step_arrays,
-    work,
-)
-from sb3_quad.simulation.engine.workers import batch_lock, compilation_notice, run
+from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
+from sb3_quad.simulation.engine.workers import batch_lock, first_run, run
 from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
@@ -164,7 +152,7 @@ class QuadcopterBatch:
         self._bind()
         self.set_noise(noise)
         self.set_observation_scaling(observation_mean, observation_std)
-        with compilation_notice(), compiled_by_one(work):
+        with first_run():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
 

@@ -9,7 +9,8 @@ import os
 import sys
 import threading
 import weakref
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from numba.core import event
 
 from sb3_quad.base.arrays import IntArray
 from sb3_quad.base.cores import available_cpus
+from sb3_quad.simulation.engine.cache import compiled_by_one
 from sb3_quad.simulation.engine.lowlevel import LANES
 from sb3_quad.simulation.engine.work import AWAKE, BUSY, JOB, LATE, LINE, NOT_FINITE, StepArrays, step_arrays, work
 
@@ -99,6 +101,13 @@ def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
         alone = np.zeros(AWAKE, dtype=np.int64)  # a control array that no worker looks at
         outcome = work(alone, -1, PATIENCE, job, *arrays)
     return bool(outcome != NOT_FINITE)
+
+
+@contextmanager
+def first_run() -> Iterator[None]:
+    """Around a :func:`run` that may compile: of processes that start together one does, and says so, the others wait."""
+    with compilation_notice(), compiled_by_one(work):
+        yield
 
 
 def compilation_notice() -> AbstractContextManager[None]:
