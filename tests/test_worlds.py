@@ -140,6 +140,8 @@ def test_gusts_have_the_spread_and_the_memory_that_were_asked_for(std, unit, new
         gusts.append(batch.gust[:3].copy())
     assert np.std(gusts[0], axis=1) == pytest.approx(newtons, rel=0.05)
     assert np.std(gusts[-1], axis=1) == pytest.approx(newtons, rel=0.05)
+    normal = (gusts[-1] / newtons) ** 4  # whose mean is 3 if the gusts are
+    assert np.mean(normal) == pytest.approx(3.0, abs=0.25)
     for steps in (10, 20):
         kept = [np.corrcoef(gusts[0][axis], gusts[steps][axis])[0, 1] for axis in range(3)]
         assert kept == pytest.approx([np.exp(-steps * 0.01 / 0.2)] * 3, abs=0.05)

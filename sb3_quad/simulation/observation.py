@@ -88,14 +88,12 @@ def _disturb_and_scale(b):
 
 
 @compiled(inline="always")
-def observe(b, normals):
+def observe(b):
     """``b.feature``: the observations of a loaded block, disturbed by :mod:`.noise`, scaled.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
-
-    :param normals: how many standard normals are needed, at least OBSERVATION_SIZE; ``b.noise`` has those for others behind.
     """
     features(b)
-    random_words(b, normals)
-    standard_normals(b, normals)
+    random_words(b, b.word.shape[0])
+    standard_normals(b, OBSERVATION_SIZE)
     _disturb_and_scale(b)

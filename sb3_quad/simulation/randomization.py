@@ -79,11 +79,13 @@ class Torque(RandomVector):
 
 
 class Gusts(Frozen):
-    """A force in the world frame that wanders: of each component the Ornstein-Uhlenbeck process, exactly discretised.
+    """A force in the world frame that wanders: of each component the Ornstein-Uhlenbeck process, whatever the control step.
 
     Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930); the update of D. T. Gillespie,
-    "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E 54, 1996). It is what MIL-F-8785C's Dryden
-    model has along the flight path, with the time constant L / V.
+    "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E 54, 1996), but that what comes to a gust in a
+    control step is no normal number, only as wide as one: their sums are normal, over a time constant of many steps. The first
+    gust of an episode is normal, too; spread and memory are exact. It is what MIL-F-8785C's Dryden model has along the flight
+    path, with the time constant L / V.
     """
 
     std: Range = Field(description="standard deviation of each component, N or as unit says; sampled per episode")

@@ -1,5 +1,6 @@
 """Ranges of numbers that are sampled for each episode."""
 
+import math
 from typing import Any, Literal
 
 from pydantic import Field, model_validator
@@ -52,4 +53,4 @@ def between(table, k, column, u, nominal):  # type: ignore[no-untyped-def]
         return nominal
     if kind == CUBE_ROOT:
         return (low ** (1.0 / 3.0) + (high ** (1.0 / 3.0) - low ** (1.0 / 3.0)) * u) ** 3
-    return low * (high / low) ** u if kind == LOG_UNIFORM else low + (high - low) * u
+    return low * math.exp(u * math.log(high / low)) if kind == LOG_UNIFORM else low + (high - low) * u

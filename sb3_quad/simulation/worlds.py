@@ -7,11 +7,10 @@ import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.simulation.designs import DESIGN_SIZE, VehicleDistribution, arm_length
-from sb3_quad.simulation.engine.block import P, W
+from sb3_quad.simulation.engine.block import GUST_WORDS, P, W
 from sb3_quad.simulation.engine.lowlevel import compiled
 from sb3_quad.simulation.engine.random import GUST, PUSH, VEHICLE, uniforms
 from sb3_quad.simulation.layout import first_rows, row_slices
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.ranges import FIXED, between
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle
@@ -37,6 +36,8 @@ GUST_SIZE = sum(GUSTS.values())
 GUST_FORCE = row_slices(GUSTS)["force"]
 G = first_rows(GUSTS)
 _N_PARAMETERS = len(PARAMETER_NAMES)
+_SEVEN = np.uint64(127)
+_SUM_MEAN, _SUM_STD = 3 * 127 / 2, math.sqrt(3 * (128**2 - 1) / 12)  # of three whole numbers, uniform from 0 to 127
 
 
 @compiled
@@ -112,8 +113,13 @@ def sample_wrench(i, streams, nominal, table, wrench):
 @compiled
 def sample_gust(i, streams, nominal, table, gust):
     """How row i's gusts are in its episode, and the first, in place: ``gust`` (GUST_SIZE, n)."""
-    column, u, share = min(i, table.shape[1] - 1), uniforms(streams, i, 4, GUST), uniforms(streams, i, 1, PUSH)
-    std = between(table, R.gust_std, column, u[0], 0.0) if share[0] < table[R.wrench_share, column] else 0.0
+    column = min(i, table.shape[1] - 1)
+    for k in range(gust.shape[0]):
+        gust[k, i] = 0.0
+    if uniforms(streams, i, 1, PUSH)[0] >= table[R.wrench_share, column]:
+        return
+    u = uniforms(streams, i, 4, GUST)
+    std = between(table, R.gust_std, column, u[0], 0.0)
     if table[R.gust_by_weight, column] != 0.0:
         std *= _weight(i, nominal)
     keeps = table[R.gust_keeps, column]
@@ -134,13 +140,20 @@ def add_gusts(b, gust, first, count):
 
 @compiled
 def advance_gusts(b, gust, first, count):
-    """The gusts of a block one control step later, in place, by the normals behind those of the observation."""
-    noise = b.noise
-    for axis in range(3):
-        for lane in range(count):
-            i = first + lane
-            kept, added = gust[G.keeps, i] * gust[G.force + axis, i], gust[G.adds, i] * noise[OBSERVATION_SIZE + axis, lane]
-            gust[G.force + axis, i] = kept + added
+    """The gusts of a block one control step later, in place, by two random words of each lane.
+
+    What comes to a component is the sum of three numbers of seven bits each, scaled: a process that remembers many control
+    steps adds up so many of them that it is normal.
+    """
+    word = b.word
+    for lane in range(count):
+        i = first + lane
+        bits = np.uint64(word[GUST_WORDS, lane]) | np.uint64(word[GUST_WORDS + 1, lane]) << np.uint64(32)
+        for axis in range(3):
+            part = bits >> np.uint64(21 * axis)
+            added = np.float64(np.int64((part & _SEVEN) + (part >> np.uint64(7) & _SEVEN) + (part >> np.uint64(14) & _SEVEN)))
+            kept = gust[G.keeps, i] * gust[G.force + axis, i]
+            gust[G.force + axis, i] = kept + gust[G.adds, i] * ((added - _SUM_MEAN) / _SUM_STD)
 
 
 def new_worlds(

@@ -22,8 +22,8 @@ T = first_rows(TASK)
 P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
 W = first_rows(WRENCH)
 _SCORED = tuple(getattr(T, name) for name in SCORED)
-NORMALS = OBSERVATION_SIZE + 3  # at most, in a control step: observation noise, then a gust
-_WORDS = -(-NORMALS // 4) * 4
+GUST_WORDS = -(-OBSERVATION_SIZE // 2) * 2  # the first of a gust's two random words, behind those of the observation noise
+_WORDS = -(-(GUST_WORDS + 2) // 4) * 4
 
 # Of every lane: the kind of numbers, and how many or of what shape.
 _CONTENTS: dict[str, tuple[str, Any]] = {

@@ -16,7 +16,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.designs import DESIGN_SIZE, design
 from sb3_quad.simulation.engine.block import (
     MEMORY,
-    NORMALS,
     block_in,
     load_commands,
     load_rows,
@@ -179,7 +178,6 @@ def run_block(job, number, b, fresh):
     frames = carray(pointer(job.frames_at), (n, job.depth, job.frame), np.float32)
     integral = carray(pointer(job.integral_at), (job.integrals, n), np.float64)
     ages = carray(pointer(job.ages_at), (job.ages,), np.int64)
-    normals = NORMALS if job.gusts else OBSERVATION_SIZE
     returns = carray(pointer(job.returns_at), (n,), np.float64)
     limits = carray(pointer(job.limits_at), (n,), np.int64)
     observations = carray(pointer(job.observations_at), (n, job.width), np.float32)
@@ -212,7 +210,7 @@ def run_block(job, number, b, fresh):
         for lane in range(count):
             streams[STEP, first + lane] += np.uint32(1)
         load_rows(streams, first, count, b.stream)
-        observe(b, normals)
+        observe(b)
         if job.gusts:
             advance_gusts(b, gust, first, count)
         if job.depth > 0:
@@ -277,7 +275,7 @@ def run_block(job, number, b, fresh):
                 forget(i, frames, integral)
     load_rows(state, first, count, b.state)
     load_rows(streams, first, count, b.stream)
-    observe(b, normals)
+    observe(b)
     if job.depth > 0:
         for lane in range(count):
             i = first + lane
