@@ -114,6 +114,18 @@ def test_an_agent_is_handed_over_to_sac_and_flies(clone):
     assert fly(load_model(clone), "target_tracking", 48, 3).survival.all()
 
 
+@pytest.mark.parametrize(("given", "log_std"), [({}, -2.0), ({"log_std_init": -0.5}, -0.5)])
+def test_the_deviation_of_a_clone_is_that_of_its_settings(monkeypatch, given, log_std):
+    for name, value in {"CLONE_STEPS": 10, "CLONE_ROWS": 80, "CLONE_FLIGHT": 10}.items():
+        monkeypatch.setattr(handover, name, value)
+    model = SAC(
+        "MlpPolicy", QuadcopterVecEnv(8, seed=0), policy_kwargs={"net_arch": [8], **given}, buffer_size=80, device="cpu"
+    )
+    transfer_policy(pretrained("itm-recovery"), model)
+    seen = th.as_tensor(model.get_env().reset())
+    assert th.equal(model.actor.get_action_dist_params(seen)[1], th.full((8, 4), log_std))
+
+
 def test_its_offset_is_trimmed(clone):
     model = load_model(clone)
     with th.no_grad():

@@ -68,7 +68,7 @@ CLONE_STEPS = 2_500  # of Adam
 CLONE_ROUNDS = 10  # of flying, then fitting
 CLONE_BATCH = 1024
 CLONE_RATE = 2e-3  # falls to a hundredth
-CLONE_LOG_STD = -2.0  # of a clone that explores by a deviation of its own: sampled actions fly
+CLONE_LOG_STD = -2.0  # of a clone that explores by a deviation of its own, without log_std_init: sampled actions fly
 
 
 def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> float:
@@ -77,8 +77,8 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped: no weights can be copied, so they
     are fitted, by the squared error of the deterministic actions (an error of their arctanh would be all about the limits).
     One half of the environments is flown by the teacher, the other by the present clone, as in DAgger: the states that the
-    clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e^-2 everywhere.
-    The environments are reset afterwards by whoever learns.
+    clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e to the ``log_std_init`` of its
+    ``policy_kwargs`` everywhere, e^-2 without one. The environments are reset afterwards by whoever learns.
 
     :param teacher: what :class:`~sb3_quad.experts.controller.Controller` takes.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
@@ -117,5 +117,5 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     if isinstance(getattr(actor, "log_std", None), th.nn.Linear):
         with th.no_grad():
             actor.log_std.weight.zero_()
-            actor.log_std.bias.fill_(CLONE_LOG_STD)
+            actor.log_std.bias.fill_(model.policy_kwargs.get("log_std_init", CLONE_LOG_STD))
     return float(np.mean(errors[-100:]) ** 0.5)
