@@ -13,7 +13,7 @@ from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import hover_offset
-from sb3_quad.experts.models import load_model, saved_algorithm
+from sb3_quad.experts.models import load_model, load_zip, saved_algorithm
 from sb3_quad.pretrained_policies import pretrained
 from sb3_quad.settings.config import build_config, load_config
 from sb3_quad.settings.flight import FlightSettings
@@ -90,6 +90,13 @@ def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, monkeypatch):
     result = run_pipeline(with_settings(load_pipeline(path), shared), job, "stages", lambda line: None)
     assert result.exit_code == 0 and saved_algorithm(result.stages["two"].agent) == "SACBC"
     assert [stage.algo for stage in load_pipeline("value_based/two_stage.yml").stages] == ["dagger", "sac_bc"]
+
+
+def test_n_step_returns_are_loaded_without_a_warning(tmp_path, recwarn):
+    settings = {"n_steps": 3, "gamma": 0.9, "buffer_size": 40, "device": "cpu"}
+    SAC("MlpPolicy", QuadcopterVecEnv(4), **settings).save(tmp_path / "sac.zip")
+    buffer = load_zip(SAC, tmp_path / "sac.zip", env=QuadcopterVecEnv(4)).replay_buffer
+    assert (buffer.n_steps, buffer.gamma) == (3, 0.9) and not recwarn.list
 
 
 @pytest.fixture(scope="module")

@@ -2,6 +2,7 @@
 
 import io
 import json
+import warnings
 import zipfile
 from pathlib import Path
 from typing import Any, TypeVar
@@ -91,7 +92,11 @@ def load_zip(algorithm: type[Algorithm], path: str | Path | io.BytesIO, to_fly: 
         if isinstance(entry, dict) and ":serialized:" in entry:
             unread = to_fly and key not in _TO_FLY
             objects[key] = _STAND_INS.get(key) if unread else unpickle(entry[":serialized:"], f"model {path}: its {key}")
-    return algorithm.load(path, custom_objects=objects, **kwargs)
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", "`n_steps="
+        )  # SB3 takes the buffer of n-step returns, its own choice, for the user's
+        return algorithm.load(path, custom_objects=objects, **kwargs)
 
 
 def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:

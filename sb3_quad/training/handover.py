@@ -77,8 +77,8 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped: no weights can be copied, so they
     are fitted, by the squared error of the deterministic actions (an error of their arctanh would be all about the limits).
     One half of the environments is flown by the teacher, the other by the present clone, as in DAgger: the states that the
-    clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e to the ``log_std_init`` of its
-    ``policy_kwargs`` everywhere, e^-2 without one. The environments are reset afterwards by whoever learns.
+    clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e to the ``log_std_init`` of
+    its ``policy_kwargs`` everywhere, e^-2 without one. The environments are reset afterwards by whoever learns.
 
     :param teacher: what :class:`~sb3_quad.experts.controller.Controller` takes.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
