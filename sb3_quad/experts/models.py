@@ -92,10 +92,8 @@ def load_zip(algorithm: type[Algorithm], path: str | Path | io.BytesIO, to_fly: 
         if isinstance(entry, dict) and ":serialized:" in entry:
             unread = to_fly and key not in _TO_FLY
             objects[key] = _STAND_INS.get(key) if unread else unpickle(entry[":serialized:"], f"model {path}: its {key}")
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", "`n_steps="
-        )  # SB3 takes the buffer of n-step returns, its own choice, for the user's
+    with warnings.catch_warnings():  # SB3 takes the buffer of n-step returns, its own choice, for the user's
+        warnings.filterwarnings("ignore", "`n_steps=")
         return algorithm.load(path, custom_objects=objects, **kwargs)
 
 
