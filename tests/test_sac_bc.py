@@ -104,6 +104,24 @@ def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone(
     assert th.equal(critic, same) and cloned < 0.7 * without
 
 
+@pytest.mark.parametrize("normalised", [False, True])
+def test_normalised_critics_see_no_scale_of_a_layer_and_stock_sac_loads_the_zip(tmp_path, normalised):
+    model = SACBC("MlpPolicy", "Pendulum-v1", critic_layer_norm=normalised, **SMALL).learn(150)
+    model.save(tmp_path / "model.zip")
+    observations, actions = th.rand(50, 3), th.rand(50, 1)
+    values = model.critic(observations, actions)[0]
+    again = SACBC.load(tmp_path / "model.zip", device="cpu")
+    assert th.equal(again.critic(observations, actions)[0], values)
+    assert th.equal(again.critic_target(observations, actions)[0], model.critic_target(observations, actions)[0])
+    stock = SAC.load(tmp_path / "model.zip", device="cpu")
+    assert th.equal(stock.actor(observations, deterministic=True), model.actor(observations, deterministic=True))
+    assert th.equal(stock.critic(observations, actions)[0], values) is not normalised
+    with th.no_grad():
+        for parameter in model.critic.q_networks[0][0].parameters():
+            parameter *= 10.0
+    assert th.allclose(model.critic(observations, actions)[0], values, rtol=1e-2, atol=1e-2) is normalised
+
+
 @pytest.mark.parametrize("prefers", [True, False])
 def test_the_q_filter_clones_where_the_critic_prefers_the_expert(prefers):
     model = pendulum(bc_coef=0.5, bc_filter="q")

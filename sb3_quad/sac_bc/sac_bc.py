@@ -9,8 +9,10 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
+from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
@@ -33,15 +35,16 @@ class SACBC(common.Taught, SAC):
 
     What is added, with its source:
 
-    ==================  ===============================================================================================
-    ``expert_fraction``  a share of each mini-batch from the expert's own flights: RLPD, https://arxiv.org/abs/2302.02948
-    ``bc_coef``          a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089; weighed by
-                         the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every state
-                         that is visited, as in DAgger, not its own flights alone
-    ``bc_filter="q"``    only where the critic prefers the expert's action: the Q filter of Nair et al.
-    ``expert_proposal``  the expert's action and the agent's are both proposed, and the one of greater Q is flown, and
-                         bootstrapped from: IBRL, https://arxiv.org/abs/2311.02198
-    ==================  ===============================================================================================
+    =====================  ============================================================================================
+    ``expert_fraction``    a share of each mini-batch from the expert's own flights: RLPD, https://arxiv.org/abs/2302.02948
+    ``critic_layer_norm``  layer-normalised critics, which overestimate unseen actions less: RLPD
+    ``bc_coef``            a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089; weighed by
+                           the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every
+                           state that is visited, as in DAgger, not its own flights alone
+    ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair et al.
+    ``expert_proposal``    the expert's action and the agent's are both proposed, and the one of greater Q is flown, and
+                           bootstrapped from: IBRL, https://arxiv.org/abs/2311.02198
+    =====================  ============================================================================================
 
     :param expert: who flies first, labels and proposes: an object with ``actions(state)`` on the true state of our
         environments, an SB3 model, or a function from observations to actions. It is never saved. Needed when learning starts
@@ -59,6 +62,8 @@ class SACBC(common.Taught, SAC):
     :param expert_proposal: whether the expert's action is proposed beside the agent's. Needs ``n_steps=1``.
     :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that comes from imitation is
         not moved by a critic that has learnt nothing yet.
+    :param critic_layer_norm: whether the critics normalise the inputs of their activations, without parameters: in stock
+        ``SAC`` the zip loads and its actor is the same, but its critics do not normalise.
     :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite.
@@ -75,6 +80,7 @@ class SACBC(common.Taught, SAC):
         bc_filter: str = "none",
         expert_proposal: bool = False,
         critic_warmup: int = 0,
+        critic_layer_norm: bool = False,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ):
@@ -101,6 +107,7 @@ class SACBC(common.Taught, SAC):
         self.bc_filter = bc_filter
         self.expert_proposal = expert_proposal
         self.critic_warmup = critic_warmup
+        self.critic_layer_norm = critic_layer_norm
         self._clones = False
         self.expert_buffer: ReplayBuffer | None = None
         self._labels: Float32Array | None = None  # (n_envs, action_dim): its scaled actions for the present states
@@ -117,6 +124,9 @@ class SACBC(common.Taught, SAC):
                 "environment in gymnasium.wrappers.FlattenObservation"
             )
         super()._setup_model()
+        if self.critic_layer_norm:
+            _normalise_layers(self.critic)
+            _normalise_layers(self.critic_target)
         # A row of actions holds the one flown; the expert's, if it is cloned; the expert's for the next state, if it proposes.
         width = 1 + self._clones + self.expert_proposal
         assert self.replay_buffer is not None and self.replay_buffer_class is not None
@@ -342,6 +352,16 @@ class SACBC(common.Taught, SAC):
     def restore_memory(self, memory: Arrays) -> None:
         self._labels = memory.get(LABELS)
         super().restore_memory({name: array for name, array in memory.items() if name != LABELS})
+
+
+def _normalise_layers(critic: ContinuousCritic) -> None:
+    """Normalise what goes into each activation over its layer; nothing is learnt there, so a zip's names stay those of SAC."""
+    networks: list[Any] = critic.q_networks
+    for network in networks:
+        for i, layer in enumerate([*network][:-1]):
+            if isinstance(layer, nn.Linear):
+                normal = nn.LayerNorm(layer.out_features, elementwise_affine=False)
+                network[i + 1] = nn.Sequential(normal, network[i + 1])
 
 
 def _widen(buffer: ReplayBuffer, width: int) -> None:
