@@ -46,6 +46,13 @@ def make_job(folder, algo, **changes):
     return TrainingJob(config=config, log_folder=str(folder), eval_freq=120, eval_episodes=4, seed=5)
 
 
+@pytest.fixture
+def short_clone(monkeypatch):
+    """A hand-over to SAC takes no time, and its clone flies badly."""
+    for name, value in {"CLONE_STEPS": 20, "CLONE_BATCH": 32, "CLONE_ROWS": 80, "CLONE_FLIGHT": 10}.items():
+        monkeypatch.setattr(handover, name, value)
+
+
 def state(run):
     return load_model(run.model).policy.state_dict()
 
@@ -70,10 +77,7 @@ def test_an_interrupted_run_goes_on_to_the_same_agent(tmp_path, algo):
     assert saved_algorithm(whole.run.model) == {"sac": "SAC", "td3": "TD3", "sac_bc": "SACBC"}[algo]
 
 
-def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, monkeypatch):
-    for name, value in {"CLONE_STEPS": 20, "CLONE_BATCH": 32, "CLONE_ROWS": 80}.items():
-        monkeypatch.setattr(handover, name, value)
-    monkeypatch.setattr(handover, "CLONE_FLIGHT", 10)
+def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, short_clone):
     one = {
         "name": "one",
         "algo": "dagger",
@@ -122,9 +126,7 @@ def test_an_agent_is_handed_over_to_sac_and_flies(clone):
 
 
 @pytest.mark.parametrize(("given", "log_std"), [({}, -2.0), ({"log_std_init": -0.5}, -0.5)])
-def test_the_deviation_of_a_clone_is_that_of_its_settings(monkeypatch, given, log_std):
-    for name, value in {"CLONE_STEPS": 10, "CLONE_ROWS": 80, "CLONE_FLIGHT": 10}.items():
-        monkeypatch.setattr(handover, name, value)
+def test_the_deviation_of_a_clone_is_that_of_its_settings(short_clone, given, log_std):
     model = SAC(
         "MlpPolicy", QuadcopterVecEnv(8, seed=0), policy_kwargs={"net_arch": [8], **given}, buffer_size=80, device="cpu"
     )

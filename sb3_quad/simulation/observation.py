@@ -94,6 +94,6 @@ def observe(b):
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
     """
     features(b)
-    random_words(b, b.word.shape[0])
-    standard_normals(b, OBSERVATION_SIZE)
+    random_words(b)
+    standard_normals(b)
     _disturb_and_scale(b)

@@ -22,7 +22,8 @@ T = first_rows(TASK)
 P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
 W = first_rows(WRENCH)
 _SCORED = tuple(getattr(T, name) for name in SCORED)
-GUST_WORDS = -(-OBSERVATION_SIZE // 2) * 2  # the first of a gust's two random words, behind those of the observation noise
+_NORMALS = -(-OBSERVATION_SIZE // 2) * 2  # of the observation noise, each from a random word
+GUST_WORDS = _NORMALS  # where the two random words of a gust begin, behind those
 _WORDS = -(-(GUST_WORDS + 2) // 4) * 4
 
 # Of every lane: the kind of numbers, and how many or of what shape.
@@ -51,7 +52,7 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
     "noise_level": ("f4", ()),  # relative
     "additive": ("f4", ()),  # level of the noise that is added, in σ
-    "noise": ("f4", _WORDS),
+    "noise": ("f4", _NORMALS),
     "feature": ("f4", OBSERVATION_SIZE),
     "word": ("u4", _WORDS),  # random
     "stream": ("u4", 4),

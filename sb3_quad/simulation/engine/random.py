@@ -81,10 +81,10 @@ def uniforms(streams, row, blocks, purpose):
 
 
 @compiled
-def random_words(b, count):
-    """``b.word``: at least ``count`` random words of every lane, from the lane's key and counter."""
+def random_words(b):
+    """``b.word``: random words of every lane, a multiple of 4, from the lane's key and counter."""
     word, stream = b.word, b.stream
-    for block in range((count + 3) // 4):
+    for block in range(word.shape[0] // 4):
         for lane in range(LANES):
             w0, w1, w2, w3 = _words(stream, lane, block, OBSERVATION_NOISE)
             word[4 * block, lane], word[4 * block + 1, lane] = w0, w1
@@ -107,10 +107,10 @@ def _log(x):
 
 
 @compiled(fastmath=True)
-def standard_normals(b, count):
-    """``b.noise``: at least ``count`` standard normals of every lane from its ``b.word``, two from two."""
+def standard_normals(b):
+    """``b.noise``: standard normals of every lane, an even number, from the first of its ``b.word``, two from two."""
     word, noise = b.word, b.noise
-    for pair in range((count + 1) // 2):
+    for pair in range(noise.shape[0] // 2):
         for lane in range(LANES):
             u = (float32(int32(word[2 * pair, lane] >> uint32(1))) + float32(0.5)) * _TO_UNIT
             radius = np.sqrt(float32(-2.0) * _log(u))
