@@ -57,36 +57,46 @@ class Measurement:
     rates: list[float]
 
 
-def single(seconds: float) -> Measurement:
+def single(seconds: float) -> list[Measurement]:
     """One PyBullet environment behind ``gymnasium.make``, random actions, resets where episodes end."""
     with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
         env.reset(seed=0)
-        return _measure("PyBullet, one environment", 1, env.step, (4,), seconds)
+        return _measure({"PyBullet, one environment": env.step}, 1, (4,), seconds)
 
 
-def vectorised(kind: str, n_envs: int, seconds: float, randomize: Any = None) -> Measurement:
+def vectorised(kind: str, n_envs: int, seconds: float, worlds: Any = None) -> list[Measurement]:
     """``VecEnv.step`` of ``batch``, ``dummy`` or ``subproc``: physics, noise, reward, resets, infos; random actions.
 
-    :param randomize: the worlds that the episodes are flown in, nominal ones without it.
+    :param worlds: ``randomize``, worlds to fly in as well, in turns with still air: on a shared machine the speed changes
+        from second to second.
     """
-    config = build_config("ppo", ENV_ID, {"n_timesteps": 1, "vec_env": kind, "env_kwargs": {"randomize": randomize or {}}})
-    name = f"{NAMES[kind]}, random worlds" if randomize else NAMES[kind]
-    with closing(make_environments(config, n_envs, 0)) as env:
-        env.reset()
-        return _measure(name, n_envs, env.step, (n_envs, 4), seconds)
+    steps = {}
+    with ExitStack() as stack:
+        for name, randomize in ((NAMES[kind], {}), (f"{NAMES[kind]}, random worlds", worlds)):
+            if randomize is not None:
+                settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": {"randomize": randomize}}
+                env = stack.enter_context(closing(make_environments(build_config("ppo", ENV_ID, settings), n_envs, 0)))
+                env.reset()
+                steps[name] = env.step
+        return _measure(steps, n_envs, (n_envs, 4), seconds)
 
 
-def _measure(name: str, n_envs: int, step: Callable[[Any], Any], shape: tuple[int, ...], seconds: float) -> Measurement:
+def _measure(steps: dict[str, Callable[[Any], Any]], n_envs: int, shape: tuple[int, ...], seconds: float) -> list[Measurement]:
+    """Of each function, for so many seconds; their repetitions take turns."""
     actions = itertools.cycle(np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32))
-    timer = Timer(lambda: step(next(actions)))
-    timer.timeit(3)  # compiles, fills caches
-    steps, elapsed = 1, 0.0
-    while elapsed < seconds / 20:  # how many steps a repetition takes
-        steps *= 2
-        elapsed = timer.timeit(steps)
-    steps = max(1, round(steps * seconds / REPETITIONS / elapsed))
-    rates = [steps * n_envs / repetition for repetition in timer.repeat(REPETITIONS, steps)]
-    return Measurement(name, n_envs, float(np.median(rates)), rates)
+    timers = {name: Timer(lambda step=step: step(next(actions))) for name, step in steps.items()}
+    counts, rates = {}, {name: [] for name in steps}
+    for name, timer in timers.items():
+        timer.timeit(3)  # compiles, fills caches
+        count, elapsed = 1, 0.0
+        while elapsed < seconds / 20:  # how many steps a repetition takes
+            count *= 2
+            elapsed = timer.timeit(count)
+        counts[name] = max(1, round(count * seconds / REPETITIONS / elapsed))
+    for _ in range(REPETITIONS):
+        for name, timer in timers.items():
+            rates[name].append(counts[name] * n_envs / timer.timeit(counts[name]))
+    return [Measurement(name, n_envs, float(np.median(each)), each) for name, each in rates.items()]
 
 
 def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[list[Measurement], dict[str, float]]:

@@ -22,13 +22,13 @@ def run(options: argparse.Namespace) -> int:
     measurements, parts = [], {}
     if options.training is not True:
         with screen.status("one PyBullet environment"):
-            measurements.append(single(options.seconds))
-        kinds = [("dummy", options.n_envs, None), ("subproc", options.n_envs, None)]
+            measurements.extend(single(options.seconds))
         worlds = load_config("dagger", TRAINED).env_kwargs["randomize"]
-        kinds += [("batch", size, randomize) for size in options.sizes for randomize in (None, worlds)]
+        kinds = [("dummy", options.n_envs, None), ("subproc", options.n_envs, None)]
+        kinds += [("batch", size, worlds) for size in options.sizes]
         for kind, n_envs, randomize in kinds:
             with screen.status(f"{kind}, {n_envs}"):
-                measurements.append(vectorised(kind, n_envs, options.seconds, randomize))
+                measurements.extend(vectorised(kind, n_envs, options.seconds, randomize))
     for config in loops:
         with screen.status(f"training loop of {config.algo}"):
             rates, parts[config.algo] = training_loop(config)

@@ -149,17 +149,16 @@ def load_commands(b, actions, queue, mixed, first, count):
     for k in range(rotors):
         for lane in range(LANES):
             wanted[k, lane] = queue[0, k, first + min(lane, count - 1)]
-        if not mixed:
-            for late in range(delay - 1):
-                for lane in range(count):
-                    queue[late, k, first + lane] = queue[late + 1, k, first + lane]
-        else:
-            for late in range(delay - 1):
-                for lane in range(count):
-                    new = own[lane] == late + 1.0
-                    queue[late, k, first + lane] = command[k, lane] if new else queue[late + 1, k, first + lane]
+        for late in range(delay - 1):
+            here, behind = queue[late, k, first : first + count], queue[late + 1, k, first : first + count]
+            for lane in range(count):
+                # Both are read whichever is taken, and the rows are views: else the loop is not vectorised.
+                new, old = command[k, lane], behind[lane]
+                here[lane] = new if mixed and own[lane] == late + 1.0 else old
+        if mixed:
             for lane in range(LANES):
-                wanted[k, lane] = command[k, lane] if own[lane] == 0.0 else wanted[k, lane]
+                new, old = command[k, lane], wanted[k, lane]
+                wanted[k, lane] = new if own[lane] == 0.0 else old
         for lane in range(count):
             queue[delay - 1, k, first + lane] = command[k, lane]
 
