@@ -25,7 +25,7 @@ def make(num_envs=8, **kwargs):
 def test_it_is_made_by_gymnasium():
     env = make(3, noise=0.0)
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
-    assert env.unwrapped.batch.max_episode_steps == env.spec.max_episode_steps == 1500
+    assert (env.unwrapped.batch.max_steps == 1500).all() and env.spec.max_episode_steps == 1500
     observations, infos = env.reset(seed=1)
     assert observations in env.observation_space and infos["distance"].tolist() == pytest.approx([10.0] * 3)
     assert env.observation_space.shape == (3, 18) and env.action_space.shape == (3, 4)

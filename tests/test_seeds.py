@@ -44,14 +44,19 @@ def test_rows_of_different_seeds_start_differently(kind):
 
 
 def test_a_training_flies_the_same_episodes_in_either_environment():
-    first = []
+    flown = []
     for vec_env in ("batch", "dummy"):
-        config = build_config("ppo", "QuadStateRecovery-v0", {"n_timesteps": 64, "n_envs": 3, "vec_env": vec_env})
-        env = make_environments(config, 3, seed_for("training", 5))
+        settings = {"n_timesteps": 64, "n_envs": 3, "vec_env": vec_env, "env_kwargs": {"max_episode_steps": [3, 5]}}
+        config = build_config("ppo", "QuadStateRecovery-v0", settings)
+        env = make_environments(config, 3, seed_for("training", 5), staggered=True)
         env.seed(seed_for("training", 5))
-        first.append(env.reset())
+        steps = [(env.reset(), np.zeros(3))] + [env.step(np.zeros((3, 4)))[::2] for _ in range(12)]
+        flown.append([np.stack(each) for each in zip(*steps, strict=True)])
         env.close()
-    np.testing.assert_allclose(*first, atol=1e-6)
+    (batch, ends), (single, single_ends) = flown
+    np.testing.assert_allclose(batch, single, atol=1e-6)
+    np.testing.assert_array_equal(ends, single_ends)
+    assert ends.sum(axis=0).tolist() == [4, 2, 4]
 
 
 def test_a_training_flies_none_of_the_episodes_of_a_suite(tmp_path):

@@ -368,6 +368,22 @@ def test_staggered_episodes_end_at_times_spread_evenly():
     assert lengths == [55, 60]
 
 
+def test_rows_can_have_limits_of_their_own():
+    env = QuadcopterVecEnv(5, seed=0, max_episode_steps=[10, 25], staggered=True)
+    assert env.max_episode_steps == env.get_attr("max_episode_steps") == [10, 25, 10, 25, 10]
+    env.reset()
+    lengths = {row: [] for row in range(5)}
+    for _ in range(80):
+        for row, info in enumerate(env.step(np.zeros((5, 4)))[3]):
+            lengths[row] += [info["episode"]["l"]] if info else []
+    first = {0: 10, 1: 20, 2: 6, 3: 10, 4: 2}
+    for row, each in lengths.items():
+        assert each[0] == first[row]
+        assert {*each[1:]} == {25 if row % 2 else 10}
+    env.set_attr("max_episode_steps", 7)
+    assert env.max_episode_steps == 7
+
+
 def test_scaling_and_noise_of_one_row_act_on_that_row():
     plain, changed = QuadcopterVecEnv(70, noise=0.0, seed=0), QuadcopterVecEnv(70, noise=0.0, seed=0)
     changed.set_observation_scaling(mean=np.full(18, 0.5), std=np.full(18, 4.0), indices=[66])
@@ -438,6 +454,9 @@ def test_vehicles_by_row():
         ({"n_envs": 2, "observation_std": np.zeros(18)}, "observation_std"),
         ({"n_envs": 2, "observation_mean": np.zeros(17)}, r"observation_mean of shape \(17,\)"),
         ({"n_envs": 2, "max_episode_steps": 0}, "max_episode_steps 0"),
+        ({"n_envs": 2, "max_episode_steps": [5, 0]}, "max_episode_steps 0"),
+        ({"n_envs": 2, "max_episode_steps": []}, "max_episode_steps: 0 numbers for 2"),
+        ({"n_envs": 2, "max_episode_steps": [5] * 3}, "max_episode_steps: 3 numbers for 2"),
         ({"n_envs": 2, "vehicle": ["itm"] * 3}, "3 vehicles for 2"),
         ({"n_envs": 2, "vehicle": "itn"}, "did you mean 'itm'"),
     ],

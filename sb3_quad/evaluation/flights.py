@@ -127,7 +127,7 @@ def fly_settings(
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     with closing(FLEETS[backend](seeds, settings)) as fleet:
-        return _fly_fleet(fleet, controller, plan or Plan(), settings.max_episode_steps, tolerances, hooks)
+        return _fly_fleet(fleet, controller, plan or Plan(), settings.longest_episode, tolerances, hooks)
 
 
 def _fly_fleet(

@@ -1,10 +1,10 @@
 """How a run flies: the one record of it, written by training into every zip, read by all that flies its agent."""
 
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PositiveInt
+from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import validate
@@ -20,6 +20,7 @@ from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
+Steps = Annotated[int, Field(gt=0, lt=2**62)]
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
 
 
@@ -41,7 +42,16 @@ class FlightSettings(Memory):
         default=None, description="fields of VehicleDistribution, or {distribution: name}: each episode has a vehicle of it"
     )
     randomize: Randomization | None = Field(default=None, description="fields of Randomization: what differs by episode")
-    max_episode_steps: PositiveInt = Field(default=MAX_EPISODE_STEPS, lt=2**62, description="control steps of an episode")
+    max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = Field(
+        default=MAX_EPISODE_STEPS,
+        description="control steps of an episode; or a list, of which row i has number i, counted round",
+    )
+
+    @property
+    def longest_episode(self) -> int:
+        """Control steps of an episode, or of the longest where rows differ."""
+        steps = self.max_episode_steps
+        return max(steps) if isinstance(steps, list) else steps
 
     def given(self) -> dict[str, Any]:
         """The keywords that are not left at their defaults."""

@@ -104,7 +104,7 @@ def fixed_setting(
             raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
     wrenches = [validate(Wrench, push, "the push")] if push else []
     generators = [np.random.default_rng(0)]
-    acting = sample_wrenches(wrenches, vehicle, settings.max_episode_steps, generators)
+    acting = sample_wrenches(wrenches, vehicle, settings.longest_episode, generators)
     plan = Plan(start, acting)
     return Setting(settings.vehicle, settings, lambda seed: plan)
 
@@ -140,7 +140,7 @@ def fly_all(
     :raises ConfigError: settings that the environment refuses.
     :raises ControllerError: a controller that fails in flight; its name comes first.
     """
-    longest = setting.settings.max_episode_steps
+    longest = setting.settings.longest_episode
     left = longest if n_timesteps is None else n_timesteps
     while left > 0:
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))

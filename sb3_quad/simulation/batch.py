@@ -10,7 +10,7 @@ from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, In
 from sb3_quad.base.cores import available_cpus, use_cpus
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.simulation.checks import per_row, row_vehicles, whole_number
+from sb3_quad.simulation.checks import per_row, row_numbers, row_vehicles, whole_number
 from sb3_quad.simulation.designs import resolve_vehicles
 from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.random import new_streams
@@ -59,7 +59,7 @@ class BatchKeywords(TypedDict, total=False):
     position_integral: Any
     vehicles: Any
     randomize: Any
-    max_episode_steps: int
+    max_episode_steps: int | Sequence[int]
     seed: int | None
     n_threads: int | None
 
@@ -85,7 +85,8 @@ class QuadcopterBatch:
         :func:`~sb3_quad.simulation.designs.resolve_vehicles`; ``vehicle`` then says what that does not.
     :param randomize: None, a :class:`~sb3_quad.simulation.randomization.Randomization` or its fields: what is random in each
         episode.
-    :param max_episode_steps: control steps after which an episode is truncated.
+    :param max_episode_steps: control steps after which an episode is truncated; or several, of which row i has number i,
+        counted round.
     :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the operating system's entropy.
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
@@ -110,13 +111,13 @@ class QuadcopterBatch:
         position_integral: Any = None,
         vehicles: Any = None,
         randomize: Any = None,
-        max_episode_steps: int = 1500,
+        max_episode_steps: int | Sequence[int] = 1500,
         seed: int | None = None,
         n_threads: int | None = None,
         autoreset: bool = True,
     ) -> None:
         n = self.n = whole_number("n_envs", n_envs, most=MAX_ROWS)
-        self.max_episode_steps = whole_number("max_episode_steps", max_episode_steps, most=2**62)
+        self.max_steps = row_numbers("max_episode_steps", max_episode_steps, n, most=2**62)
         self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads)
         self.autoreset = autoreset
         one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
@@ -145,7 +146,7 @@ class QuadcopterBatch:
         self.mean = DEFAULT_MEAN[:, None].copy()
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
-        self.limits = np.full(n, self.max_episode_steps, dtype=np.int64)  # control steps of the present episodes, at most
+        self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
         self.outcome = np.zeros(n, dtype=OUTCOME)
         self.last_observations = np.zeros((n, self.memory.size), dtype=np.float32)
         self.lock = batch_lock()  # held while compiled code reads and writes the arrays, and while some are replaced
@@ -171,7 +172,7 @@ class QuadcopterBatch:
 
     def stagger(self) -> None:
         """Truncate the present episodes at times spread evenly over ``max_episode_steps``; those that follow, after it."""
-        self.limits[:] = self.max_episode_steps - np.arange(self.n) * self.max_episode_steps // self.n
+        self.limits[:] = self.max_steps - np.arange(self.n) * self.max_steps // self.n
 
     def observe(self) -> Float32Array:
         """The present observations, float32 (n, memory.size); the same numbers until the next step."""
@@ -313,10 +314,10 @@ class QuadcopterBatch:
             if values is not None:
                 array[:, columns] = values[:, : columns.size]
 
-    def set_max_episode_steps(self, steps: int) -> None:
-        """Control steps after which an episode is truncated, for all rows from the next step on."""
-        most = whole_number("max_episode_steps", steps)
-        self._bind(max_episode_steps=most, limits=np.full(self.n, most, dtype=np.int64))
+    def set_max_episode_steps(self, steps: int | Sequence[int]) -> None:
+        """Control steps after which an episode is truncated, for all rows from the next step on; of several, counted round."""
+        most = row_numbers("max_episode_steps", steps, self.n, most=2**62)
+        self._bind(max_steps=most, limits=most.copy())
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
         """Set the task of all episodes that begin from now on; episodes under way end as they began.
@@ -359,7 +360,6 @@ class QuadcopterBatch:
                 "delay": len(self.queue),
                 "substeps": first.substeps,
                 "physics_step": first.physics_step,
-                "max_steps": values["max_episode_steps"],
                 "tasks": table.weights.size,
                 **{f"{name}_columns": values[array].shape[1] for name, array in COLUMNS.items()},
                 "gusts": self.randomize.gusts is not None,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.arrays import FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
@@ -77,6 +77,14 @@ def whole_number(name: str, value: Any, least: int = 1, most: int | None = None,
         limits = f"of at least {least}" if most is None else f"of {least} to {most}"
         raise ConfigError(f"{name} {value!r}: must be a whole number {limits}{unit}")
     return int(value)
+
+
+def row_numbers(name: str, given: Any, n: int, most: int) -> IntArray:
+    """Whole numbers from 1 to ``most`` for n rows, (n,): one for all, or several that are counted round."""
+    several = [given] if np.ndim(given) == 0 else [*given]
+    if not 0 < len(several) <= n:
+        raise ConfigError(f"{name}: {len(several)} numbers for {n} environments; give from one to as many")
+    return np.resize(np.array([whole_number(name, each, most=most) for each in several], dtype=np.int64), n)
 
 
 def row_vehicles(given: Sequence[Any], n: int, layout: str | Vehicle | None = None) -> list[Vehicle]:

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 from timeit import Timer
@@ -61,7 +62,7 @@ def single(seconds: float) -> list[Measurement]:
     """One PyBullet environment behind ``gymnasium.make``, random actions, resets where episodes end."""
     with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
         env.reset(seed=0)
-        return _measure({"PyBullet, one environment": env.step}, 1, (4,), seconds)
+        return _measure({"PyBullet, one environment": env}, 1, (4,), seconds)
 
 
 def vectorised(kind: str, n_envs: int, seconds: float, worlds: Any = None) -> list[Measurement]:
@@ -70,22 +71,22 @@ def vectorised(kind: str, n_envs: int, seconds: float, worlds: Any = None) -> li
     :param worlds: ``randomize``, worlds to fly in as well, in turns with still air: on a shared machine the speed changes
         from second to second.
     """
-    steps = {}
+    envs: dict[str, Any] = {}
     with ExitStack() as stack:
         for name, randomize in ((NAMES[kind], {}), (f"{NAMES[kind]}, random worlds", worlds)):
             if randomize is not None:
                 settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": {"randomize": randomize}}
                 env = stack.enter_context(closing(make_environments(build_config("ppo", ENV_ID, settings), n_envs, 0)))
                 env.reset()
-                steps[name] = env.step
-        return _measure(steps, n_envs, (n_envs, 4), seconds)
+                envs[name] = env
+        return _measure(envs, n_envs, (n_envs, 4), seconds)
 
 
-def _measure(steps: dict[str, Callable[[Any], Any]], n_envs: int, shape: tuple[int, ...], seconds: float) -> list[Measurement]:
-    """Of each function, for so many seconds; their repetitions take turns."""
+def _measure(envs: dict[str, Any], n_envs: int, shape: tuple[int, ...], seconds: float) -> list[Measurement]:
+    """Each environment for so many seconds; their repetitions take turns."""
     actions = itertools.cycle(np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32))
-    timers = {name: Timer(lambda step=step: step(next(actions))) for name, step in steps.items()}
-    counts, rates = {}, {name: [] for name in steps}
+    timers = {name: Timer(partial(lambda step: step(next(actions)), env.step)) for name, env in envs.items()}
+    counts = {}
     for name, timer in timers.items():
         timer.timeit(3)  # compiles, fills caches
         count, elapsed = 1, 0.0
@@ -93,6 +94,7 @@ def _measure(steps: dict[str, Callable[[Any], Any]], n_envs: int, shape: tuple[i
             count *= 2
             elapsed = timer.timeit(count)
         counts[name] = max(1, round(count * seconds / REPETITIONS / elapsed))
+    rates: dict[str, list[float]] = {name: [] for name in envs}
     for _ in range(REPETITIONS):
         for name, timer in timers.items():
             rates[name].append(counts[name] * n_envs / timer.timeit(counts[name]))

@@ -80,9 +80,7 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
             env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs})
         else:
             in_worker = config.vec_env == "subproc"
-            given = config.env_kwargs.get("vehicle")
-            vehicles = [{"vehicle": each} for each in given] if isinstance(given, (list, tuple)) else [{}]
-            keywords = [{**config.env_kwargs, **vehicles[row % len(vehicles)]} for row in range(n_envs)]
+            keywords = [_of_row(config.env_kwargs, row) for row in range(n_envs)]
             rows = range(n_envs) if staggered else [0] * n_envs
             make = partial(_make_one, config.env_id, config.env_wrapper, in_worker, n_envs)
             with _worker_errors():
@@ -95,6 +93,13 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
     for path, kwargs in config.vec_env_wrapper:
         env = instance(path, "vec_env_wrapper", env, **kwargs)
     return env
+
+
+def _of_row(env_kwargs: dict[str, Any], row: int) -> dict[str, Any]:
+    """The keywords of one row, where lists are counted round."""
+    lists = {name: env_kwargs.get(name) for name in ("vehicle", "max_episode_steps")}
+    own = {name: given[row % len(given)] for name, given in lists.items() if isinstance(given, (list, tuple)) and given}
+    return {**env_kwargs, **own}
 
 
 def _make_one(

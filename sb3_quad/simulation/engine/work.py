@@ -68,7 +68,7 @@ OUTCOME = np.dtype(
 # Columns of vehicles, random worlds and scaling: 1 where one serves all rows; none of worlds where all are nominal. Control
 # steps of an episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
 SIZES = (
-    *("n", "delay", "substeps", "max_steps", "tasks", "vehicle_columns", "nominal_columns", "given_columns"),
+    *("n", "delay", "substeps", "tasks", "vehicle_columns", "nominal_columns", "given_columns"),
     *("design_columns", "world_columns", "gust_columns", "scaling_columns", "mixed_delays", "gusts", "sets_wrench"),
     *("sets_vehicle", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
 )
@@ -98,6 +98,7 @@ ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and
     "task_weights": ("f8", ("tasks",)),
     "returns": ("f8", ("n",)),
     "limits": ("i8", ("n",)),
+    "max_steps": ("i8", ("n",)),
     "outcome": (OUTCOME, ("n",)),
     "last_observations": ("f4", ("n", "width")),  # of the episodes that outcome tells of
 }
@@ -254,11 +255,12 @@ def run_block(job, number, b, fresh):
         if not job.autoreset:
             return
 
+    max_steps = carray(pointer(job.max_steps_at), (n,), np.int64)
     weights = carray(pointer(job.task_weights_at), (job.tasks,), np.float64)
     nominal = carray(pointer(job.nominal_at), (_PARAMETERS, job.nominal_columns), np.float64)
     for i in range(first, first + count):
         if dones[i]:
-            returns[i], limits[i] = 0.0, job.max_steps
+            returns[i], limits[i] = 0.0, max_steps[i]
             count_episode(i, streams)
             if job.design_columns > 0:
                 given = carray(pointer(job.given_at), (_PARAMETERS, job.given_columns), np.float64)
