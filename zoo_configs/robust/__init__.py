@@ -1,0 +1,1 @@
+"""The shipped agents for random worlds: the default settings with more timesteps."""
