@@ -86,7 +86,7 @@ class YamlFolder:
     :param suffix: of the files.
     :param in_name: whether the suffix is part of the name, as in ``thesis/dagger.yml``.
     :param folders: further ones inside the package, in the order in which their names are listed.
-    :param former: folders that once were, and where their files are now; their former names still find them.
+    :param former: beginnings of names that once were, and what they are now; former names still find the files.
     """
 
     kind: str

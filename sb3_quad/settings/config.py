@@ -37,8 +37,8 @@ SETTINGS = YamlFolder(
     "sb3_quad.zoo_configs",
     ".yml",
     in_name=True,
-    folders=("any_quadcopter", "nominal", "pid", "thesis", "value_based"),
-    former={"geometric/": "nominal/", "robust/": ""},
+    folders=("any_quadcopter", "nominal", "pid", "robust", "thesis", "value_based"),
+    former={"geometric/": "nominal/", "robust/dagger": "dagger", "robust/ppo_bc": "ppo_bc"},
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")

@@ -1,1 +1,1 @@
-"""The shipped agents for random worlds: the default settings with more timesteps."""
+"""The shipped agent for random worlds, `itm-robust`: larger, and trained for longer, than the default."""
