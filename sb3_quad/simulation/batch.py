@@ -366,6 +366,7 @@ class QuadcopterBatch:
                 "sets_vehicle": self.sets_vehicle,
                 "sets_wrench": self.randomize.sets_wrench,
                 "mixed_delays": self.randomize.delay is not None or bool((self.given[P.delay] != len(self.queue)).any()),
+                "own_arms": self.given.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
                 "width": self.memory.size,
                 **dict(zip(("depth", "frame"), self.frames.shape[1:], strict=True)),
                 "ages": self.ages.size,

@@ -136,8 +136,13 @@ class Randomization(Frozen):
     @property
     def sets_vehicle(self) -> bool:
         """Whether an episode begins with a vehicle of its own."""
-        changes = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self.delay)
-        return any(each is not None for each in changes)
+        changes = (self.mass, self.inertia, self.motor_gain, self.thrust, self.delay)
+        return self.sets_arms or any(each is not None for each in changes)
+
+    @property
+    def sets_arms(self) -> bool:
+        """Whether that vehicle's rotors are elsewhere."""
+        return self.arm is not None or self.center_of_mass is not None
 
     @property
     def sets_wrench(self) -> bool:

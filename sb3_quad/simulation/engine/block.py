@@ -92,20 +92,20 @@ def store_state(b, state, first, count):
 
 
 @compiled
-def load_vehicles(b, vehicles, first, count, physics_step):
-    """What the control step needs of the vehicles of a block, with the divisions done."""
+def load_vehicles(b, vehicles, first, count, physics_step, arms):
+    """What the control step needs of the vehicles of a block, with the divisions done; without ``arms`` those stay."""
     if vehicles.shape[1] > 1 and count == LANES:
-        _prepare_vehicles(b, vehicles, first, physics_step)
+        _prepare_vehicles(b, vehicles, first, physics_step, arms)
         return
     for k in range(vehicles.shape[0]):
         for lane in range(LANES):
             b.vehicle[k, lane] = vehicles[k, min(first + min(lane, count - 1), vehicles.shape[1] - 1)]
-    _prepare_vehicles(b, b.vehicle, 0, physics_step)
+    _prepare_vehicles(b, b.vehicle, 0, physics_step, arms)
 
 
 @compiled
-def _prepare_vehicles(b, vehicles, first, dt):
-    motor, lift, fall, push, twist, gyro, arm = b.motor, b.lift, b.fall, b.push, b.twist, b.gyro, b.arm
+def _prepare_vehicles(b, vehicles, first, dt, arms):
+    motor, lift, fall, push, twist, gyro = b.motor, b.lift, b.fall, b.push, b.twist, b.gyro
     for lane in range(LANES):
         i = first + lane
         ixx, iyy, izz = vehicles[P.ixx, i], vehicles[P.iyy, i], vehicles[P.izz, i]
@@ -116,10 +116,11 @@ def _prepare_vehicles(b, vehicles, first, dt):
         b.thrust_middle[lane] = vehicles[P.thrust_middle, i] / lift[lane]
         b.thrust_half_range[lane] = vehicles[P.thrust_half_range, i] / lift[lane]
         b.radius[lane], b.delay[lane] = vehicles[P.collision_radius, i], vehicles[P.delay, i]
-    for axis in range(3):
-        for rotor in range(4):
-            for lane in range(LANES):
-                arm[axis, rotor, lane] = vehicles[P.roll_arm_0 + 4 * axis + rotor, first + lane]
+    if arms:
+        for axis in range(3):
+            for rotor in range(4):
+                for lane in range(LANES):
+                    b.arm[axis, rotor, lane] = vehicles[P.roll_arm_0 + 4 * axis + rotor, first + lane]
 
 
 @compiled(fastmath=True)

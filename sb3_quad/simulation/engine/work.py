@@ -69,8 +69,8 @@ OUTCOME = np.dtype(
 # steps of an episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
 SIZES = (
     *("n", "delay", "substeps", "tasks", "vehicle_columns", "nominal_columns", "given_columns"),
-    *("design_columns", "world_columns", "gust_columns", "scaling_columns", "mixed_delays", "gusts", "sets_wrench"),
-    *("sets_vehicle", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
+    *("design_columns", "world_columns", "gust_columns", "scaling_columns", "mixed_delays", "own_arms", "gusts"),
+    *("sets_wrench", "sets_vehicle", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
 )
 _MAY_BE_NONE = ("world_columns", "gust_columns", "design_columns")
 _PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
@@ -196,7 +196,7 @@ def run_block(job, number, b, fresh):
     if job.mode > LOOK:
         load_rows(state, first, count, b.state)
         if fresh or job.vehicle_columns > 1:
-            load_vehicles(b, vehicles, first, count, job.physics_step)
+            load_vehicles(b, vehicles, first, count, job.physics_step, fresh or job.own_arms)
         if fresh or job.tasks > 1:
             load_scored(b, task_index, tasks, first, count)
         actions = carray(pointer(job.actions_at), (n, 4), np.float32)
