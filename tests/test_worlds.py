@@ -12,10 +12,10 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts import geometric
-from sb3_quad.experts.geometric import GeometricExpert, told_geometric
+from sb3_quad.experts.geometric import GeometricExpert, told_cautious, told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.engine.block import P, W
-from sb3_quad.simulation.state import QUATERNION
+from sb3_quad.simulation.state import QUATERNION, VELOCITY
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 WORLDS = {
@@ -181,6 +181,26 @@ def test_who_is_told_of_a_nominal_world_flies_as_the_others():
         state = batch.true_state()
         np.testing.assert_allclose(told.actions(state), plain.actions(state), atol=1e-5)
         batch.step(plain.actions(state))
+
+
+def test_who_is_cautious_falls_less_fast_where_the_rotors_lift_hardly_more_than_weight_and_push():
+    worlds = {"mass": [1.2, 1.25], "force": {"magnitude": [2, 4], "direction": [0, 0, -1]}}
+    fastest, survival = {}, {}
+    for expert in (told_geometric(), told_cautious()):
+        batch = QuadcopterBatch(480, "target_tracking", randomize=worlds, seed=0, autoreset=False)
+        batch.reset()
+        slowest, lost = np.zeros(480), np.zeros(480, bool)
+        for _ in range(600):
+            lost |= batch.step(expert.actions(batch.true_state()))[2]
+            slowest = np.minimum(slowest, batch.state[VELOCITY][2])
+        fastest[expert.reserve > 0], survival[expert.reserve > 0] = slowest.min(), 1.0 - lost.mean()
+    assert survival[False] < survival[True] and fastest[False] < 1.5 * fastest[True]
+
+
+@pytest.mark.parametrize(("told", "reserve"), [(True, -0.1), (False, 0.1)])
+def test_a_reserve_is_for_who_is_told_and_not_negative(told, reserve):
+    with pytest.raises(ConfigError, match="reserve"):
+        GeometricExpert(told=told, reserve=reserve)
 
 
 def test_several_vehicles_are_given_round():

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.engine.block import P, W
 from sb3_quad.simulation.engine.lowlevel import compiled
@@ -19,6 +20,7 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
+_CAUTIOUS_DESCENT, _CAUTIOUS_RESERVE = 0.5, 0.05
 _TOLD_YAW = 4.0  # times the yaw gain: an agent's error in the moment that it sets against a torque becomes a yaw rate / gain
 
 
@@ -113,6 +115,9 @@ class GeometricExpert(Expert):
     :param told: whether it flies each vehicle by its true parameters and takes from forces and moments what pushes it, as far
         as a state says (``state.vehicles``, ``state.wrench``). Its gains then change from vehicle to vehicle as those of
         :func:`derived_gains` do.
+    :param reserve: weights of thrust that it does not count on when it plans to brake a descent; above 0 it also counts with
+        the force that it is told of.
+    :raises ConfigError: a negative reserve, or one without ``told``.
     """
 
     def __init__(
@@ -122,8 +127,12 @@ class GeometricExpert(Expert):
         observation_mean: npt.ArrayLike | None = None,
         observation_std: npt.ArrayLike | None = None,
         told: bool = False,
+        reserve: float = 0.0,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
+        if reserve < 0.0 or (reserve and not told):
+            raise ConfigError(f"reserve {reserve:g}: must not be negative, and needs told=True")
+        self.reserve = reserve
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
         body = np.array([v.mass, v.gravity, *v.inertia, Authority(v).command_lag])
@@ -139,13 +148,23 @@ class GeometricExpert(Expert):
         constants: tuple[FloatArray, ...] = self._constants
         if self._told is not None and state.vehicles is not None:
             constants = self._told.constants(state.vehicles)
-        _geometric(*moving, *constants, wrench, actions)
+        _geometric(*moving, *constants, wrench, self.reserve, actions)
         return actions
 
 
 def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     """A :class:`GeometricExpert` that is told the true vehicle and wrench."""
     return GeometricExpert(vehicle, told=True)
+
+
+def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+    """The told expert for an agent that must find out what its rotors lift before it falls too fast to be stopped.
+
+    It begins descents with half the acceleration and brakes them with 0.05 weights of thrust in reserve.
+    """
+    gains = GeometricExpert(vehicle).gains
+    gains = gains.model_copy(update={"descent": _CAUTIOUS_DESCENT * gains.descent})
+    return GeometricExpert(vehicle, gains, told=True, reserve=_CAUTIOUS_RESERVE)
 
 
 @compiled
@@ -155,14 +174,20 @@ def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-d
 
 
 @compiled
-def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g):  # type: ignore[no-untyped-def]
+def _brake_share(upwards, az, spare):  # type: ignore[no-untyped-def]
+    """Share of the rotors' greatest acceleration upwards that brakes a descent, with a push az and some to spare, m/s²."""
+    return min(1.0, max(0.05, (upwards + az - spare) / max(upwards, 0.1)))
+
+
+@compiled
+def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, brake):  # type: ignore[no-untyped-def]
     """Desired force of the rotors per mass in the world frame, m/s², where something else accelerates by (ax, ay, az)."""
     distance = math.sqrt(ex * ex + ey * ey)
     speed = gains[G.position]  # per distance
     if distance > 0.0:
         speed = _braking_profile(distance, gains[G.position], gains[G.deceleration]) / distance
     fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
-    deceleration = gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
+    deceleration = gains[G.height_deceleration] if ez > 0.0 else brake * gains[G.descent_deceleration]
     rise = math.copysign(_braking_profile(abs(ez), gains[G.height_position], deceleration), ez)
     climb = max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
     fx, fy = fx - ax, fy - ay
@@ -231,7 +256,7 @@ def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: i
 
 
 @compiled
-def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies, inverses, limits, wrench, actions):  # type: ignore[no-untyped-def]
+def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies, inverses, limits, wrench, reserve, actions):  # type: ignore[no-untyped-def]
     gains, body = np.empty(all_gains.shape[0]), np.empty(bodies.shape[0])
     for i in range(actions.shape[0]):
         column, pushed = min(i, bodies.shape[1] - 1), min(i, wrench.shape[1] - 1)
@@ -248,7 +273,8 @@ def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies,
         ay = (wrench[W.force_world + 1, pushed] + r21 * ux + r22 * uy + r23 * uz) / mass
         az = (wrench[W.force_world + 2, pushed] + r31 * ux + r32 * uy + r33 * uz) / mass
         tx, ty, tz = wrench[W.torque_world, pushed], wrench[W.torque_world + 1, pushed], wrench[W.torque_world + 2, pushed]
-        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], ax, ay, az, gains, g)
+        brake = _brake_share(4.0 * high / mass - g, az, reserve * g) if reserve > 0.0 else 1.0
+        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], ax, ay, az, gains, g, brake)
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
         b1 = (r11 * fx + r21 * fy + r31 * fz) / size
         b2 = (r12 * fx + r22 * fy + r32 * fz) / size

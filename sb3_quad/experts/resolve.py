@@ -14,6 +14,7 @@ EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
     "told_geometric": "sb3_quad.experts.geometric:told_geometric",
+    "told_cautious": "sb3_quad.experts.geometric:told_cautious",
     "told_clipped": "sb3_quad.experts.clipped:told_clipped",
     "raptor": "sb3_quad.experts.raptor:Raptor",
 }
