@@ -283,8 +283,8 @@ def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
     robust = {**dict.fromkeys((DEFAULT_PIPELINE, "two_stage.yml"), "told_geometric"), "robust/two_stage.yml": "told_cautious"}
     pipelines = {**robust, "nominal/two_stage.yml": "geometric"}
     for file, expert in {**pipelines, "pid/two_stage.yml": "pid", "thesis/two_stage.yml": "pid"}.items():
-        for each in load_pipeline(file).stages:
-            assert each.settings.get("expert", load_config(each.algo, each.env, each.conf_file).expert) == expert
+        stages = load_pipeline(file).stages
+        assert {load_config(each.algo, each.env, each.conf_file, each.settings).expert for each in stages} == {expert}
 
 
 @pytest.mark.parametrize("name", [name for name in SETTINGS.names() if not name.endswith(("two_stage.yml", "imitation.yml"))])

@@ -20,7 +20,6 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
-_CAUTIOUS_DESCENT, _CAUTIOUS_RESERVE = 0.5, 0.05
 _TOLD_YAW = 4.0  # times the yaw gain: an agent's error in the moment that it sets against a torque becomes a yaw rate / gain
 
 
@@ -163,8 +162,8 @@ def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     It begins descents with half the acceleration and brakes them with 0.05 weights of thrust in reserve.
     """
     gains = GeometricExpert(vehicle).gains
-    gains = gains.model_copy(update={"descent": _CAUTIOUS_DESCENT * gains.descent})
-    return GeometricExpert(vehicle, gains, told=True, reserve=_CAUTIOUS_RESERVE)
+    gentle = gains.model_copy(update={"descent": 0.5 * gains.descent})
+    return GeometricExpert(vehicle, gentle, told=True, reserve=0.05)
 
 
 @compiled
@@ -180,14 +179,14 @@ def _brake_share(upwards, az, spare):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, brake):  # type: ignore[no-untyped-def]
+def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g):  # type: ignore[no-untyped-def]
     """Desired force of the rotors per mass in the world frame, m/s², where something else accelerates by (ax, ay, az)."""
     distance = math.sqrt(ex * ex + ey * ey)
     speed = gains[G.position]  # per distance
     if distance > 0.0:
         speed = _braking_profile(distance, gains[G.position], gains[G.deceleration]) / distance
     fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
-    deceleration = gains[G.height_deceleration] if ez > 0.0 else brake * gains[G.descent_deceleration]
+    deceleration = gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
     rise = math.copysign(_braking_profile(abs(ez), gains[G.height_position], deceleration), ez)
     climb = max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
     fx, fy = fx - ax, fy - ay
@@ -273,8 +272,9 @@ def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies,
         ay = (wrench[W.force_world + 1, pushed] + r21 * ux + r22 * uy + r23 * uz) / mass
         az = (wrench[W.force_world + 2, pushed] + r31 * ux + r32 * uy + r33 * uz) / mass
         tx, ty, tz = wrench[W.torque_world, pushed], wrench[W.torque_world + 1, pushed], wrench[W.torque_world + 2, pushed]
-        brake = _brake_share(4.0 * high / mass - g, az, reserve * g) if reserve > 0.0 else 1.0
-        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], ax, ay, az, gains, g, brake)
+        if reserve > 0.0:
+            gains[G.descent_deceleration] *= _brake_share(4.0 * high / mass - g, az, reserve * g)
+        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], ax, ay, az, gains, g)
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
         b1 = (r11 * fx + r21 * fy + r31 * fz) / size
         b2 = (r12 * fx + r22 * fy + r32 * fz) / size
