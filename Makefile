@@ -1,5 +1,5 @@
 # Everything runs in a virtual environment of its own, made on first use: make test, make train.
-# Another interpreter: make PYTHON=python3.11 test. Arguments: make test ARGS="-m 'not slow'", make train ARGS="--seed 1".
+# Another interpreter: make PYTHON=python3.11 test. Arguments: make test ARGS="-k physics", make train ARGS="--seed 1".
 PYTHON ?= python3
 VENV ?= .venv
 ZOO_VENV ?= .venv-zoo
@@ -14,11 +14,12 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test fuzz test-zoo lint format type links commit-checks clean
+.PHONY: help install train test test-all fuzz test-zoo lint format type links commit-checks clean
 
 help:
 	@echo "make train          train with the default settings"
-	@echo "make test           run the tests"
+	@echo "make test           run the tests that a change is likely to break, in minutes"
+	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers, a browser"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3 or Ray, in an environment of its own"
 	@echo "make lint           check code style, and which package imports which"
@@ -32,8 +33,14 @@ install: $(INSTALLED)
 train: $(INSTALLED)
 	$(PY) -m sb3_quad.cli train $(ARGS)
 
+# A file's tests share what its fixtures made, so that a file goes to one worker.
+PYTEST := $(PY) -m pytest -n auto --maxprocesses 4 --dist loadfile --durations=15
+
 test: $(INSTALLED)
-	$(PY) -m pytest -n auto --maxprocesses 4 $(ARGS)
+	$(PYTEST) -m "not slow" $(ARGS)
+
+test-all: $(INSTALLED)
+	$(PYTEST) $(ARGS)
 
 # A round is a thousand examples for each property; what fails is kept in .hypothesis/ and tried first from then on.
 fuzz: $(INSTALLED)
@@ -78,7 +85,6 @@ $(PY):
 # An environment that another checkout has installed itself into is used as it is: it would point here from then on.
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 	@owner=$$(cat $@ 2>/dev/null || true); \
-	[ -n "$$owner" ] || [ ! -e $@ ] || owner=$(dir $(abspath $(VENV))).; \
 	if [ -e "$$owner/setup.cfg" ] && ! [ "$$owner" -ef . ]; then \
 		echo "$(VENV) is that of $$owner, and is used as it is"; \
 	else \

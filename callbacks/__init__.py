@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from sb3_quad.callbacks.interruption import LastGoodModel as LastGoodModel
     from sb3_quad.callbacks.interruption import StopOnSignal as StopOnSignal
     from sb3_quad.callbacks.observation_statistics import ObservationStatistics as ObservationStatistics
-    from sb3_quad.callbacks.trajectory_plots import TrajectoryPlots as TrajectoryPlots
 
 _LAZY = {  # imported on first use: naming one waits for none of the others
     "BestModel": "sb3_quad.callbacks.best_model",
@@ -24,9 +23,7 @@ _LAZY = {  # imported on first use: naming one waits for none of the others
     "LastGoodModel": "sb3_quad.callbacks.interruption",
     "ObservationStatistics": "sb3_quad.callbacks.observation_statistics",
     "StopOnSignal": "sb3_quad.callbacks.interruption",
-    "TrajectoryPlots": "sb3_quad.callbacks.trajectory_plots",
 }
 __all__ = list(_LAZY)
 
-_LAZY["TrajectoryFigures"] = "sb3_quad.callbacks.trajectory_plots"  # a former name
 __getattr__, __dir__ = lazy_names(__name__, _LAZY)

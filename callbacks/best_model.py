@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
-from sb3_quad.experts.controller import Controller
+from sb3_quad.controllers.controller import Controller
 
 KEYS = ("timesteps", "results", "ep_lengths", "successes", "seconds")  # of the file
 MORE = ("survivals",)  # where environments report survival

@@ -11,7 +11,7 @@ from stable_baselines3.common.monitor import ResultsWriter
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text
-from sb3_quad.experts.controller import true_state_of
+from sb3_quad.controllers.controller import true_state_of
 
 
 class EpisodeLog(BaseCallback):

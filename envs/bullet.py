@@ -11,10 +11,10 @@ import numpy as np
 
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
-from sb3_quad.drawing.camera import ChaseCamera
-from sb3_quad.drawing.models import rotor_turning
-from sb3_quad.drawing.scene import Pose, Scene
-from sb3_quad.drawing.window import disconnect, has_display, open_window, point_window, start_drawing
+from sb3_quad.envs.rendering.camera import ChaseCamera
+from sb3_quad.envs.rendering.models import rotor_turning
+from sb3_quad.envs.rendering.scene import Pose, Scene
+from sb3_quad.envs.rendering.window import disconnect, has_display, open_window, point_window, start_drawing
 from sb3_quad.simulation.engine.block import P
 from sb3_quad.simulation.engine.rotors import write_body
 from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, QuadcopterState

@@ -2,7 +2,8 @@
 
 import gymnasium
 
-MAX_EPISODE_STEPS = 1500  # 15 s of control steps of 0.01 s (4.2.3)
+from sb3_quad.simulation import MAX_EPISODE_STEPS
+
 ENVIRONMENTS = {"QuadTargetTracking-v0": "target_tracking", "QuadStateRecovery-v0": "state_recovery"}
 
 

@@ -1,7 +1,9 @@
-"""What every test starts from: the CPU, one thread of torch, fixed seeds, no display."""
+"""What every test starts from (the CPU, one thread of torch, fixed seeds, no display), and small agents to fly and read."""
 
 import os
 import random
+import shutil
+from pathlib import Path
 
 os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read when torch is imported; the tests are the same on every machine
 os.environ["MPLBACKEND"] = "Agg"
@@ -13,17 +15,68 @@ from hypothesis import settings
 
 # The first example of a test may compile, so no deadline. The same examples every time, except in `make fuzz`.
 settings.register_profile("fuzz", deadline=None, derandomize=False, max_examples=1000, print_blob=True)
-settings.register_profile("default", deadline=None, derandomize=True, database=None, print_blob=True)  # becomes the parent
+settings.register_profile("default", deadline=None, derandomize=True, database=None, max_examples=20, print_blob=True)
 settings.load_profile("default")
+
+TINY = ["--n-envs", "16", "-n", "1600", "--eval-episodes", "2", "--eval-freq", "800", "--no-progress", "--num-threads", "1"]
+HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
+    "dagger": ["n_steps:50", "gradient_steps:2", "batch_size:64"],
+    "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
+    "sac_bc": ["learning_starts:100", "buffer_size:2000", "batch_size:64", "gradient_steps:2"],
+}
 
 
 @pytest.fixture(autouse=True)
-def same_start():
-    """Sums come out the same on any number of cores, and global generators start from the same seed in every test."""
+def same_start(monkeypatch):
+    """Sums come out the same on any number of cores, global generators start from the same seed, closing tables are small."""
     torch.set_num_threads(1)
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 - SB3's buffers draw from it
     torch.manual_seed(0)
+    monkeypatch.setattr("sb3_quad.cli.compare.FRESH_EPISODES", 4)
+
+
+def _trained(algo: str, folder: Path) -> Path:
+    from sb3_quad.cli import main
+
+    command = ["train", "--algo", algo, "--env", "QuadStateRecovery-v0", "--conf-file", f"nominal/{algo}.yml", "--seed", "3"]
+    assert main([*command, "-f", str(folder), *TINY, "--hyperparams", *HYPERPARAMS[algo]]) == 0
+    return folder / algo / "QuadStateRecovery-v0_1"
+
+
+@pytest.fixture(scope="session")
+def trained_runs(tmp_path_factory):
+    """By an algorithm's name, the folder of a tiny run of it, trained when it is first asked for; to be read, not written."""
+    folder, found = tmp_path_factory.mktemp("logs"), {}
+
+    def run(algo: str) -> Path:
+        if algo not in found:
+            found[algo] = _trained(algo, folder)
+        return found[algo]
+
+    return run
+
+
+@pytest.fixture
+def dagger_run(trained_runs, tmp_path):
+    """A copy of a tiny run of DAgger, in a log folder of its own."""
+    folder = tmp_path / "logs" / "dagger" / "QuadStateRecovery-v0_1"
+    shutil.copytree(trained_runs("dagger"), folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def results_folder(tmp_path_factory):
+    """The results of evaluating two experts on a suite of two short scenarios; to be read, not written."""
+    from sb3_quad.cli import main
+
+    folder = tmp_path_factory.mktemp("results")
+    suite = folder / "small.yaml"
+    scenarios = "[{name: hover, duration: 0.5, episodes: 3}, {name: far, target: [1, 0, 15], duration: 1, episodes: 2}]"
+    suite.write_text(f"{{name: small, scenarios: {scenarios}}}")
+    out = folder / "out"
+    assert main(["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out), "--no-report"]) == 0
+    return out
 
 
 def legends_cover_nothing(figure):

@@ -22,9 +22,9 @@ from stable_baselines3.common.results_plotter import load_results
 import sb3_quad
 from sb3_quad.cli import compare, main
 from sb3_quad.cli.app import COMMANDS
-from sb3_quad.pretrained_policies import agent_path
-from sb3_quad.settings.config import build_config
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -324,7 +324,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     for path in zips:
         mailed = tmp_path / f"mailed_{path.name}"
         mailed.write_bytes(path.read_bytes())
-        settings, source = FlightSettings.of(mailed)
+        settings, source = agent_settings(mailed)
         assert source == mailed and (settings.vehicle.mass, settings.vehicle.name) == (1.6, "heavy")
         assert (settings.task, settings.noise, settings.observation_std) == ("state_recovery", 0, std)
     monkeypatch.chdir(tmp_path)
@@ -351,7 +351,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     ):
         assert part in card
     assert run.command.read_text().strip() in card
-    assert FlightSettings.of("mine.zip")[0] == FlightSettings.of("mailed_best_model.zip")[0]
+    assert agent_settings("mine.zip")[0] == agent_settings("mailed_best_model.zip")[0]
     assert main(["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]) == 2
     assert f"{run.best_model}: layer" in capsys.readouterr().err  # of other sizes
 

@@ -11,10 +11,10 @@ from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.settings.config import build_config
-from sb3_quad.settings.values import import_class, qualified_classes
+from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
+from sb3_quad.training.values import import_class, qualified_classes
 
 NUMBER = st.floats(-1e3, 1e3)
 

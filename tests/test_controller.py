@@ -11,8 +11,8 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
 from sb3_quad.base.errors import ExpertError
+from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.experts.controller import Controller
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
 

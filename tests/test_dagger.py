@@ -11,9 +11,17 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
+from sb3_quad.algorithms.common import (
+    CLONING_LOSSES,
+    actor_mean,
+    cloning_errors,
+    gaussian_entropy,
+    gaussian_nll,
+    l2_loss,
+    value_loss,
+)
+from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
-from sb3_quad.common import CLONING_LOSSES, actor_mean, cloning_errors, gaussian_entropy, gaussian_nll, l2_loss, value_loss
-from sb3_quad.dagger import DAgger
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
 

@@ -8,8 +8,8 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_quad.algorithms.dataset import AggregatedDataset, sample_rows
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.dagger.dataset import AggregatedDataset, sample_rows
 
 
 def pairs(first, n):

@@ -9,8 +9,8 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.resolve import resolve_expert
 
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or by what it is
@@ -88,10 +88,6 @@ def check_ppo_bc(scope):
     assert not np.array_equal(first, last)
 
 
-def check_recurrent(scope):
-    assert np.mean(scope["rewards"]) > -0.3  # of -1 by whom has forgotten
-
-
 def check_dynamics(scope):
     assert len(scope["difference"]) == 5 and 0.0 < max(scope["difference"].values()) < 1e-9
     assert scope["observed"] < 1e-6 and scope["fastest"] > 20.0
@@ -113,7 +109,6 @@ CHECKS = {
     "docs/dynamics.md": check_dynamics,
     "docs/environments.md": check_environments,
     "docs/ppo_bc.md": check_ppo_bc,
-    "docs/recurrent.md": check_recurrent,
     "docs/vehicles.md": check_vehicles,
 }
 

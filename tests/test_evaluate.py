@@ -14,6 +14,8 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.cli import main
+from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flightlog import read_flights
@@ -21,11 +23,9 @@ from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.scaling import measure_mean
 from sb3_quad.evaluation.scenario_flights import flown_as
-from sb3_quad.experts.models import load_model, saved_algorithm
-from sb3_quad.pretrained_policies import pretrained
-from sb3_quad.scenarios.load import load_suite
-from sb3_quad.scenarios.sample import sample_plan
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.evaluation.scenarios.sample import sample_plan
+from sb3_quad.simulation.settings import FlightSettings
 
 SUITE = """
 name: small

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_quad.settings.literals import parse_number
+from sb3_quad.base.literals import parse_number
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout

@@ -12,11 +12,11 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.experts.resolve import resolve_expert
 from sb3_quad.simulation.rotation import nearest_rotation, quaternion_from_rotation
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import load_vehicle

@@ -19,14 +19,14 @@ from stable_baselines3 import A2C, PPO, SAC, TD3
 
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.cli import main
+from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, policy
 from sb3_quad.export.check import FLAGS, Reference, load_header
 from sb3_quad.export.memory import RememberingNetwork
 from sb3_quad.export.network import build_network
 from sb3_quad.export.policy import FORMATS, export_policy
-from sb3_quad.pretrained_policies import pretrained
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")

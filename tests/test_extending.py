@@ -23,7 +23,7 @@ from sb3_quad import DAgger, GeometricExpert
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
-from sb3_quad.experts.resolve import resolve_expert
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import FEATURE_NAMES
 

@@ -8,8 +8,8 @@ import pytest
 
 from sb3_quad.cli.app import COMMANDS, EPILOG, make_parser
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.settings.algorithms import ALGORITHMS
-from sb3_quad.settings.config import SETTINGS
+from sb3_quad.training.algorithms import ALGORITHMS
+from sb3_quad.training.config import SETTINGS
 
 README = (Path(__file__).parent.parent / "README.md").read_text()
 

@@ -7,8 +7,8 @@ from stable_baselines3 import PPO
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import DEFAULT_STD
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.training.trim import trim_hover
 from sb3_quad.vehicles.vehicle import load_vehicle

@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from stable_baselines3 import PPO
 from torch import nn
 
-from sb3_quad import PPOBC, DAgger, GeometricExpert, common
+from sb3_quad import PPOBC, DAgger, GeometricExpert
+from sb3_quad.algorithms import common
+from sb3_quad.algorithms.networks import Perceptron, losses, mlp, shared_out
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.networks import Perceptron, losses, mlp, shared_out
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
 

@@ -6,7 +6,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 
 
 def test_it_does_not_vanish_at_the_target():

@@ -9,14 +9,14 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 
+from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
 from sb3_quad.cli import main
+from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import hover_offset
-from sb3_quad.ppo_bc import PPOBC
-from sb3_quad.pretrained_policies import load_pretrained
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs, with_settings
 from sb3_quad.training.trainer import train

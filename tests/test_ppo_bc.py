@@ -13,12 +13,12 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_quad.algorithms.common import CLONING_LOSSES, evaluate_actions
+from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.callbacks.best_model import BestModel
-from sb3_quad.common import CLONING_LOSSES, evaluate_actions
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.ppo_bc import PPOBC
-from sb3_quad.settings.algorithms import constructor_parameters
+from sb3_quad.training.algorithms import constructor_parameters
 
 SMALL = {"n_steps": 64, "batch_size": 32, "n_epochs": 2, "seed": 3, "device": "cpu"}
 

@@ -15,12 +15,13 @@ from stable_baselines3 import PPO
 import sb3_quad
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.pretrained import FOLDER, agent_path, pretrained_names
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.resolve import resolve_expert
-from sb3_quad.pretrained_policies import FOLDER, agent_path, pretrained_names
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 PICKLED = {"stable_baselines3.common.buffers.RolloutBuffer", "stable_baselines3.common.policies.ActorCriticPolicy"}
@@ -48,7 +49,7 @@ def test_there_are_some_each_with_a_card_of_its_own():
 
 @pytest.mark.parametrize("name", pretrained_names())
 def test_each_flies_as_its_card_says(name):
-    own = {**FlightSettings.of(sb3_quad.pretrained(name))[0].in_any_task(), "vehicle": vehicle_of(name)}
+    own = {**agent_settings(sb3_quad.pretrained(name))[0].in_any_task(), "vehicle": vehicle_of(name)}
     flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 480, 31_000_000, **own)
     assert 100 * flights.survival.mean() == pytest.approx(survival_on_the_card(name), abs=4.0 if "thesis" in name else 2.0)
 
@@ -195,7 +196,7 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folde
 
 @pytest.mark.parametrize("name", pretrained_names())
 def test_each_says_how_it_flies(name):
-    settings, source = FlightSettings.of(sb3_quad.pretrained(name))
+    settings, source = agent_settings(sb3_quad.pretrained(name))
     assert source == sb3_quad.pretrained(name) and settings.vehicle == load_vehicle(vehicle_of(name))
     assert settings.task == ("target_tracking" if name == "thesis-imitation" else "state_recovery")
 
@@ -235,7 +236,7 @@ def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
         assert part in card
     for part in ("commit", "seed", "versions", "None"):
         assert part not in card
-    assert FlightSettings.of(tmp_path / "x.zip") == (FlightSettings(), None)
+    assert agent_settings(tmp_path / "x.zip") == (FlightSettings(), None)
 
 
 def test_publish_refuses_what_it_cannot_describe(run_folder, tmp_path, capsys):

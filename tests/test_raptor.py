@@ -9,13 +9,13 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_quad.base.errors import ConfigError, ExpertError, MissingExtra
 from sb3_quad.cli import main
+from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import AdaptiveScaling
 from sb3_quad.evaluation.scenario_flights import fly_scenario
-from sb3_quad.experts.controller import Controller
-from sb3_quad.experts.resolve import resolve_expert
-from sb3_quad.scenarios.load import parse_suite
+from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 installed = pytest.mark.skipif(importlib.util.find_spec("foundation_policy") is None, reason="needs the extra [raptor]")

@@ -14,9 +14,9 @@ from stable_baselines3.common.vec_env import VecVideoRecorder
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.drawing import models
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.rendering import models
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.vehicles.vehicle import load_vehicle
 

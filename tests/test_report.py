@@ -19,21 +19,21 @@ from matplotlib.colors import to_rgb
 from rich.console import Console
 
 from sb3_quad.cli import main
-from sb3_quad.drawing.labels import COLOURS
-from sb3_quad.drawing.scene import MARKER
+from sb3_quad.envs.rendering.labels import COLOURS
+from sb3_quad.envs.rendering.scene import MARKER
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, time_row
 from sb3_quad.evaluation.records import Failure, HitTrial
+from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.evaluation.summary import share
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render, write_report
 from sb3_quad.report.paths import TARGET
 from sb3_quad.report.plots import FORCE, HEIGHT, WIDTH, Flown, hits_plot
 from sb3_quad.report.sections import sections
-from sb3_quad.scenarios.load import parse_suite
 
 SUITE = """
 name: small

@@ -12,10 +12,10 @@ from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
+from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.summary import mean, share, summarise
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.scenarios.load import load_suite, parse_suite
-from sb3_quad.scenarios.scenario import Scenario
 
 
 def scenario(entry: str) -> Scenario:

@@ -17,18 +17,18 @@ from PIL import Image
 
 from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
-from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
-from sb3_quad.drawing.labels import side_by_side, with_header
-from sb3_quad.drawing.picture import Overlay, draw_overlays
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, following_cameras, framing_camera
+from sb3_quad.envs.rendering.labels import side_by_side, with_header
+from sb3_quad.envs.rendering.picture import Overlay, draw_overlays
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.settings.config import load_config
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show import sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, HOLD, film_frames, frame_times, write_film
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import POSITION, TARGET
+from sb3_quad.training.config import load_config
 from sb3_quad.training.runs import claim_run
 
 HIT = {"start": 0.1, "duration": 0.02, "force": (-20, -20, 0), "torque": (-5, -5, -5)}

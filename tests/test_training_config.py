@@ -12,16 +12,16 @@ from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
 from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, RolloutBuffer
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
 from sb3_quad.cli.arguments.train import DEFAULT_PIPELINE
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.experts.resolve import DEFAULT_EXPERT
-from sb3_quad.settings.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
-from sb3_quad.settings.config import SETTINGS, build_config, check_environment, load_config
-from sb3_quad.settings.literals import parse_mapping, parse_number, parse_value
-from sb3_quad.settings.values import convert, qualified_classes, takes_whole
 from sb3_quad.simulation.tasks import TASKS
+from sb3_quad.training.algorithms import ALGORITHMS, constructor_parameters, get_algorithm
+from sb3_quad.training.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline
+from sb3_quad.training.values import convert, qualified_classes, takes_whole
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}

@@ -19,7 +19,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.settings.config import build_config, load_config
+from sb3_quad.training.config import build_config, load_config
 from sb3_quad.tuning import results as results_module
 from sb3_quad.tuning import search as search_module
 from sb3_quad.tuning import study as study_module

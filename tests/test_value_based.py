@@ -10,14 +10,14 @@ from stable_baselines3 import PPO, SAC
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
+from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.controllers.zips import load_model, load_zip, saved_algorithm
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import hover_offset
-from sb3_quad.experts.models import load_model, load_zip, saved_algorithm
-from sb3_quad.pretrained_policies import pretrained
-from sb3_quad.settings.config import build_config, load_config
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training import handover
+from sb3_quad.training.config import build_config, load_config
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings

@@ -11,9 +11,10 @@ from stable_baselines3.common.utils import LinearSchedule
 import sb3_quad
 from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.callbacks import CoefficientSchedule
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.pretrained import pretrained_names
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.pretrained_policies import pretrained_names
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 FLY = """
@@ -57,7 +58,7 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     actions, timesteps = json.loads(result.stdout)
     assert timesteps[: len(models)] == [256] * len(models)
     for path, noise in (("again.zip", 0.0), ("2.zip", 0.2)):
-        settings, source = FlightSettings.of(tmp_path / path)
+        settings, source = agent_settings(tmp_path / path)
         assert source == tmp_path / path and settings.vehicle == load_vehicle("crazyflie")
         assert (settings.noise, settings.observation_mean, settings.task) == (noise, [0.5] * 18, "target_tracking")
     for model, flown in zip([*models, *map(PPO.load, shipped)], actions, strict=True):

@@ -7,10 +7,10 @@ import yaml
 from stable_baselines3 import SAC
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.literals import ZooLoader
 from sb3_quad.base.yaml_files import parse_yaml
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.settings.literals import ZooLoader
 
 ENV = "QuadStateRecovery-v0"
 TAGGED = """!!python/object/apply:collections.OrderedDict

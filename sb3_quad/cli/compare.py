@@ -5,13 +5,13 @@ from typing import Any
 
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.cli.output import console
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
+from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Column, Table
-from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.scenarios.load import load_suite
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.job import TrainingJob
 
 FRESH_EPISODES = 240
@@ -56,5 +56,5 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     """
     settings = job.flight_settings
     controllers = {"agent": model, "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle)}
-    agent = "IL-agent" if job.config.algo in ("dagger", "recurrent_dagger") else "RL-agent"
+    agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))

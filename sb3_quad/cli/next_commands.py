@@ -5,9 +5,9 @@ import shutil
 import sys
 from pathlib import Path
 
-from sb3_quad.drawing.window import has_display
+from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.envs.rendering.window import has_display
 from sb3_quad.training.runs import RunFolder
 
 
@@ -23,9 +23,8 @@ def print_next(run: RunFolder) -> None:
         ["enjoy", "--algo", algo, "--env", run.name, "-f", str(run.path.parent.parent), "--exp-id", number, *picture],
         ["evaluate", agent, "--suite", "quick", "-o", f"evaluations/{label}"],
     ]
-    if algo != "recurrent_dagger":  # which no file but a zip holds
-        vehicle = ["--vehicle", "itm"] if FlightSettings.of(agent)[0].vehicles else []  # else the one that it was trained on
-        commands.append(["export", agent, "--format", "torchscript", *vehicle])
+    vehicle = ["--vehicle", "itm"] if agent_settings(agent)[0].vehicles else []  # else the one that it was trained on
+    commands.append(["export", agent, "--format", "torchscript", *vehicle])
     for command in commands:
         print("  " + shlex.join([*_program(), *command]))
 

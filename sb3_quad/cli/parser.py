@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NoReturn
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.settings.literals import parse_number, parse_value
+from sb3_quad.base.literals import parse_number, parse_value
 
 TRUST = "let zips run whatever is pickled in them, see docs/security.md"
 BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo {}, docs/zoo.md"

@@ -12,12 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.controllers.resolve import EXPERTS, import_factory, resolve_expert
+from sb3_quad.controllers.zips import saved_algorithm
 from sb3_quad.evaluation.records import ControllerRecord, Scaling
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
-from sb3_quad.experts.models import saved_algorithm
-from sb3_quad.experts.resolve import EXPERTS, import_factory, resolve_expert
-from sb3_quad.pretrained_policies import agent_path
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
@@ -38,9 +39,9 @@ class ControllerSpec:
     def own(self) -> FlightSettings | None:
         """How the agent in a zip says that it flies; None: experts, factories, and zips that say nothing.
 
-        :raises ConfigError: see :meth:`FlightSettings.of`.
+        :raises ConfigError: see :func:`agent_settings`.
         """
-        settings, source = FlightSettings.of(self.spec) if self.spec.endswith(".zip") else (None, None)
+        settings, source = agent_settings(self.spec) if self.spec.endswith(".zip") else (None, None)
         return settings if source else None
 
     @property

@@ -5,16 +5,16 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 
-from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.base.files import locked
+from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.controllers import ControllerSpec, describe
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.folder import RESULTS, load_results, read_entries, write_results
 from sb3_quad.evaluation.jobs import Job, failure, run_jobs
 from sb3_quad.evaluation.records import ControllerRecord, Failure, Results
+from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Suite
 from sb3_quad.executors import start_executor
-from sb3_quad.scenarios.scenario import DEFAULT_VEHICLE, Suite
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last

@@ -8,9 +8,9 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.layout import row_slices
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState
 
 MAX_CLIENTS = 512  # PyBullet allows about 1000 physics clients in a process

@@ -15,13 +15,13 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, unknown
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.in_flight import quadcopter_spaces
-from sb3_quad.envs.registration import MAX_EPISODE_STEPS
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.motion import Motion
-from sb3_quad.experts.controller import Controller
-from sb3_quad.scenarios.sample import Plan
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.evaluation.scenarios.sample import Plan
+from sb3_quad.simulation import MAX_EPISODE_STEPS
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 

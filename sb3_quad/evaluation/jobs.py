@@ -10,18 +10,18 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
-from sb3_quad import __version__
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import SB3QuadError, WorkerDied
+from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.controllers import ControllerSpec, build
 from sb3_quad.evaluation.flightlog import episode_arrays
 from sb3_quad.evaluation.folder import flights_path, write_entry
 from sb3_quad.evaluation.records import SCHEMA_VERSION, ControllerRecord, Entry, Failure
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
+from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario
 from sb3_quad.evaluation.summary import summarise
 from sb3_quad.executors import Executor, as_completed
 from sb3_quad.executors.travel import files_of, with_files
-from sb3_quad.scenarios.scenario import DEFAULT_VEHICLE, Scenario
 from sb3_quad.simulation.memory import Memory
 from sb3_quad.vehicles.vehicle import load_vehicle
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 from itertools import groupby
 
 from sb3_quad.evaluation.records import Estimate, HitLimit, Metrics, Moment, Results
+from sb3_quad.evaluation.scenarios.load import axis_name
+from sb3_quad.evaluation.scenarios.scenario import NumberOrRange, Reference, Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.scenarios.load import axis_name
-from sb3_quad.scenarios.scenario import NumberOrRange, Reference, Scenario
 
 # The rows, without their cells:
 SUCCESS, SURVIVAL = Row("success", "%"), Row("survival", "%")

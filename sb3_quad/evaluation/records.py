@@ -15,8 +15,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from sb3_quad.base.validate import Frozen
-from sb3_quad.scenarios.parts import Vector
-from sb3_quad.scenarios.scenario import Scenario
+from sb3_quad.evaluation.scenarios.parts import Vector
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 SCHEMA_VERSION: Literal[2] = 2
 Scaling = Literal["none", "adaptive"]

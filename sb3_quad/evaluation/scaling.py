@@ -12,10 +12,10 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.controllers.controller import observation_function
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.controller import observation_function
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS
+from sb3_quad.simulation.settings import FlightSettings
 
 N_FLIGHTS = 120  # to random targets, of which the final offset is the mean
 ROUNDS = 3  # the offset is measured anew after each correction

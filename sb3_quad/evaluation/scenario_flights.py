@@ -9,10 +9,10 @@ from sb3_quad.base.arrays import Arrays, FloatArray
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.records import Estimate, HitLimit, HitTrial
+from sb3_quad.evaluation.scenarios.sample import sample_plan
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.summary import share
-from sb3_quad.scenarios.sample import sample_plan
-from sb3_quad.scenarios.scenario import Scenario
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
 RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most

@@ -13,15 +13,16 @@ from typing import Any, NamedTuple
 import numpy.typing as npt
 from stable_baselines3 import PPO
 
-from sb3_quad import __version__
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.experts.models import load_model, saved_algorithm
+from sb3_quad.base.version import __version__
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import check
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.memory import RememberingNetwork
 from sb3_quad.export.network import Network, build_network, check_policy, write_onnx, write_torchscript
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
@@ -53,7 +54,7 @@ def export_policy(
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
     thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. What else the policy sees, the file keeps in a state,
     see ``metadata["state"]``. Vehicle and scaling that are not given are those
-    that :meth:`FlightSettings.of` finds in or beside the zip, or else ``itm`` and Table A.2.
+    that :func:`agent_settings` finds in or beside the zip, or else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
@@ -76,7 +77,7 @@ def export_policy(
     if file_format not in formats:
         raise ConfigError(unknown("format", file_format, formats))
     write, load = formats[file_format]
-    algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), FlightSettings.of(path)
+    algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), agent_settings(path)
     changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
     if settings.vehicles is not None:

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays
-from sb3_quad.drawing.labels import colours_of
+from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.report.plots import POINTS, band, legend, styled
 
 NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file

@@ -11,7 +11,7 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes, write_text
 from sb3_quad.base.imports import require
-from sb3_quad.drawing.labels import colours_of
+from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.records import Results
 from sb3_quad.report.sections import Section, sections

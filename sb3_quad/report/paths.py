@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import FORCE, GRID, Flown, Plot, legend, styled
-from sb3_quad.scenarios.scenario import Scenario
 
 TARGET, START = "#1a9a45", "#8a8f98"
 MARKS: dict[str, Any] = {"diamond": {"marker": "D"}, "circle-open": {"marker": "o", "markerfacecolor": "none"}}

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from sb3_quad.drawing.labels import colours_of
+from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
@@ -16,12 +16,12 @@ from sb3_quad.evaluation.metric_tables import (
     scenario_groups,
 )
 from sb3_quad.evaluation.records import Results
+from sb3_quad.evaluation.scenarios.load import axis_label
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.paths import paths_plot
 from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, hits_plot
 from sb3_quad.report.varied import families_plot, group_plots
-from sb3_quad.scenarios.load import axis_label
-from sb3_quad.scenarios.scenario import Scenario
 from sb3_quad.simulation.noise import in_words
 
 OVERVIEW = (

@@ -9,9 +9,9 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.records import Metrics, Results
+from sb3_quad.evaluation.scenarios.load import UNITS, axis_label, axis_name
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import POINTS, WIDTH, Plot, band, interval_ends, legend, new_axes, styled
-from sb3_quad.scenarios.load import UNITS, axis_label, axis_name
-from sb3_quad.scenarios.scenario import Scenario
 
 Groups = Sequence[tuple[str, Sequence[Scenario]]]
 Cells = list[tuple[Scenario, Metrics]]  # those of a varied scenario that one controller has flown

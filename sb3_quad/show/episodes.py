@@ -10,17 +10,17 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
-from sb3_quad.drawing.labels import COLOURS
-from sb3_quad.drawing.models import rotor_turning
-from sb3_quad.drawing.scene import Pose
+from sb3_quad.controllers.controller import observation_function
+from sb3_quad.envs.rendering.labels import COLOURS
+from sb3_quad.envs.rendering.models import rotor_turning
+from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.evaluation.scenario_flights import flown_as
-from sb3_quad.experts.controller import observation_function
-from sb3_quad.scenarios.load import load_suite
-from sb3_quad.scenarios.parts import Wrench
-from sb3_quad.scenarios.sample import Plan, sample_plan, sample_wrenches
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.evaluation.scenarios.parts import Wrench
+from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan, sample_wrenches
 from sb3_quad.simulation.checks import vector
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
@@ -93,7 +93,7 @@ def fixed_setting(
     """Episodes of some settings, all with the same target and the same push.
 
     :param target: r_T, (3,), m; None: the episode's own.
-    :param push: fields of a :class:`~sb3_quad.scenarios.parts.Wrench`; none: there is no push.
+    :param push: fields of a :class:`~sb3_quad.evaluation.scenarios.parts.Wrench`; none: there is no push.
     :raises ConfigError: an unknown vehicle, a target below ground, a push that is none.
     """
     vehicle = load_vehicle(settings.vehicle)

@@ -16,11 +16,11 @@ from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
-from sb3_quad.drawing.camera import Camera, Lens, broadside, following_cameras, framing_camera
-from sb3_quad.drawing.labels import side_by_side, with_header
-from sb3_quad.drawing.picture import Overlay
-from sb3_quad.drawing.scene import Scene
-from sb3_quad.drawing.window import disconnect, open_window, point_window, start_drawing
+from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, following_cameras, framing_camera
+from sb3_quad.envs.rendering.labels import side_by_side, with_header
+from sb3_quad.envs.rendering.picture import Overlay
+from sb3_quad.envs.rendering.scene import Scene
+from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.episodes import Recording
 
 FPS = 25

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray, Image
-from sb3_quad.drawing.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.drawing.labels import side_by_side, tag_size, with_header, with_tags
-from sb3_quad.drawing.models import span
-from sb3_quad.drawing.picture import Overlay
-from sb3_quad.drawing.scene import Scene
+from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
+from sb3_quad.envs.rendering.labels import side_by_side, tag_size, with_header, with_tags
+from sb3_quad.envs.rendering.models import span
+from sb3_quad.envs.rendering.picture import Overlay
+from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.show.episodes import Recording
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target

@@ -12,11 +12,11 @@ from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.pretrained_policies import agent_path
-from sb3_quad.scenarios.load import load_suite
-from sb3_quad.scenarios.scenario import Scenario, Suite
-from sb3_quad.settings.config import load_config
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
 from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
+from sb3_quad.training.config import load_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import Pipeline, is_pipeline, load_pipeline, stage_jobs, with_settings
 from sb3_quad.vehicles.vehicle import first_vehicle

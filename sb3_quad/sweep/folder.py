@@ -17,7 +17,7 @@ from pydantic import Field
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
 from sb3_quad.base.validate import Frozen, read_record
-from sb3_quad.scenarios.scenario import Suite
+from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.records import RunRecord
 from sb3_quad.sweep.spec import SweepSpec

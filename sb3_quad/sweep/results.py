@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_quad import __version__
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.files import write_text
+from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.sweep.aggregates import aggregates
 from sb3_quad.sweep.folder import Plan, SweepFolder

@@ -16,17 +16,17 @@ from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import import_packages, require
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import validate
+from sb3_quad.controllers.zips import load_model, saved_data
 from sb3_quad.evaluation.controllers import ControllerSpec, build
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors.travel import pack, unpack, with_files
-from sb3_quad.experts.models import load_model, saved_data
-from sb3_quad.scenarios.scenario import Suite
-from sb3_quad.settings.config import build_config
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.simulation.batch import share_cores
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.records import MEASURES, REWARD, Numbers, RunRecord
+from sb3_quad.training.config import build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import STATUS_FILE, resume_pipeline, run_pipeline

@@ -17,11 +17,11 @@ from typing import Annotated, Any, TypeAlias
 from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, PositiveInt
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import check_seed
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.settings.literals import parse_number
-from sb3_quad.settings.values import as_list
+from sb3_quad.training.values import as_list
 
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 MAX_RUNS = 10_000

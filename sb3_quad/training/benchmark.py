@@ -22,13 +22,13 @@ from gymnasium.wrappers import Autoreset
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-import sb3_quad
-from sb3_quad import common
+from sb3_quad.algorithms import common
+from sb3_quad.algorithms.networks import Perceptron
 from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.experts.controller import Controller
-from sb3_quad.networks import Perceptron
-from sb3_quad.settings.config import TrainingConfig, build_config
+from sb3_quad.base.version import __version__
+from sb3_quad.controllers.controller import Controller
+from sb3_quad.training.config import TrainingConfig, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import build_model
@@ -189,7 +189,7 @@ def machine() -> dict[str, Any]:
         "cores": available_cpus(),
         "system": platform.platform(),
         "python": platform.python_version(),
-        "versions": {"sb3_quad": sb3_quad.__version__, **{package: metadata.version(package) for package in PACKAGES}},
+        "versions": {"sb3_quad": __version__, **{package: metadata.version(package) for package in PACKAGES}},
         "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
         "time": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
     }

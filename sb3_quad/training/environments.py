@@ -15,8 +15,8 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
-from sb3_quad.settings.config import TrainingConfig
-from sb3_quad.settings.values import instance
+from sb3_quad.training.config import TrainingConfig
+from sb3_quad.training.values import instance
 
 
 class _Dummy(RowSeeds, DummyVecEnv):

@@ -12,8 +12,8 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.memory import check_unpacked
-from sb3_quad.experts.controller import Controller
-from sb3_quad.experts.models import load_model
+from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.zips import load_model
 
 
 def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
@@ -80,7 +80,7 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e to the ``log_std_init`` of
     its ``policy_kwargs`` everywhere, e^-2 without one. The environments are reset afterwards by whoever learns.
 
-    :param teacher: what :class:`~sb3_quad.experts.controller.Controller` takes.
+    :param teacher: what :class:`~sb3_quad.controllers.controller.Controller` takes.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
     """
     env, policy, actor = model.get_env(), model.policy, cast(Any, model.actor)

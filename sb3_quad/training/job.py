@@ -9,8 +9,8 @@ from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import check_seed
 from sb3_quad.base.validate import Frozen
-from sb3_quad.settings.config import TrainingConfig
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.training.config import TrainingConfig
 
 
 def _check_device(device: str) -> str:

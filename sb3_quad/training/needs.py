@@ -7,7 +7,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.memory import check_memory
-from sb3_quad.settings.config import TrainingConfig
+from sb3_quad.training.config import TrainingConfig
 
 ROLLOUT_COLUMNS = 6  # of a rollout buffer, float32 each, beside observations and actions
 REPLAY_COLUMNS = 3  # of a replay buffer, likewise

@@ -24,15 +24,15 @@ from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_va
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
+from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.experts.models import load_zip, saved_data
+from sb3_quad.controllers.zips import load_zip, saved_data
 from sb3_quad.report.curves import read_curve
-from sb3_quad.settings.algorithms import get_algorithm
-from sb3_quad.settings.config import SETTINGS, load_config, with_vehicle_path
-from sb3_quad.settings.literals import parse_mapping
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.training.algorithms import get_algorithm
+from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import check_tensorboard, resume, train

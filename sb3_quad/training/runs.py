@@ -11,12 +11,12 @@ import stable_baselines3
 import torch
 import yaml
 
-import sb3_quad
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
+from sb3_quad.base.literals import ZooLoader
+from sb3_quad.base.version import __version__
 from sb3_quad.base.yaml_files import parse_mapping_file
-from sb3_quad.pretrained_policies import BEST, TRIMMED, run_agent
-from sb3_quad.settings.literals import ZooLoader
+from sb3_quad.controllers.pretrained import BEST, TRIMMED, run_agent
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
 
@@ -85,14 +85,14 @@ class RunFolder:
 
 def made_with() -> dict[str, str]:
     """The commit of the checkout, with a mark where files differ from it, and the versions of what a run is made with."""
-    checkout = Path(sb3_quad.__file__).resolve().parent.parent
+    checkout = Path(__file__).resolve().parents[2]
     command = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty= and changes"]
     try:
         commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         commit = "not a checkout"
     versions = f"stable-baselines3 {stable_baselines3.__version__}, torch {torch.__version__}"
-    return dict(zip(MADE_WITH, (commit, f"sb3_quad {sb3_quad.__version__}, {versions}"), strict=True))
+    return dict(zip(MADE_WITH, (commit, f"sb3_quad {__version__}, {versions}"), strict=True))
 
 
 def file_name(env_id: str) -> str:

@@ -16,8 +16,8 @@ from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.callbacks.interruption import ENVIRONMENT, MEMORY, LastGoodModel, set_random_state
-from sb3_quad.experts.models import load_zip
-from sb3_quad.settings.algorithms import get_algorithm
+from sb3_quad.controllers.zips import load_zip
+from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 DATASET = "dataset."  # before the names of the dataset's arrays

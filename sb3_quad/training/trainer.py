@@ -30,11 +30,10 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import LastGoodModel
-from sb3_quad.experts.controller import Controller
-from sb3_quad.experts.resolve import resolve_expert
-from sb3_quad.settings.algorithms import get_algorithm, takes_expert
-from sb3_quad.settings.config import TrainingConfig, build_config
-from sb3_quad.settings.values import instance
+from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.training.algorithms import get_algorithm, takes_expert
+from sb3_quad.training.config import TrainingConfig, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob
@@ -42,6 +41,7 @@ from sb3_quad.training.needs import check_buffer, check_networks
 from sb3_quad.training.progress import ProgressBar
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
+from sb3_quad.training.values import instance
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
 Report = Callable[[str], None]

@@ -20,7 +20,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.evaluation.flights import Flights, Hook, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.tuning.study import open_study
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics

@@ -24,11 +24,11 @@ from optuna import Trial
 from pydantic import Field, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.literals import parse_number, parse_value
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm, is_off_policy
-from sb3_quad.settings.literals import parse_number, parse_value
-from sb3_quad.settings.values import takes_whole
+from sb3_quad.training.algorithms import constructor_parameters, get_algorithm, is_off_policy
+from sb3_quad.training.values import takes_whole
 
 SPACES = YamlFolder("search space", "sb3_quad.zoo_configs.search_spaces", ".yml")
 MINIBATCHES = "n_minibatches"

@@ -15,12 +15,12 @@ from rl_zoo3 import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.literals import parse_mapping
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.settings.algorithms import takes_expert
-from sb3_quad.settings.config import SETTINGS, VEC_ENVS
-from sb3_quad.settings.literals import parse_mapping
+from sb3_quad.training.algorithms import takes_expert
+from sb3_quad.training.config import SETTINGS, VEC_ENVS
 from sb3_quad.training.handover import transfer_policy
 from sb3_quad.zoo.registration import OWN_ALGORITHMS, Settings, register_space, to_keywords
 

@@ -8,14 +8,14 @@ from typing import Any
 from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
-from sb3_quad.settings.algorithms import constructor_parameters, get_algorithm
-from sb3_quad.settings.config import SETTINGS
-from sb3_quad.settings.literals import parse_mapping
-from sb3_quad.settings.values import convert
+from sb3_quad.base.literals import parse_mapping
+from sb3_quad.training.algorithms import constructor_parameters, get_algorithm
+from sb3_quad.training.config import SETTINGS
+from sb3_quad.training.values import convert
 from sb3_quad.tuning.space import load_space
 
 Settings = dict[str, Any]
-OWN_ALGORITHMS = ("dagger", "ppo_bc", "recurrent_dagger", "sac_bc")
+OWN_ALGORITHMS = ("dagger", "ppo_bc", "sac_bc")
 
 
 def register() -> None:

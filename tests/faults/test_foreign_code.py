@@ -19,10 +19,10 @@ from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.experts.models import load_model, load_zip
-from sb3_quad.experts.unpickle import unpickle
-from sb3_quad.pretrained_policies import pretrained
-from sb3_quad.settings.flight import FlightSettings
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.controllers.unpickle import unpickle
+from sb3_quad.controllers.zips import load_model, load_zip
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 MARK = Path("foreign_code_ran")
@@ -220,5 +220,5 @@ def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
         data["flight_settings"]["vehicle"]["name"] = name
         copy.writestr("data", json.dumps(data))
     with pytest.raises(ConfigError, match=r"foreign\.zip: flight_settings: name: "):
-        FlightSettings.of("foreign.zip")
+        agent_settings("foreign.zip")
     assert sorted(path.name for path in here.rglob("*")) == ["foreign.yaml", "foreign.zip", "own"]

@@ -8,13 +8,13 @@ import torch
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
+from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import locked
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli import main
-from sb3_quad.dagger import DAgger
-from sb3_quad.settings.config import build_config
 from sb3_quad.training import snapshots
+from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
 

@@ -2,7 +2,6 @@
 
 controllers:
   pid, geometric          the experts
-  raptor                  RAPTOR's published policy; needs: pip install '.[raptor]' from a clone
   path/to/agent.zip       an agent of any Stable-Baselines3 algorithm, or the run folder of one
   package.module:factory  a function that takes the vehicle and returns a controller
   name=…                  any of these, under that name in the tables

@@ -11,7 +11,7 @@ How it was trained is taken from its run folder. What is recorded nowhere, the c
 """
 
 from sb3_quad.cli.parser import TRUST, Parser, positive
-from sb3_quad.pretrained_policies import agent_path
+from sb3_quad.controllers.pretrained import agent_path
 
 
 def add_arguments(parser: Parser) -> None:

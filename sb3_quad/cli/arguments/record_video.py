@@ -12,7 +12,7 @@ Films need: pip install '.[video]' from a clone. Several controllers, scenarios 
 
 from sb3_quad.cli.arguments.enjoy import add_flight_arguments
 from sb3_quad.cli.parser import Parser, positive
-from sb3_quad.pretrained_policies import agent_path
+from sb3_quad.controllers.pretrained import agent_path
 
 
 def add_arguments(parser: Parser) -> None:

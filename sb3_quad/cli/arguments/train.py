@@ -21,7 +21,7 @@ examples:
 import argparse
 
 from sb3_quad.cli.parser import BRIDGE, TRUST, OneOrMore, Pairs, Parser, pointers, positive, seed, whole
-from sb3_quad.pretrained_policies import agent_path
+from sb3_quad.controllers.pretrained import agent_path
 
 DEFAULT_PIPELINE = "imitation.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
@@ -43,7 +43,7 @@ def add_settings(parser: Parser) -> None:
     """The flags of rl-zoo's ``train.py`` for what is trained, with their meanings."""
     parser.elsewhere = ELSEWHERE
     add = parser.add_argument
-    add("--algo", help=f"algorithm: dagger, recurrent_dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
+    add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
     add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
     add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
     add("-n", "--n-timesteps", type=whole, metavar="N", help="timesteps, in whole rollouts; fewer than one shorten it")

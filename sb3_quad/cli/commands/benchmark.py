@@ -7,8 +7,8 @@ from dataclasses import asdict
 from sb3_quad.base.files import write_text
 from sb3_quad.cli.output import console
 from sb3_quad.evaluation.tables import text_table
-from sb3_quad.settings.config import load_config
 from sb3_quad.training.benchmark import PARTS, TRAINED, machine, single, training_loop, vectorised
+from sb3_quad.training.config import load_config
 
 
 def _share(seconds: dict[str, float], part: str) -> str:

@@ -16,15 +16,15 @@ from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.arguments.enjoy import DEFAULT_ENV
 from sb3_quad.cli.output import progress_bar
 from sb3_quad.cli.parser import given
-from sb3_quad.drawing.window import has_display
 from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.rendering.window import has_display
 from sb3_quad.evaluation.controllers import ControllerSpec, build, parse_controllers
-from sb3_quad.settings.algorithms import get_algorithm
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.show.episodes import Recording, Setting, fixed_setting, fly_all, scenario_setting
 from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
 from sb3_quad.show.sequence import sequence
 from sb3_quad.simulation.checks import check_size
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import find_run
 
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels

@@ -11,7 +11,7 @@ from sb3_quad.cli.output import console, progress_bar
 from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.metric_tables import overview
-from sb3_quad.scenarios.load import load_suite
+from sb3_quad.evaluation.scenarios.load import load_suite
 
 
 def run(options: argparse.Namespace) -> int:

@@ -10,35 +10,26 @@ from sb3_quad.cli.output import output_file
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.export.c_header import c_name
 from sb3_quad.export.policy import FORMATS, export_policy
-from sb3_quad.export.px4_raptor import FILE, export_px4_raptor
-
-PX4 = "px4-raptor"
 
 
 def run(options: argparse.Namespace) -> int:
     """Build, check, time, write. Returns the exit code."""
-    formats = [*FORMATS, PX4]
-    if options.format not in formats:
-        raise ConfigError(unknown("format", options.format, formats))
+    if options.format not in FORMATS:
+        raise ConfigError(unknown("format", options.format, FORMATS))
     model = Path(options.model)
-    file = output_file(options.file, FILE if options.format == PX4 else model.stem + FORMATS[options.format])
+    file = output_file(options.file, model.stem + FORMATS[options.format])
     if file.resolve() == model.resolve():
         raise ConfigError(f"{file}: is the model itself; give another file with -o")
     refuse_existing(file, options.overwrite)
     if options.name is not None and options.format != "c":
         raise ConfigError(f"--name {options.name}: only a C header has one (--format c)")
-    if options.output != "thrusts" and options.format == PX4:
-        raise ConfigError(f"--output {options.output}: {PX4} gives motor commands, and nothing else")
     name = c_name(file.stem) if options.name is None else options.name
     if options.vehicle and (line := ControllerSpec(model.stem, str(model)).notice(options.vehicle)):
         print(f"warning: {line}", file=sys.stderr)
-    if options.format == PX4:
-        exported = export_px4_raptor(model, options.vehicle)
-    else:
-        exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
+    exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
     write_bytes(file, exported.content)
     print(f"settings: {exported.settings or 'neither in the zip nor beside it; assumed: itm, the scaling of Table A.2'}")
-    for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "checkpoint_name", "check"):
+    for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check"):
         if key in exported.metadata:
             print(f"{key}: {exported.metadata[key]}")
     if exported.microseconds is not None:

@@ -7,9 +7,9 @@ from pathlib import Path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.cli.arguments.plot import THESIS
+from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.report.curves import plot_curves, read_curve
 from sb3_quad.report.plots import picture
-from sb3_quad.scenarios.load import load_suite
 
 
 def run(options: argparse.Namespace) -> int:

@@ -8,10 +8,10 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
 from sb3_quad.base.signals import StopSignals
-from sb3_quad.experts.models import load_model, saved_algorithm, saved_data
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.export.policy import slim_bytes
 from sb3_quad.report.card import measure, write_card
-from sb3_quad.settings.flight import FlightSettings
 from sb3_quad.training.runs import MADE_WITH, open_run
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -25,7 +25,7 @@ def run(options: argparse.Namespace) -> int:
     zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
-    settings, source = FlightSettings.of(options.model)
+    settings, source = agent_settings(options.model)
     content = slim_bytes(options.model, settings if source else None)
     command, facts = _origin(Path(options.model))
     if not source:

@@ -7,6 +7,7 @@ from typing import Any
 
 import torch
 
+from sb3_quad.algorithms.networks import share_out
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.seeds import seed_for
@@ -16,10 +17,9 @@ from sb3_quad.cli.compare import agent_and_expert, print_tables
 from sb3_quad.cli.next_commands import print_next
 from sb3_quad.cli.output import console, shows_progress
 from sb3_quad.cli.parser import given
-from sb3_quad.experts.models import load_model
-from sb3_quad.experts.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.networks import share_out
-from sb3_quad.settings.config import TrainingConfig, load_config
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
+from sb3_quad.controllers.zips import load_model
+from sb3_quad.training.config import TrainingConfig, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import (
     REFERENCE,

@@ -16,10 +16,10 @@ from sb3_quad.cli.commands.train import make_config, prepare
 from sb3_quad.cli.compare import agent_and_expert
 from sb3_quad.cli.output import console, progress_bar
 from sb3_quad.cli.parser import given
+from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.tables import text_table
 from sb3_quad.executors import start_executor
-from sb3_quad.experts.models import load_model
-from sb3_quad.settings.config import build_config
+from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import claim_folder, file_name, open_run
 from sb3_quad.tuning.results import BEST, PLOT, TRIALS, in_words, settings_of, train_command, varied, write_plot, write_results

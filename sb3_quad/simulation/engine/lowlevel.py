@@ -42,7 +42,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 def _source_stamp() -> str:
     """A digest of what is compiled in: the same for copies of it, such as those that a cluster's nodes are sent."""
     package, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
-    for folder in ("base", "vehicles", "simulation", "experts", "networks"):
+    for folder in ("base", "vehicles", "simulation", "experts", "algorithms/networks"):
         for path in sorted((package / folder).rglob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()

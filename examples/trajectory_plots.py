@@ -1,0 +1,88 @@
+"""Flights of the policy as it is, as plots in TensorBoard."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure as Picture
+from stable_baselines3.common.logger import Figure
+
+from sb3_quad.base.arrays import Arrays
+from sb3_quad.base.seeds import row_seeds
+from sb3_quad.callbacks.every import EveryTimesteps
+from sb3_quad.controllers.controller import Controller
+from sb3_quad.envs.in_flight import quadcopter_spaces
+from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.evaluation.flights import ACTIONS, fly_settings
+from sb3_quad.simulation import MAX_EPISODE_STEPS
+from sb3_quad.simulation.settings import FlightSettings
+
+
+class TrajectoryPlots(EveryTimesteps):
+    """Flies a few episodes every ``every`` timesteps and logs them as ``flights/figure``: path, error, actions.
+
+    It works with any algorithm whose policy flies on the quadcopter's own observation. The flights are deterministic, the
+    same each time, and separate from the training: neither its environments nor its random numbers are touched.
+
+    >>> from stable_baselines3 import PPO
+    >>> from sb3_quad.envs import QuadcopterVecEnv
+    >>> env = QuadcopterVecEnv(8, "state_recovery", seed=0)
+    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, tensorboard_log="tb", device="cpu")
+    >>> plots = TrajectoryPlots(every=800, n_flights=2, max_steps=50, task="state_recovery")
+    >>> _ = model.learn(800, callback=plots)
+
+    In a configuration file, with ``-tb`` on the command line: ``TrajectoryPlots: {every: 1000000, task: state_recovery}``.
+
+    :param every: timesteps between plots.
+    :param n_flights: episodes in a plot.
+    :param seed: of the flights.
+    :param max_steps: control steps after which an episode ends at the latest.
+    :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as ``task`` and ``vehicle``.
+    :raises ConfigError: ``every`` or ``n_flights`` below 1, an unknown keyword; a policy of other spaces.
+    """
+
+    def __init__(
+        self,
+        every: int,
+        n_flights: int = 4,
+        seed: int = 0,
+        max_steps: int = MAX_EPISODE_STEPS,
+        verbose: int = 0,
+        **environment: Any,
+    ) -> None:
+        super().__init__(every, verbose, n_flights=n_flights, max_steps=max_steps)
+        self._seeds = row_seeds(seed, n_flights)
+        self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_steps)
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        Controller(self.model, ACTIONS, quadcopter_spaces(self._settings.size)[0], kind="TrajectoryPlots: policy")
+
+    def _on_event(self) -> bool:
+        recorder = Recorder(len(self._seeds))
+        fly_settings(self.model, self._settings, self._seeds, hooks=[recorder])
+        plot = Figure(_plot(recorder.arrays()), close=False)
+        self.logger.record("flights/figure", plot, exclude=("stdout", "log", "json", "csv"))
+        self.logger.dump(self.num_timesteps)
+        return True
+
+
+def _plot(flights: Arrays) -> Picture:
+    """Paths in 3-D, distance from the target, and the actions of the first flight."""
+    picture = Picture(figsize=(13, 4), layout="constrained")
+    space: Any = picture.add_subplot(1, 3, 1, projection="3d")
+    space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="paths and targets")
+    error = picture.add_subplot(1, 3, 2, xlabel="time (s)", ylabel="distance from target (m)", title="error")
+    actions = picture.add_subplot(1, 3, 3, xlabel="time (s)", ylabel="action", title="actions of flight 0", ylim=(-1.05, 1.05))
+    for number, (position, target) in enumerate(zip(flights["position"], flights["target"], strict=True)):
+        space.plot(*position.T, color=f"C{number}")
+        space.plot(*target[:1].T, color=f"C{number}", marker="D")
+        error.plot(flights["time"], np.linalg.norm(position - target, axis=1), label=f"flight {number}")
+    actions.plot(flights["time"], flights["action"][0], label=[f"rotor {rotor}" for rotor in range(4)])
+    space.set_aspect("equal", adjustable="datalim")
+    for axes in (error, actions):
+        axes.grid(alpha=0.3)
+        axes.legend(frameon=False)
+    return picture
+
+
+TrajectoryFigures = TrajectoryPlots  # its former name

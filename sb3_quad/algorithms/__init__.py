@@ -1,0 +1,1 @@
+"""The algorithms: DAgger, and PPO and SAC with behavioural cloning."""

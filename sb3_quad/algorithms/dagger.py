@@ -1,0 +1,485 @@
+"""DAgger, data aggregation, as a Stable-Baselines3 algorithm (thesis 3.1.2, 4.2.1, Algorithm 3)."""
+
+import secrets
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import PPO
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import DiagGaussianDistribution
+from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import FloatSchedule, explained_variance
+from stable_baselines3.common.vec_env import VecEnv
+from typing_extensions import Self
+
+from sb3_quad.algorithms import common
+from sb3_quad.algorithms.dataset import AggregatedDataset, sample_rows
+from sb3_quad.algorithms.networks import shared_out
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.base.errors import ConfigError, TrainingError, unknown
+from sb3_quad.controllers.controller import Controller
+
+_VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
+
+_LEAST = {"n_steps": 1, "batch_size": 1, "n_epochs": 1, "gradient_steps": 1, "beta_decay": 0, "beta_final": 0}
+# Names of the critic's own parameters; the last two are those of recurrent policies.
+_CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.", "lstm_critic.", "critic.")
+Timeout = tuple[int, int, npt.NDArray[Any], Any]  # step, environment, last observation, what the critic remembered
+
+
+class DAgger(common.Taught, OnPolicyAlgorithm):
+    """Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
+
+    In every control step and every environment, independently, the expert's action flies with probability β, else the agent's
+    sampled action. Each visited observation joins a bounded dataset together with the expert's action for the state *before*
+    the step. The actor learns from mini-batches of the dataset, the critic from the GAE returns of the rollout just flown. The
+    loss is Eq. 4.3, with the sign of its entropy term put right (it prints +c_H H in a loss that is minimised; entropy is to
+    be encouraged)::
+
+        L_BC + l2_coef * 1/2 Σw² - ent_coef * H + vf_coef * value loss (Eq. 3.8)
+
+    with Σw² over the weight matrices of both networks, without biases and log_std.
+
+    For any environment with a Box action space and observations that are not a Dict. Papers:
+    https://arxiv.org/abs/1011.0686 (DAgger); the study thesis STUD-512 (this form of it).
+
+    A run is a function of its ``seed``: β, the agent's sampling and the mini-batches come from generators that are seeded by
+    it and by the updates made so far, so a resumed run continues exactly as the uninterrupted one would have.
+
+    Arguments that are not listed here mean what they mean in :class:`stable_baselines3.PPO`. ``learning_rate`` and
+    ``clip_range_vf`` can be functions of the remaining progress (from 1 to 0).
+
+    :param policy: The policy model to use (MlpPolicy, CnnPolicy, ...). Unless ``policy_kwargs`` holds ``log_std_init``, it
+        begins at -2: sampled actions fly, and SB3's own 0 spreads them over the whole action space
+    :param env: The environment to learn from (if registered in Gym, can be str)
+    :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``GeometricExpert``, another SB3
+        model, or a function from observations to actions; :class:`~sb3_quad.controllers.controller.Controller` says what
+        each is shown. It is never saved: give it to ``load`` again, or call :meth:`set_expert`, before learning continues
+    :param batch_size: Minibatch size, in pairs of the dataset
+    :param n_epochs: Passes of the critic over each rollout; and of the actor, over as many pairs as a rollout holds,
+        unless ``gradient_steps`` says otherwise
+    :param clip_range_vf: ε of the clipped value loss (Eq. 3.8). None: plain mean squared error
+    :param ent_coef: Entropy coefficient c_H
+    :param max_grad_norm: The maximum value for the gradient clipping, of actor and critic each by itself, so that a
+        large error of the critic does not hold up the actor. None: no clipping
+    :param gradient_steps: Optimiser steps after each rollout, at most one for each row of ``n_epochs`` passes over it. Each
+        takes ``batch_size`` pairs of the dataset. None: ``n_epochs * ceil(n_steps * n_envs / batch_size)``, as in PPO. The
+        critic takes part in as many of them as that, or in all if there are fewer, each with an equal share of its passes
+    :param beta: β of the first rollout, from 0 to 1
+    :param beta_decay: What β loses with every rollout
+    :param beta_final: Where β stops falling
+    :param bc_loss: ``"nll"``, Eq. 3.12, learns the standard deviation too; ``"mse"``, on the mean alone, leaves it to
+        ``log_std_init`` and ``ent_coef``; so do ``"huber"``, squared up to 0.05 and linear beyond, which is more exact
+        where the expert is smooth, and ``"huber_mse"``, that and three times the squared error
+    :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
+    :param l2_coef: c_L2
+    :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
+    :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis prepares them
+        ("chronologically", 4.2.3)
+    :raises ConfigError: an argument out of range, or a space that is not supported
+    :raises ExpertError: an expert that does not fit the environment
+    """
+
+    policy_aliases = PPO.policy_aliases
+
+    def __init__(
+        self,
+        policy: str | type[ActorCriticPolicy],
+        env: GymEnv | str,
+        expert: Any = None,
+        learning_rate: float | Schedule = 1e-3,
+        n_steps: int = 250,
+        batch_size: int = 8192,
+        n_epochs: int = 10,
+        gamma: float = 0.998,
+        gae_lambda: float = 0.95,
+        clip_range_vf: float | Schedule | None = None,
+        ent_coef: float = 0.0,
+        vf_coef: float = 0.5,
+        max_grad_norm: float | None = 0.5,
+        gradient_steps: int | None = None,
+        beta: float = 0.5,
+        beta_decay: float = 0.001,
+        beta_final: float = 0.3,
+        bc_loss: common.CloningLoss = "mse",
+        log_std_min: float = -3.0,
+        l2_coef: float = 0.0,
+        dataset_capacity: int = 1_500_000,
+        shuffle: bool = True,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            if isinstance(env.observation_space, spaces.Dict):
+                raise ConfigError(
+                    f"observation space {env.observation_space}: DAgger does not support Dict; wrap the environment in "
+                    "gymnasium.wrappers.FlattenObservation"
+                )
+            if not isinstance(env.action_space, spaces.Box):
+                raise ConfigError(f"action space {env.action_space}: DAgger supports Box only")
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            n_steps=n_steps,
+            gamma=gamma,
+            gae_lambda=gae_lambda,
+            ent_coef=ent_coef,
+            vf_coef=vf_coef,
+            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
+            use_sde=False,
+            sde_sample_freq=-1,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs={"log_std_init": -2.0, **(policy_kwargs or {})},
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.batch_size = batch_size
+        self.n_epochs = n_epochs
+        self.gradient_steps = gradient_steps
+        self.clip_range_vf = clip_range_vf
+        self.beta = beta
+        self.beta_decay = beta_decay
+        self.beta_final = beta_final
+        self.bc_loss: common.CloningLoss = bc_loss
+        self.log_std_min = log_std_min
+        self.l2_coef = l2_coef
+        self.dataset_capacity = dataset_capacity
+        self.shuffle = shuffle
+        self.expert: Any = None
+        self._n_rollouts = 0
+        self._entropy = secrets.randbits(63)  # what seeds the generators where no seed is given
+
+        if expert is not None:
+            self.set_expert(expert)
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        super()._setup_model()
+        if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
+            raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
+        if self.clip_range_vf is not None:
+            self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        dtype = self.rollout_buffer.observations.dtype
+        self.dataset = self._empty_dataset(
+            self.dataset_capacity or self.n_steps * self.n_envs,
+            self.rollout_buffer.obs_shape,
+            self.rollout_buffer.action_dim,
+            np.float32 if np.issubdtype(dtype, np.floating) else dtype,
+        )
+
+    def _empty_dataset(
+        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike
+    ) -> AggregatedDataset:
+        return AggregatedDataset(capacity, observation_shape, action_dim, dtype)
+
+    def _check_arguments(self) -> None:
+        """:raises ConfigError: an argument that does not fit; one line says which and what is allowed."""
+        for name, least in _LEAST.items():
+            value = getattr(self, name)
+            if value is not None and value < least:
+                raise ConfigError(f"{name} {value}: must be at least {least}")
+        if not self.beta_final <= self.beta <= 1.0:
+            raise ConfigError(f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1")
+        if isinstance(self.clip_range_vf, (float, int)) and self.clip_range_vf <= 0:
+            raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
+        if self.policy_kwargs.get("use_sde"):
+            raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
+        if self.bc_loss not in common.CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, common.CLONING_LOSSES))
+        rollout = self.n_steps * self.n_envs
+        if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
+            raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
+
+    def set_expert(self, expert: Any) -> None:
+        """Learn from ``expert`` from now on.
+
+        :raises ExpertError: an expert that does not fit the environment
+        """
+        if self.env is not None:
+            self._labeller = Controller.for_env(expert, self.env, self._labeller)
+        self.expert = expert
+
+    @property
+    def current_beta(self) -> float:
+        """β of the present rollout k: max(β_0 - k Δβ, β_final), Algorithm 3 line 8."""
+        return max(self.beta - self.beta_decay * self._n_rollouts, self.beta_final)
+
+    def set_beta(self, beta: float) -> None:
+        """Let the expert fly with probability ``beta`` from the next rollout on, whatever ``beta_decay`` says.
+
+        :raises ConfigError: a number below 0 or above 1
+        """
+        if not 0.0 <= beta <= 1.0:
+            raise ConfigError(f"beta {beta}: a probability, from 0 to 1")
+        self.beta = self.beta_final = float(beta)
+
+    def _generator(self, purpose: int) -> np.random.Generator:
+        """Random numbers for this rollout (0) or update (1): no state to save, and the same again after a resume."""
+        return np.random.default_rng([self._entropy if self.seed is None else self.seed, purpose, self._n_updates])
+
+    def collect_rollouts(
+        self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
+    ) -> bool:
+        """Fly ``n_rollout_steps`` steps by the mixture of expert and agent, and add what was seen to the dataset.
+
+        Fills ``rollout_buffer`` as SB3 does, but for ``log_probs``, which no loss here needs. The critic evaluates the
+        whole rollout at the end, since it does not change before.
+        """
+        self.policy.set_training_mode(False)
+        self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)
+        rng, networks = self._generator(0), common.perceptrons(self.policy)
+        beta = self.current_beta
+        n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
+        low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
+        std = np.exp(self.policy.log_std.detach().cpu().numpy())
+        labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)
+        not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
+        timeouts: list[Timeout] = []
+        n_by_expert = 0
+
+        rollout_buffer.reset()
+        callback.on_rollout_start()
+
+        for step in range(n_rollout_steps):
+            observations: Any = self._last_obs
+            labels[step] = labeller.labels(observations, self._last_episode_starts)  # of the state before the step
+            means = self._means(networks, observations, step)
+            sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
+            by_expert = rng.random(n_envs) < beta
+            actions = np.where(by_expert[:, None], labels[step], sampled)
+            clipped_actions = np.clip(actions, low, high).reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
+
+            new_obs, rewards, dones, infos = env.step(clipped_actions)
+
+            self.num_timesteps += n_envs
+            n_by_expert += int(by_expert.sum())
+            callback.update_locals(locals())
+            if not callback.on_step():
+                return False
+
+            ended = np.flatnonzero(dones)
+            self._update_info_buffer([infos[row] for row in ended], dones[ended])
+            for row in ended:
+                if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
+                    timeouts.append((step, int(row), infos[row]["terminal_observation"], self._critic_memory(int(row))))
+
+            rollout_buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)  # type: ignore[arg-type]
+            self._last_obs = new_obs  # type: ignore[assignment]
+            self._last_episode_starts = dones
+
+        values, last_values, terminal_values = self._rollout_values(timeouts)
+        rollout_buffer.values = values
+        if timeouts:  # a time limit is no failure: what would have followed is worth V of the last observation
+            steps, rows, *_ = zip(*timeouts, strict=True)
+            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * terminal_values
+        rollout_buffer.compute_returns_and_advantage(last_values=th.from_numpy(last_values), dones=dones)
+
+        if self.dataset_capacity == 0:
+            self.dataset.clear()
+        self._aggregate(labels)
+        self._n_rollouts += 1
+
+        self.logger.record("dagger/beta", beta)
+        self.logger.record("dagger/dataset_size", self.dataset.n_pairs)
+        self.logger.record("rollout/expert_fraction", n_by_expert / (n_rollout_steps * n_envs))
+        callback.update_locals(locals())
+        callback.on_rollout_end()
+        return True
+
+    def _means(self, networks: common.Perceptrons | None, observations: npt.NDArray[Any], step: int) -> Float32Array:
+        """The policy's mean actions (n_envs, action_dim) for the observations of a step of the rollout."""
+        return common.outputs(networks, self.policy, "actor", observations)
+
+    def _critic_memory(self, row: int) -> Any:
+        """What the critic remembers of environment ``row`` after the step."""
+        return None
+
+    def _rollout_values(self, timeouts: list[Timeout]) -> tuple[Float32Array, Float32Array, Float32Array]:
+        """V of the rollout's observations (n_steps, n_envs), of those after it (n_envs,), and where time limits struck."""
+        buffer = self.rollout_buffer
+        values = self._values(buffer.observations.reshape(-1, *buffer.obs_shape)).reshape(buffer.values.shape)
+        terminal = self._values(np.stack([last for _, _, last, _ in timeouts])) if timeouts else np.empty(0, np.float32)
+        return values, self._values(self._last_obs), terminal
+
+    def _aggregate(self, labels: Float32Array) -> None:
+        """Add the rollout to the dataset, with its labels (n_steps, n_envs, action_dim)."""
+        flown = self.rollout_buffer.observations.reshape(-1, *self.rollout_buffer.obs_shape)
+        self.dataset.add(flown, labels.reshape(len(flown), -1))
+
+    def _values(self, observations: Any) -> Float32Array:
+        """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
+        networks, chunks = common.perceptrons(self.policy), range(0, len(observations), _VALUE_CHUNK)
+        parts = (observations[first : first + _VALUE_CHUNK] for first in chunks)
+        return np.concatenate([common.outputs(networks, self.policy, "critic", part) for part in parts])
+
+    def train(self) -> None:
+        """Update the actor on the dataset and the critic on the rollout just flown.
+
+        :raises TrainingError: a loss or gradient that is not finite; the parameters stay those of the last good step
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.optimizer)
+        clip_range_vf = self.clip_range_vf(self._current_progress_remaining) if callable(self.clip_range_vf) else None
+        # The actor, with whatever both share, and the critic.
+        groups: dict[bool, list[th.nn.Parameter]] = {False: [], True: []}
+        for name, parameter in self.policy.named_parameters():
+            groups[name.startswith(_CRITIC)].append(parameter)
+        rng = self._generator(1)
+        buffer = self.rollout_buffer
+        n_rows, batch_size = self._batch_rows()
+        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // batch_size)
+        n_batches = min(n_batches, self.n_epochs * n_rows)
+        actor_batches = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle).reshape(n_batches, -1)
+        n_critic = min(self.n_epochs * -(-n_rows // batch_size), n_batches)  # steps in which the critic takes part
+        critic_batches = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle), n_critic))
+        flown, values = self._critic_data()
+        networks = common.perceptrons(self.policy)
+        terms = np.empty((n_batches, 4))  # of the loss; where the critic takes no part, its one is 0
+        limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+
+        for i, for_actor in enumerate(actor_batches):
+            due = (i + 1) * n_critic // n_batches > i * n_critic // n_batches
+            step = (for_actor, flown, values, next(critic_batches) if due else None, clip_range_vf)
+            terms[i] = self._gradients(*step) if networks is None else self._compiled_gradients(networks, *step)
+            for parameter in groups[True] if not due else ():
+                parameter.grad = None
+            norms = [th.nn.utils.clip_grad_norm_(groups[part], limit) for part in (False, True)[: 1 + due]]
+            if not np.isfinite(terms[i]).all() or not all(th.isfinite(norm) for norm in norms):
+                self.policy.optimizer.zero_grad()
+                raise TrainingError(
+                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms[i, 0]:.3g}, value loss "
+                    f"{terms[i, 1]:.3g}); lower learning_rate, or look for rewards and observations that are not finite"
+                )
+            self.policy.optimizer.step()
+            self.policy.log_std.data.clamp_(min=self.log_std_min)
+            self._n_updates += 1
+
+        bc, v_loss, entropy_loss, l2 = terms.sum(axis=0) / (n_batches, n_critic, n_batches, n_batches)
+        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
+        averages = {"loss": loss, "bc_loss": bc, "value_loss": v_loss, "entropy_loss": entropy_loss, "l2_loss": l2}
+        for name, average in averages.items():
+            self.logger.record(f"train/{name}", float(average))
+        self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
+        self.logger.record("train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        if clip_range_vf is not None:
+            self.logger.record("train/clip_range_vf", clip_range_vf)
+
+    def _batch_rows(self) -> tuple[int, int]:
+        """Rows of the rollout, and of a mini-batch; the dataset counts in the same rows."""
+        return self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs, self.batch_size
+
+    def _critic_data(self) -> tuple[npt.NDArray[Any], Float32Array]:
+        """Observations (n, ...) of the rollout; V when it was flown, and the returns, (n, 2)."""
+        buffer = self.rollout_buffer
+        values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
+        return buffer.observations.reshape(len(values), *buffer.obs_shape), values
+
+    def _gradients(
+        self,
+        for_actor: IntArray,
+        flown: npt.NDArray[Any],
+        values: Float32Array,
+        for_critic: IntArray | None,
+        clip_range_vf: float | None,
+    ) -> FloatArray:
+        """Set the gradient of Eq. 4.3 for rows of the dataset, and of the rollout just flown.
+
+        :param flown: see :meth:`_critic_data`; :param values: likewise.
+        :param for_critic: None: the critic takes no part.
+        :return: the terms of cloning, value, entropy and weights.
+        """
+        policy, log_std = self.policy, self.policy.log_std
+        bc = common.cloning_errors(self.bc_loss, *self._actor_batch(for_actor)).mean()
+        entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
+        v_loss = th.zeros((), device=self.device)
+        if for_critic is not None:
+            now, bounds = self._critic_batch(flown, values, for_critic)
+            v_loss = common.value_loss(now, bounds[:, 0], bounds[:, 1], clip_range_vf)
+        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
+        policy.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        terms: FloatArray = th.stack([bc, v_loss, entropy_loss, l2]).detach().double().cpu().numpy()
+        return terms
+
+    def _actor_batch(self, rows: IntArray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
+        """Means (b, action_dim), log_std and labels (b, action_dim) for rows of the dataset."""
+        observations, labels = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(rows)))
+        return common.actor_mean(self.policy, observations), self.policy.log_std, labels
+
+    def _critic_batch(self, flown: npt.NDArray[Any], values: Float32Array, rows: IntArray) -> tuple[th.Tensor, th.Tensor]:
+        """V now (b,), and V when it was flown with the returns (b, 2), for rows of the rollout."""
+        states, bounds = (th.as_tensor(part[rows], device=self.device) for part in (flown, values))
+        return common.critic_values(self.policy, states), bounds
+
+    def _compiled_gradients(
+        self,
+        networks: common.Perceptrons,
+        for_actor: IntArray,
+        flown: npt.NDArray[Any],
+        values: Float32Array,
+        for_critic: IntArray | None,
+        clip_range_vf: float | None,
+    ) -> FloatArray:
+        """The same by compiled code."""
+        observations, expert_actions, rows = self.dataset.arrays(for_actor)
+        loss = common.actor_terms(self.bc_loss, 1.0)
+        (bc, *_) = networks.actor.gradient(observations, rows, expert_actions, loss, networks.log_std) / len(rows)
+        v_loss = 0.0
+        if for_critic is not None:
+            loss = common.critic_terms(self.vf_coef, clip_range_vf)
+            sums = networks.critic.gradient(flown.reshape(len(flown), -1), for_critic, values, loss)
+            v_loss = sums[0] / len(for_critic)
+        return np.array([bc, v_loss, *common.add_penalties(self.policy, self.ent_coef, self.l2_coef)])
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 1,
+        tb_log_name: str = "DAgger",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """As in SB3. ``reset_num_timesteps=True`` also begins β anew; the dataset stays until ``dataset.clear()``.
+
+        :raises ExpertError: no expert, or one that does not fit the environment
+        """
+        self.set_expert(self.expert)
+        if reset_num_timesteps:
+            self._n_rollouts = 0
+        with shared_out(common.perceptrons(self.policy) is not None):
+            return super().learn(
+                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
+            )
+
+    def save_dataset(self, path: str | Path) -> None:
+        """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""
+        self.dataset.save(path)
+
+    def load_dataset(self, path: str | Path) -> None:
+        """Replace the dataset by a saved one, as :meth:`AggregatedDataset.load` does."""
+        self.dataset.load(path)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "dataset"]

@@ -1,0 +1,373 @@
+"""Soft actor-critic that also learns from an expert: a value-based stage two."""
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import ContinuousCritic
+from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.utils import FloatSchedule, polyak_update
+from torch import nn
+from torch.nn import functional as F
+from typing_extensions import Self
+
+from sb3_quad.algorithms import common
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
+from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
+from sb3_quad.controllers.controller import Controller
+
+BC_LOSSES: tuple[common.CloningLoss, ...] = ("mse", "huber", "huber_mse")
+BC_FILTERS = ("none", "q", "agreement")
+LABELS = "labels"  # among what is remembered: the expert's actions for the present states
+
+
+class SACBC(common.Taught, SAC):
+    """Soft Actor-Critic with an expert (SAC+BC): its transitions, its actions and its proposals, each a switch of its own.
+
+    All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the additions at their defaults it is
+    SAC, bit for bit. A saved model loads with ``SAC.load``, even where this package is not installed. For any environment with
+    a Box action space; with an addition, observations that are no Dict.
+
+    What is added, with its source:
+
+    =====================  ============================================================================================
+    ``expert_fraction``    a share of each mini-batch from the expert's own flights: RLPD, https://arxiv.org/abs/2302.02948
+    ``critic_layer_norm``  layer-normalised critics, which overestimate unseen actions less: RLPD
+    ``bc_coef``            a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089; weighed by
+                           the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every
+                           state that is visited, as in DAgger, not its own flights alone
+    ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair et al.
+    ``expert_proposal``    the expert's action and the agent's are both proposed, and the one of greater Q is flown, and
+                           bootstrapped from: IBRL, https://arxiv.org/abs/2311.02198
+    =====================  ============================================================================================
+
+    :param expert: who flies first, labels and proposes: an object with ``actions(state)`` on the true state of our
+        environments, an SB3 model, or a function from observations to actions. It is never saved. Needed when learning starts
+        with any of the additions.
+    :param expert_timesteps: the first timesteps of the training, over all environments, which the expert flies; nothing is
+        learnt meanwhile. They are kept in a buffer of their own, ``expert_buffer``. Random actions follow only if
+        ``learning_starts`` is more than that.
+    :param expert_fraction: the share of each mini-batch that comes from ``expert_buffer``, 0 to 1 (RLPD: a half).
+    :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a schedule of the remaining
+        progress.
+    :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear beyond 0.05;
+        ``"huber_mse"``, that and three times the squared error. Actions are those of the policy, within -1 and 1.
+    :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's action is greater than Q of the
+        policy's mean action; ``"agreement"``, where both differ by less than 0.3, as of :class:`PPOBC`.
+    :param expert_proposal: whether the expert's action is proposed beside the agent's. Needs ``n_steps=1``.
+    :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that comes from imitation is
+        not moved by a critic that has learnt nothing yet.
+    :param critic_layer_norm: whether the critics normalise the inputs of their activations, without parameters: in stock
+        ``SAC`` the zip loads and its actor is the same, but its critics do not normalise.
+    :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
+    :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
+    :raises TrainingError: a loss that is not finite.
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        expert: Any = None,
+        expert_timesteps: int = 0,
+        expert_fraction: float = 0.0,
+        bc_coef: float | Schedule = 0.0,
+        bc_loss: common.CloningLoss = "mse",
+        bc_filter: str = "none",
+        expert_proposal: bool = False,
+        critic_warmup: int = 0,
+        critic_layer_norm: bool = False,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ):
+        super().__init__(*args, _init_setup_model=False, **kwargs)  # type: ignore[misc]
+        for name, value, valid in (("bc_loss", bc_loss, BC_LOSSES), ("bc_filter", bc_filter, BC_FILTERS)):
+            if value not in valid:
+                raise ConfigError(unknown(name, value, valid))
+        for name, count in (("expert_timesteps", expert_timesteps), ("critic_warmup", critic_warmup)):
+            if count < 0:
+                raise ConfigError(f"{name} is {count}, must be at least 0")
+        if not 0.0 <= expert_fraction <= 1.0:
+            raise ConfigError(f"expert_fraction is {expert_fraction}, must be from 0 to 1")
+        if isinstance(bc_coef, (float, int)) and not 0.0 <= bc_coef < float("inf"):
+            raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
+        if expert_fraction > 0.0 and expert_timesteps == 0:
+            raise ConfigError(f"expert_fraction is {expert_fraction}, but expert_timesteps is 0: the expert has flown nothing")
+        if expert_proposal and self.n_steps != 1:
+            raise ConfigError(f"expert_proposal needs n_steps 1, not {self.n_steps}: it proposes for the next state")
+        self.expert = expert
+        self.expert_timesteps = expert_timesteps
+        self.expert_fraction = expert_fraction
+        self.bc_coef = bc_coef
+        self.bc_loss: common.CloningLoss = bc_loss
+        self.bc_filter = bc_filter
+        self.expert_proposal = expert_proposal
+        self.critic_warmup = critic_warmup
+        self.critic_layer_norm = critic_layer_norm
+        self._clones = False
+        self.expert_buffer: ReplayBuffer | None = None
+        self._labels: Float32Array | None = None  # (n_envs, action_dim): its scaled actions for the present states
+
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self.bc_coef = FloatSchedule(self.bc_coef)
+        self._clones = common.is_ever_nonzero(self.bc_coef)
+        if self.will_clone() and isinstance(self.observation_space, spaces.Dict):
+            raise ConfigError(
+                f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the "
+                "environment in gymnasium.wrappers.FlattenObservation"
+            )
+        super()._setup_model()
+        if self.critic_layer_norm:
+            _normalise_layers(self.critic)
+            _normalise_layers(self.critic_target)
+        # A row of actions holds the one flown; the expert's, if it is cloned; the expert's for the next state, if it proposes.
+        width = 1 + self._clones + self.expert_proposal
+        assert self.replay_buffer is not None and self.replay_buffer_class is not None
+        if width > 1:
+            _widen(self.replay_buffer, width)
+        if self.expert_timesteps > 0:
+            size = -(-self.expert_timesteps // self.n_envs) * self.n_envs
+            arguments = size, self.observation_space, self.action_space, self.device, self.n_envs, self.optimize_memory_usage
+            self.expert_buffer = self.replay_buffer_class(*arguments, **self.replay_buffer_kwargs)
+            if width > 1:
+                _widen(self.expert_buffer, width)
+
+    @property
+    def expert_flies(self) -> bool:
+        """Whether the training is still in its first ``expert_timesteps``."""
+        return self.expert_buffer is not None and not self.expert_buffer.full
+
+    @property
+    def policy_is_idle(self) -> bool:
+        """Whether the policy is still the one that it began with, since only the critic has learnt (``critic_warmup``)."""
+        return 0 < self.critic_warmup >= self._n_updates
+
+    def will_clone(self) -> bool:
+        """Whether the expert is needed at all, for whichever of the additions."""
+        return self._clones or self.expert_proposal or self.expert_timesteps > 0
+
+    @property
+    def _needs_labels(self) -> bool:
+        """Whether the expert is asked about the present states."""
+        return self._clones or self.expert_proposal or self.expert_flies
+
+    def _ask(self, observation: Any, episode_start: BoolArray | None) -> Float32Array:
+        """The expert's actions for the present states, scaled to -1 to 1 as a replay buffer holds actions: (n_envs, dim)."""
+        assert self.env is not None
+        self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
+        labels = self._labeller.labels(observation, episode_start)
+        scaled = self.policy.scale_action(labels.reshape(-1, *self.action_space.shape))  # type: ignore[misc]
+        return np.asarray(scaled, dtype=np.float32).reshape(len(labels), -1)
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
+        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
+        if self._labels is None and self._needs_labels:
+            self._labels = self._ask(self._last_obs, None)
+        if self.expert_flies:
+            assert self._labels is not None
+            scaled = self._labels.reshape(shape)
+            return self.policy.unscale_action(scaled), scaled
+        action, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
+        if not self.expert_proposal or self.num_timesteps < learning_starts:
+            return action, scaled
+        assert self._labels is not None
+        own, theirs = (th.as_tensor(each.reshape(n_envs, -1), device=self.device) for each in (scaled, self._labels))
+        with th.no_grad():
+            observations, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
+            better = self._least_q(self.critic_target, observations, theirs) > self._least_q(
+                self.critic_target, observations, own
+            )
+        chosen = th.where(better, theirs, own).cpu().numpy().reshape(shape)
+        self.logger.record_mean("rollout/expert_fraction", float(better.float().mean()))
+        return self.policy.unscale_action(chosen), chosen
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: npt.NDArray[Any],
+        new_obs: Any,
+        reward: npt.NDArray[Any],
+        dones: npt.NDArray[Any],
+        infos: list[dict[str, Any]],
+    ) -> None:
+        buffer = self.expert_buffer if self.expert_flies and self.expert_buffer is not None else replay_buffer
+        if self._labels is not None:
+            now, following = self._labels, self._ask(new_obs, dones)
+            parts = [buffer_action.reshape(len(now), -1), *([now] if self._clones else [])]
+            if self.expert_proposal:  # of an episode that has ended, the state that the expert would have to see is gone
+                parts.append(np.where(dones[:, None], np.float32(np.nan), following))
+            buffer_action, self._labels = np.hstack(parts), following
+        super()._store_transition(buffer, buffer_action, new_obs, reward, dones, infos)
+        if not self._needs_labels:
+            self._labels = None
+
+    def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, th.Tensor | None, th.Tensor | None]:
+        """A mini-batch; the expert's actions for its states and for the next ones, (b, dim), None where there are none."""
+        n_expert = round(batch_size * self.expert_fraction)
+        parts = [(self.replay_buffer, batch_size - n_expert), (self.expert_buffer, n_expert)]
+        drawn = [buffer.sample(n, env=self._vec_normalize_env) for buffer, n in parts if buffer is not None and n > 0]
+        joined: list[Any] = [None if column[0] is None else th.cat(column) for column in zip(*drawn, strict=True)]
+        data = drawn[0] if len(drawn) == 1 else ReplayBufferSamples(*joined)
+        actions, *labels = data.actions.chunk(1 + self._clones + self.expert_proposal, dim=1)
+        following = labels.pop() if self.expert_proposal else None
+        return data._replace(actions=actions), labels.pop() if labels else None, following
+
+    @staticmethod
+    def _least_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
+        """The least of the critics' values, (b, 1)."""
+        return th.cat(critic(observations, actions), dim=1).min(dim=1, keepdim=True).values
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        """Updates on the replay buffer: SAC's loop, with what is added to it marked by ``+``."""
+        if self.replay_buffer is None or self.replay_buffer.size() == 0:  # + the expert flies
+            return
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers += [self.ent_coef_optimizer]
+        self._update_learning_rate(optimizers)
+        bc_coef = self.bc_coef(self._current_progress_remaining)  # type: ignore[operator]  # +
+        monitored: dict[str, list[float]] = {}  # by name: a number of each gradient step
+
+        def monitor(**values: th.Tensor) -> None:
+            for name, value in values.items():
+                monitored.setdefault(name, []).append(value.item())
+
+        for gradient_step in range(gradient_steps):
+            data, labels, following = self._sample(batch_size)  # + from both buffers, with the expert's actions
+            discounts = data.discounts if data.discounts is not None else self.gamma
+            if self.use_sde:
+                self.actor.reset_noise()
+
+            actions_pi, log_prob = self.actor.action_log_prob(data.observations)
+            log_prob = log_prob.reshape(-1, 1)
+            mean = self.actor.action_dist.mode() if labels is not None and bc_coef > 0.0 else None  # +
+            warming_up = self._n_updates + gradient_step < self.critic_warmup  # +
+
+            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+                # The coefficient of this step is that from before its update.
+                ent_coef = th.exp(self.log_ent_coef.detach())
+                assert isinstance(self.target_entropy, float)
+                ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                monitor(ent_coef_loss=ent_coef_loss)
+                if not warming_up:
+                    self.ent_coef_optimizer.zero_grad()
+                    ent_coef_loss.backward()  # type: ignore[no-untyped-call]
+                    self.ent_coef_optimizer.step()
+            else:
+                ent_coef = self.ent_coef_tensor
+            monitor(ent_coef=ent_coef)
+
+            with th.no_grad():
+                next_actions, next_log_prob = self.actor.action_log_prob(data.next_observations)
+                next_q = self._least_q(self.critic_target, data.next_observations, next_actions)
+                next_values = next_q - ent_coef * next_log_prob.reshape(-1, 1)
+                if following is not None:  # + the expert's proposal, where there is one and it is better
+                    known = following.isfinite().all(dim=1, keepdim=True)
+                    proposed = self._least_q(self.critic_target, data.next_observations, following.nan_to_num())
+                    next_values = th.where(known & (proposed > next_q), proposed, next_values)
+                targets = data.rewards + (1 - data.dones) * discounts * next_values
+
+            current = self.critic(data.observations, data.actions)
+            critic_loss: Any = 0.5 * sum(F.mse_loss(q, targets) for q in current)
+            monitor(critic_loss=critic_loss)
+            if not np.isfinite(monitored["critic_loss"][-1]):  # +
+                advice = "lower learning_rate, or look for rewards and observations that are not finite"
+                raise TrainingError(f"the critic's loss is not finite after {self.num_timesteps} timesteps: {advice}")
+            self.critic.optimizer.zero_grad()
+            critic_loss.backward()
+            self.critic.optimizer.step()
+
+            if not warming_up:  # +
+                q_pi = self._least_q(self.critic, data.observations, actions_pi)
+                actor_loss = (ent_coef * log_prob - q_pi).mean()
+                monitor(actor_loss=actor_loss)
+                if mean is not None and labels is not None:  # +
+                    bc_loss, cloned = self._bc_loss(data.observations, mean, labels)
+                    actor_loss = actor_loss + bc_coef * q_pi.detach().abs().mean() * bc_loss
+                    monitor(bc_loss=bc_loss, bc_share=cloned)
+                self.actor.optimizer.zero_grad()
+                own = [*self.actor.parameters()]
+                actor_loss.backward(inputs=own)  # type: ignore[no-untyped-call]  # + the critic needs no gradient of this loss
+                self.actor.optimizer.step()
+
+            if gradient_step % self.target_update_interval == 0:
+                polyak_update(self.critic.parameters(), self.critic_target.parameters(), self.tau)
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+        self._n_updates += gradient_steps
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in monitored.items():
+            self.logger.record(f"train/{name}", np.mean(values))
+        if self._clones:  # +
+            self.logger.record("train/bc_coef", bc_coef)
+
+    def _bc_loss(self, observations: Any, mean: th.Tensor, labels: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """The cloning term over the mini-batch, and the share of its rows that are cloned; the others count as zero.
+
+        :param mean: the policy's mean actions, (b, dim), as ``labels`` the expert's.
+        """
+        errors = common.cloning_errors(self.bc_loss, mean, mean, labels)  # no kind of error here needs log_std
+        kept = th.ones_like(errors, dtype=th.bool)
+        with th.no_grad():
+            if self.bc_filter == "q":
+                theirs, own = (self._least_q(self.critic, observations, each) for each in (labels, mean))
+                kept = (theirs > own).flatten()
+            elif self.bc_filter == "agreement":
+                kept = common.agree(mean, labels)
+        return (errors * kept).mean(), kept.float().mean()
+
+    def learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "SACBC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> Self:
+        """As ``SAC.learn``; see the class for what it raises."""
+        if self.will_clone() and self.expert is None:
+            raise ExpertError("SACBC needs an expert: SACBC(..., expert=GeometricExpert()) or model.set_expert(...)")
+        if reset_num_timesteps or self._last_obs is None:  # the environments begin anew
+            self._labels = self._labeller = None
+        return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "expert_buffer", "_labels"]
+
+    def memory(self) -> Arrays:
+        """As of any algorithm that an expert teaches, and what the expert has said."""
+        return super().memory() | ({} if self._labels is None else {LABELS: self._labels})
+
+    def restore_memory(self, memory: Arrays) -> None:
+        self._labels = memory.get(LABELS)
+        super().restore_memory({name: array for name, array in memory.items() if name != LABELS})
+
+
+def _normalise_layers(critic: ContinuousCritic) -> None:
+    """Normalise what goes into each activation over its layer; nothing is learnt there, so a zip's names stay those of SAC."""
+    networks: list[Any] = critic.q_networks
+    for network in networks:
+        for i, layer in enumerate([*network][:-1]):
+            if isinstance(layer, nn.Linear):
+                normal = nn.LayerNorm(layer.out_features, elementwise_affine=False)
+                network[i + 1] = nn.Sequential(normal, network[i + 1])
+
+
+def _widen(buffer: ReplayBuffer, width: int) -> None:
+    """Give each row of a new buffer room for ``width`` actions side by side, which SB3's own sampling then gives back."""
+    buffer.action_dim *= width
+    buffer.actions = np.zeros((*buffer.actions.shape[:2], buffer.action_dim), dtype=np.float32)
+
+
+SACBC.__init__.__signature__ = common.full_signature(SAC, SACBC)  # type: ignore[attr-defined]

@@ -1,0 +1,63 @@
+"""Experts by name, as YAML and the command line give them."""
+
+import pkgutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
+from sb3_quad.controllers.pretrained import agent_path, pretrained_names
+from sb3_quad.controllers.zips import load_model
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
+
+EXPERTS = {
+    "pid": "sb3_quad.experts.pid:PIDExpert",
+    "geometric": "sb3_quad.experts.geometric:GeometricExpert",
+    "told_geometric": "sb3_quad.experts.geometric:told_geometric",
+    "told_cautious": "sb3_quad.experts.geometric:told_cautious",
+}
+DEFAULT_EXPERT = "geometric"
+"""Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
+
+
+def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "itm", kind: str = "expert") -> Any:
+    """The expert that ``spec`` names.
+
+    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
+        with the package (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)`` returns an
+        expert; or an expert itself, returned as it is.
+    :param vehicle: what a named expert is designed for; of several, the first.
+    :param kind: what messages call it.
+    :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be imported.
+    :raises ExpertError: a factory that fails.
+    """
+    if not isinstance(spec, (str, Path)):
+        return spec
+    text = str(spec)
+    path = agent_path(text)
+    if path.endswith(".zip"):
+        return load_model(path)
+    factory = import_factory(text, kind)
+    try:
+        return factory(first_vehicle(vehicle))
+    except SB3QuadError:
+        raise
+    except (Exception, SystemExit) as error:
+        raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
+
+
+def import_factory(text: str, kind: str = "expert") -> Any:
+    """What makes the expert of a name, or is at ``package.module:factory``.
+
+    :raises ConfigError: an unknown name, or a factory that cannot be imported; :class:`MissingExtra` where it needs one.
+    """
+    location = EXPERTS.get(text, text)
+    if ":" not in location:
+        valid = [*EXPERTS, *pretrained_names()]
+        raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
+    try:
+        return pkgutil.resolve_name(location)
+    except SB3QuadError:
+        raise
+    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+        raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error

@@ -1,6 +1,0 @@
-"""Networks that train faster than layer by layer, with the same results."""
-
-from sb3_quad.networks.losses import LOSS
-from sb3_quad.networks.mlp import Perceptron, share_out, shared_out
-
-__all__ = ["LOSS", "Perceptron", "share_out", "shared_out"]
