@@ -1,4 +1,4 @@
-"""The Python of the README and of docs/ runs as it stands there."""
+"""The Python of the README and of docs/ runs as it stands there; the fast tests shorten its trainings."""
 
 import re
 import sys
@@ -101,7 +101,6 @@ def check_vehicles(scope):
     assert abs(scope["flights"].survival.mean() - 0.953) < 0.01
 
 
-LONG = ("docs/callbacks.md",)
 STAGES = ("README.md", "docs/ppo_bc.md")  # which train both stages, and show what they print
 CHECKS = {
     "README.md": check_readme,
@@ -114,12 +113,15 @@ CHECKS = {
 
 
 @pytest.mark.parametrize("page", TO_RUN)
-def test_a_page_runs(page, monkeypatch, capsys):
-    if page in LONG:
-        shorten_trainings(monkeypatch)
-    scope = run(page)
-    if page in CHECKS:
-        CHECKS[page](scope)
+def test_a_page_runs_with_trainings_of_one_rollout(page, monkeypatch):
+    shorten_trainings(monkeypatch)
+    run(page)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", CHECKS)
+def test_a_page_gives_what_it_says(page, capsys):
+    CHECKS[page](run(page))
     if page in STAGES:
         check_output(page, capsys.readouterr().out)
 
