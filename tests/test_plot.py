@@ -5,7 +5,8 @@ import pytest
 from conftest import legends_cover_nothing
 
 from sb3_quad.cli import main
-from sb3_quad.report.curves import Curve, plot_curves, read_curve
+from sb3_quad.evaluation.learning_curves import Curve, read_curve
+from sb3_quad.report.curves import plot_curves
 
 EXPERT = {"expert": {"success": 0.3, "reward": -5.0}}
 

@@ -1,62 +1,19 @@
-"""Learning curves from run folders: success, reward and losses over timesteps and wall-clock time (Figs. 4.3 and 4.4)."""
+"""Pictures of learning curves: success, reward and losses over timesteps and wall-clock time (Figs. 4.3 and 4.4)."""
 
 import itertools
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays
 from sb3_quad.envs.rendering.labels import colours_of
+from sb3_quad.evaluation.learning_curves import Curve
 from sb3_quad.report.plots import POINTS, band, legend, styled
 
-NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file
 SUCCESS, SURVIVAL, REWARD, LOSSES = "success", "survival", "reward", "losses"
 _LABELS = {SUCCESS: "success in %", SURVIVAL: "survival in %", REWARD: "mean reward", "bc_loss": "cloning loss"}
-
-
-class Curve(NamedTuple):
-    """The evaluations of one run, k of them."""
-
-    timesteps: FloatArray  # (k,)
-    seconds: FloatArray  # of training, evaluations along the way included, (k,)
-    success: FloatArray  # share of successful episodes, (k,)
-    reward: FloatArray  # mean per episode, (k,)
-    survival: FloatArray | None = None  # share of episodes, (k,); None: the environment reports none, or version 0.1 flew
-    losses: Mapping[str, FloatArray] = {}  # by name, of the update before each evaluation, (k,); NaN where there was none
-
-    def values(self, name: str) -> FloatArray:
-        """What a panel shows: success, survival, reward or the loss of a name, (k,); NaN where there is none."""
-        found: Any = self.losses.get(name) if name.endswith("loss") else getattr(self, name)
-        return np.full(len(self.timesteps), np.nan) if found is None else found
-
-
-def read_curve(run: str | Path, task: str | None = None) -> Curve:
-    """The curve of a run folder, from its ``evaluations.npz``.
-
-    :param task: one of the run's ``eval_tasks``; None for its environment's own.
-    :raises ConfigError: a folder without evaluations, or a damaged file.
-    """
-    path = Path(run) / ("evaluations.npz" if task is None else f"evaluations_{task}.npz")
-    if not path.is_file():
-        reason = "a run that was trained with --eval-episodes 0 has no curve"
-        raise ConfigError(f"{path}: no such file; " + (f"{task} is none of this run's eval_tasks" if task else reason))
-    arrays = read_arrays(path)
-    if missing := NAMES - arrays.keys():
-        raise ConfigError(f"{path}: cannot be read ({', '.join(sorted(missing))}: no such array)")
-    shapes = [arrays[name].shape for name in ("timesteps", "seconds", "successes", "results")]
-    count = shapes[0][0] if shapes[0] else 0
-    right = [len(each) for each in shapes] == [1, 1, 2, 2] and all(each[0] == count for each in shapes)
-    if not (right and count and all(arrays[name].dtype.kind in "fiub" for name in NAMES)):
-        raise ConfigError(f"{path}: cannot be read (timesteps, seconds, successes and results do not fit together)")
-    timesteps, seconds = (np.asarray(arrays[name], dtype=np.float64) for name in ("timesteps", "seconds"))
-    survival = arrays["survivals"].mean(axis=1) if "survivals" in arrays else None
-    losses = {name.removeprefix("train/"): array for name, array in arrays.items() if name.startswith("train/")}
-    return Curve(timesteps, seconds, arrays["successes"].mean(axis=1), arrays["results"].mean(axis=1), survival, losses)
 
 
 @styled
@@ -77,7 +34,7 @@ def plot_curves(
     for name in names or show:
         curves = [curve for group in groups.values() for curve in group]
         if name == LOSSES or all(np.isnan(curve.values(name)).all() for curve in curves):
-            raise ConfigError(f"{name}: the runs' evaluations hold none; runs since version 0.2 do")
+            raise ConfigError(f"{name}: the runs' evaluations hold none")
     figure = Figure(figsize=(11, 1.2 + 2.65 * len(names)), layout="constrained")
     panels = figure.subplots(len(names), 2, sharex="col", sharey="row", squeeze=False)
     axes = (("timesteps", 1e6, "timesteps in millions"), ("seconds", 60.0, "wall-clock time in minutes"))

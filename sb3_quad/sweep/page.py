@@ -6,8 +6,9 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.tables import Table, text_table
-from sb3_quad.report.curves import Curve, plot_curves, read_curve
+from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import PAGE, PICTURES, TABLES, render_page
 from sb3_quad.report.plots import Plot
 from sb3_quad.report.sections import Section

@@ -29,7 +29,7 @@ from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip, saved_data
-from sb3_quad.report.curves import read_curve
+from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path

@@ -7,8 +7,9 @@ from pathlib import Path
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.cli.arguments.plot import THESIS
+from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.report.curves import plot_curves, read_curve
+from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.plots import picture
 
 
