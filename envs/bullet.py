@@ -15,9 +15,8 @@ from sb3_quad.envs.rendering.camera import ChaseCamera
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import disconnect, has_display, open_window, point_window, start_drawing
-from sb3_quad.simulation.engine.block import P
-from sb3_quad.simulation.engine.rotors import write_body
-from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, QuadcopterState
+from sb3_quad.simulation.rotors import write_body
+from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, P, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")

@@ -14,7 +14,7 @@ from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
 from sb3_quad.simulation.checks import check_size, parse_options
-from sb3_quad.simulation.engine.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
+from sb3_quad.simulation.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
 from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD
 from sb3_quad.simulation.tasks import TaskSpec
 

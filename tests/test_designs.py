@@ -14,9 +14,8 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.designs import sample_vehicles
-from sb3_quad.simulation.engine.block import P, W
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import QUATERNION
+from sb3_quad.simulation.state import QUATERNION, P, W
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, load_vehicle
 
 RAPTOR = {"distribution": "raptor"}

@@ -7,11 +7,10 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.engine.block import T
-from sb3_quad.simulation.engine.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
-from sb3_quad.simulation.tasks import SCORED, TASK, TASKS, Task, resolve_tasks
+from sb3_quad.simulation.tasks import SCORED, TASK, TASKS, T, Task, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")

@@ -21,7 +21,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.engine.workers import compilation_notice
+from sb3_quad.simulation.threads import compilation_notice
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("target_tracking", "state_recovery")

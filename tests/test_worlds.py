@@ -14,8 +14,7 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts import geometric
 from sb3_quad.experts.geometric import GeometricExpert, told_cautious, told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.engine.block import P, W
-from sb3_quad.simulation.state import QUATERNION, VELOCITY
+from sb3_quad.simulation.state import QUATERNION, VELOCITY, P, W
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 WORLDS = {

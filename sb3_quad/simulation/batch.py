@@ -12,16 +12,15 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.simulation.checks import per_row, row_numbers, row_vehicles, whole_number
 from sb3_quad.simulation.designs import resolve_vehicles
-from sb3_quad.simulation.engine.block import P
-from sb3_quad.simulation.engine.random import new_streams
-from sb3_quad.simulation.engine.work import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
-from sb3_quad.simulation.engine.workers import batch_lock, first_run, run
+from sb3_quad.simulation.kernel import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
 from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
+from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import resolve_randomization
-from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, QuadcopterState, make_wrench
+from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
+from sb3_quad.simulation.threads import batch_lock, first_run, run
 from sb3_quad.simulation.worlds import GUST_FORCE, new_worlds
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"

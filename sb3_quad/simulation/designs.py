@@ -17,12 +17,12 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.base.yaml_files import YamlFolder
-from sb3_quad.simulation.engine.block import P
-from sb3_quad.simulation.engine.lowlevel import compiled
-from sb3_quad.simulation.engine.random import DESIGN, new_streams, uniforms
+from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.episodes import count_episode
 from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.random import DESIGN, new_streams, uniforms
 from sb3_quad.simulation.ranges import Range, between
+from sb3_quad.simulation.state import P
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle, load_vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.vehicles.distributions")

@@ -4,9 +4,10 @@ import math
 
 import numpy as np
 
-from sb3_quad.simulation.engine.block import P, T, X
-from sb3_quad.simulation.engine.lowlevel import compiled
-from sb3_quad.simulation.engine.random import EPISODE, EPISODE_START, STEP, uniforms
+from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.random import EPISODE, EPISODE_START, STEP, uniforms
+from sb3_quad.simulation.state import P, X
+from sb3_quad.simulation.tasks import T
 
 TURN = 2.0 * math.pi
 
@@ -26,7 +27,7 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
 
     :param state: float64 (STATE_SIZE, n), see :mod:`.state`.
     :param queue: float64 (delay, 4, n), commanded rotor speeds on their way: hover.
-    :param streams: uint32 (4, n), see :mod:`.engine.random`.
+    :param streams: uint32 (4, n), see :mod:`.random`.
     :param task_index: int64 (n,), the sampled row of the table of tasks.
     :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) for all rows.
     :param tasks: float64 (K, columns), :meth:`sb3_quad.simulation.tasks.Task.parameters` of each task.

@@ -12,7 +12,7 @@ from pydantic import Field, PositiveFloat, field_validator
 
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 MAX_AGE = 1000  # control steps

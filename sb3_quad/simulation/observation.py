@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numba import float32
 
-from sb3_quad.simulation.engine.lowlevel import LANES, compiled
-from sb3_quad.simulation.engine.random import random_words, standard_normals
+from sb3_quad.simulation.compiled import LANES, compiled
 from sb3_quad.simulation.layout import first_rows, row_slices
+from sb3_quad.simulation.random import random_words, standard_normals
 from sb3_quad.simulation.rotation import rotation_rows
 
 
@@ -42,6 +42,8 @@ GROUPS = row_slices(_SIZES)
 """By the name of a group, where its features stand in an observation."""
 FEATURE_NAMES = tuple(f"{feature.each}_{part}" for feature in FEATURES for part in feature.parts)
 OBSERVATION_SIZE = len(FEATURE_NAMES)
+NORMALS = -(-OBSERVATION_SIZE // 2) * 2  # of the noise, each from a random word
+GUST_WORDS = NORMALS  # where the two random words of a gust begin, behind those
 DEFAULT_MEAN = np.zeros(OBSERVATION_SIZE)
 DEFAULT_STD = np.concatenate([np.full(len(feature.parts), feature.std) for feature in FEATURES])
 

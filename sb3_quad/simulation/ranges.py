@@ -6,7 +6,7 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from sb3_quad.base.validate import Frozen
-from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation.compiled import compiled
 
 FIXED, UNIFORM, LOG_UNIFORM, CUBE_ROOT = range(4)
 _KINDS = {"uniform": UNIFORM, "log_uniform": LOG_UNIFORM, "uniform_cube_root": CUBE_ROOT}

@@ -2,7 +2,7 @@
 
 import math
 
-from sb3_quad.simulation.engine.lowlevel import LANES, compiled
+from sb3_quad.simulation.compiled import LANES, compiled
 from sb3_quad.simulation.tasks import S
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation.compiled import compiled
 
 
 @compiled(inline="always")

@@ -16,16 +16,22 @@ import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.layout import row_slices
+from sb3_quad.simulation.layout import first_rows, row_slices
 from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}
 STATE_SIZE = sum(STATE.values())
 POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = row_slices(STATE).values()
 
+X = first_rows(STATE)
+
 WRENCH = {"force_world": 3, "force_body": 3, "torque_world": 3, "torque_body": 3}
 WRENCH_SIZE = sum(WRENCH.values())
 FORCE_WORLD, FORCE_BODY, TORQUE_WORLD, TORQUE_BODY = row_slices(WRENCH).values()
+W = first_rows(WRENCH)
+
+P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))  # of a vehicle's parameters
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,6 +70,7 @@ class Task(Frozen):
 
 TASK = {name: 3 if name == "start_position" else 1 for name in Task.model_fields if name != "name"}
 """Columns of a table of tasks: how many numbers each field of :class:`Task` is."""
+T = first_rows(TASK)
 # What a control step needs:
 SCORED = [name for name in TASK if name.startswith(("max_", "success_")) or name.endswith(("_cost", "_range"))]
 S = first_rows(dict.fromkeys(SCORED, 1))

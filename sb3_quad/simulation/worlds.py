@@ -6,13 +6,14 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.designs import DESIGN_SIZE, VehicleDistribution, arm_length
-from sb3_quad.simulation.engine.block import GUST_WORDS, P, W
-from sb3_quad.simulation.engine.lowlevel import compiled
-from sb3_quad.simulation.engine.random import GUST, PUSH, VEHICLE, uniforms
 from sb3_quad.simulation.layout import first_rows, row_slices
+from sb3_quad.simulation.observation import GUST_WORDS
+from sb3_quad.simulation.random import GUST, PUSH, VEHICLE, uniforms
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.ranges import FIXED, between
+from sb3_quad.simulation.state import P, W
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, Vehicle
 
 _RANGES = ("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay")

@@ -11,8 +11,8 @@ import numba
 import numpy as np
 import pytest
 
-from sb3_quad.simulation.engine import cache
-from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation import cache
+from sb3_quad.simulation.compiled import compiled
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -107,7 +107,7 @@ CODE = """
 import sys
 import numpy as np
 from sb3_quad.envs import QuadcopterVectorEnv
-from sb3_quad.simulation.engine.work import _finite
+from sb3_quad.simulation.kernel import _finite
 print(_finite(np.zeros((2, 4), np.float32)), sum(_finite.stats.cache_hits.values()))
 """
 

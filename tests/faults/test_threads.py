@@ -19,7 +19,7 @@ INTERRUPTED = """
 import random, signal, sys
 import numpy as np
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.engine import workers
+from sb3_quad.simulation import threads as workers
 
 workers.PATIENCE = 1  # so that every job waits for its workers
 workers.REST = 0

@@ -8,7 +8,7 @@ import numpy as np
 from numba import carray, float32, uint64
 
 from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
-from sb3_quad.simulation.engine.lowlevel import atomic_add, atomic_get, compiled, give_way, pointer
+from sb3_quad.simulation.compiled import atomic_add, atomic_get, compiled, give_way, pointer
 
 ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
 LINEAR, TANH, RELU = range(3)

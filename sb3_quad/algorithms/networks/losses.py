@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numba import float32
 
-from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation.compiled import compiled
 
 KINDS = ("mse", "nll", "huber", "huber_mse")
 FILTERS = ("none", "negative_advantage", "agreement")

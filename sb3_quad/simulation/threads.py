@@ -18,9 +18,9 @@ from numba.core import event
 
 from sb3_quad.base.arrays import IntArray
 from sb3_quad.base.cores import available_cpus
-from sb3_quad.simulation.engine.cache import compiled_by_one
-from sb3_quad.simulation.engine.lowlevel import LANES
-from sb3_quad.simulation.engine.work import AWAKE, BUSY, JOB, LATE, LINE, NOT_FINITE, StepArrays, step_arrays, work
+from sb3_quad.simulation.cache import compiled_by_one
+from sb3_quad.simulation.compiled import LANES
+from sb3_quad.simulation.kernel import AWAKE, BUSY, JOB, LATE, LINE, NOT_FINITE, StepArrays, step_arrays, work
 
 PATIENCE = 20_000  # looks for a block before a worker sleeps: some 30 microseconds
 WORTHWHILE = 3  # blocks; fewer are done before a worker has woken

@@ -2,9 +2,9 @@
 
 import math
 
-from sb3_quad.simulation.engine.block import P, W, X
-from sb3_quad.simulation.engine.lowlevel import compiled
+from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.simulation.state import P, W, X
 
 NOT_FINITE, BODY_FRAME_ONLY, WORLD_FRAME_TOO = range(3)
 

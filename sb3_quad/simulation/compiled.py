@@ -16,7 +16,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from sb3_quad.simulation.engine.cache import Cache, tell_unkept
+from sb3_quad.simulation.cache import Cache, tell_unkept
 
 LANES = 64  # rows of a block; a multiple of every vector width, small enough for a block to stay in the first cache
 
@@ -41,7 +41,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
 @functools.cache
 def _source_stamp() -> str:
     """A digest of what is compiled in: the same for copies of it, such as those that a cluster's nodes are sent."""
-    package, digest = Path(__file__).resolve().parents[2], hashlib.sha256()
+    package, digest = Path(__file__).resolve().parents[1], hashlib.sha256()
     for folder in ("base", "vehicles", "simulation", "experts", "algorithms/networks"):
         for path in sorted((package / folder).rglob("*.py")):
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")

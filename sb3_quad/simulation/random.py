@@ -19,7 +19,7 @@ import numpy.typing as npt
 from gymnasium.utils import seeding
 from numba import float32, int32, uint32, uint64
 
-from sb3_quad.simulation.engine.lowlevel import LANES, compiled
+from sb3_quad.simulation.compiled import LANES, compiled
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
 OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DESIGN = range(6)  # purposes: the last word of the counter

@@ -13,8 +13,7 @@ from numba import carray, int64
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.designs import DESIGN_SIZE, design
-from sb3_quad.simulation.engine.block import (
+from sb3_quad.simulation.block import (
     MEMORY,
     block_in,
     load_commands,
@@ -25,13 +24,14 @@ from sb3_quad.simulation.engine.block import (
     store_observations,
     store_state,
 )
-from sb3_quad.simulation.engine.lowlevel import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
-from sb3_quad.simulation.engine.physics import fly_block
-from sb3_quad.simulation.engine.random import STEP
+from sb3_quad.simulation.compiled import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
+from sb3_quad.simulation.designs import DESIGN_SIZE, design
 from sb3_quad.simulation.episodes import count_episode, start_episode
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.memory import forget, integrate, remember, remember_action
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
+from sb3_quad.simulation.physics import fly_block
+from sb3_quad.simulation.random import STEP
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import TASK, S

@@ -9,9 +9,9 @@ The body rates stay in the body frame: a rotation about ω leaves ω as it is, s
 
 import math
 
-from sb3_quad.simulation.engine.block import W
-from sb3_quad.simulation.engine.lowlevel import LANES, compiled
+from sb3_quad.simulation.compiled import LANES, compiled
 from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.simulation.state import W
 
 MAX_COORDINATE_VELOCITY = 100.0  # btMultiBody's m_maxCoordinateVelocity, m/s and rad/s
 MAX_HALF_ANGLE = math.pi / 8.0  # btMultiBody's ANGULAR_MOTION_THRESHOLD, halved

@@ -10,20 +10,13 @@ from typing import Any
 import numpy as np
 from numba import carray
 
-from sb3_quad.simulation.engine.lowlevel import LANES, compiled, pointer
-from sb3_quad.simulation.layout import first_rows
-from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE
-from sb3_quad.simulation.tasks import SCORED, TASK
+from sb3_quad.simulation.compiled import LANES, compiled, pointer
+from sb3_quad.simulation.observation import GUST_WORDS, NORMALS, OBSERVATION_SIZE
+from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH_SIZE, P, X
+from sb3_quad.simulation.tasks import SCORED, T
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
-X = first_rows(STATE)
-T = first_rows(TASK)
-P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))
-W = first_rows(WRENCH)
 _SCORED = tuple(getattr(T, name) for name in SCORED)
-_NORMALS = -(-OBSERVATION_SIZE // 2) * 2  # of the observation noise, each from a random word
-GUST_WORDS = _NORMALS  # where the two random words of a gust begin, behind those
 _WORDS = -(-(GUST_WORDS + 2) // 4) * 4
 
 # Of every lane: the kind of numbers, and how many or of what shape.
@@ -52,7 +45,7 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
     "noise_level": ("f4", ()),  # relative
     "additive": ("f4", ()),  # level of the noise that is added, in σ
-    "noise": ("f4", _NORMALS),
+    "noise": ("f4", NORMALS),
     "feature": ("f4", OBSERVATION_SIZE),
     "word": ("u4", _WORDS),  # random
     "stream": ("u4", 4),

@@ -1,1 +1,0 @@
-"""The compiled engine: threads, memory layout, random numbers, integration. Only its typed functions are used elsewhere."""
