@@ -30,10 +30,10 @@ from sb3_quad.evaluation.records import Failure, HitTrial
 from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.evaluation.summary import share
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.report.page import render, write_report
+from sb3_quad.report.page import render
 from sb3_quad.report.paths import TARGET
 from sb3_quad.report.plots import FORCE, HEIGHT, WIDTH, Flown, hits_plot
-from sb3_quad.report.sections import sections
+from sb3_quad.report.results_page import facts, sections, write_report
 
 SUITE = """
 name: small
@@ -174,7 +174,7 @@ def test_plots_in_the_page_have_its_colours_and_the_files_their_own(parts):
 
 
 def test_plotly_is_only_where_something_can_be_turned(folder, parts):
-    text = render(load_results(folder), [parts["noise"], parts["starts"]], with_pictures=False)
+    text = render("title", "", [parts["noise"], parts["starts"]])
     assert "<svg" in text and "<script" not in text and len(text) < 1_000_000
 
 
@@ -182,10 +182,11 @@ def test_the_page_is_small_and_says_what_was_flown_when_and_by_which_version(fol
     assert page.stat().st_size < 2_600_000  # plotly.js alone has 4.8 million bytes
     results = load_results(folder)
     agent = results.controllers[0].model_copy(update={"algorithm": "PPO"})
-    text = render(results.model_copy(update={"controllers": [agent, *results.controllers[1:]]}), [*parts.values()], False)
+    flown = results.model_copy(update={"controllers": [agent, *results.controllers[1:]]})
+    text = render("title", facts(flown), sections(flown, folder))
     (day,) = {datetime.date.fromisoformat(entry.date) for entry in results.entries}
     assert f"flown {day} by sb3_quad {results.package_version}" in text
-    assert f'<code title="{agent.content}">{agent.content[:12]}</code>' in text
+    assert agent.content[:12] in text
 
 
 def test_controllers_targets_and_forces_have_colours_of_their_own(parts):
@@ -358,7 +359,7 @@ def test_the_best_is_better_than_all_others_for_certain(cells, row):
 def test_failures_are_listed(folder, parts):
     failure = Failure(controller="x<y", scenario="hit", message="no & no")
     failed = load_results(folder).model_copy(update={"failures": [failure]})
-    text = render(failed, list(parts.values()), with_pictures=False)
+    text = render("title", facts(failed), sections(failed, folder))
     assert "x&lt;y" in text and "no &amp; no" in text and "figures/" not in text.split("<script")[0]
 
 

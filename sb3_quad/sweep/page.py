@@ -1,17 +1,14 @@
 """The report of a sweep: its tables as ``report.md``, and with the learning curves as one page, ``report.html``."""
 
-import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.report.curves import plot_curves
-from sb3_quad.report.page import PAGE, PICTURES, TABLES, render_page
+from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.report.sections import Section
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.records import RunRecord
 from sb3_quad.sweep.results import Found
@@ -29,18 +26,7 @@ def write_report(
         not be written.
     """
     parts = sections(place, plan, records, found, shown)
-    title = f"Sweep: {plan.spec.name}"
-    blocks = [f"# {title}"]
-    for part in parts:
-        texts = (html.escape(text, False) for text in (part.description, part.facts) if text)
-        blocks += [f"## {part.heading}", *texts, *(table.markdown() for table in part.tables)]
-    write_text(place.path / TABLES, "\n\n".join(blocks) + "\n")
-    for plot in (plot for part in parts for plot in part.plots):
-        write_bytes(place.path / PICTURES / f"{plot.name}.png", plot.png)
-        write_bytes(place.path / PICTURES / f"{plot.name}.svg", plot.svg)
-    page = place.path / PAGE
-    write_text(page, render_page(title, _facts(plan, found), parts))
-    return page
+    return write_page(place.path, f"Sweep: {plan.spec.name}", _facts(plan, found), parts)
 
 
 def sections(

@@ -4,7 +4,8 @@ import argparse
 from pathlib import Path
 
 from sb3_quad.cli.output import console
-from sb3_quad.report.page import PICTURES, write_report
+from sb3_quad.report.page import PICTURES
+from sb3_quad.report.results_page import write_report
 
 
 def run(options: argparse.Namespace) -> int:
@@ -16,7 +17,7 @@ def run(options: argparse.Namespace) -> int:
 def report(folder: str | Path, overwrite: bool, pictures: bool) -> None:
     """Write the page of a folder of results, with a spinner in a terminal; tell where it is.
 
-    :raises ConfigError: see :func:`sb3_quad.report.page.write_report`.
+    :raises ConfigError: see :func:`sb3_quad.report.results_page.write_report`.
     """
     with console().status("report"):
         page = write_report(folder, overwrite, pictures)

@@ -1,11 +1,13 @@
-"""A report's content in order: an overview, then a section for each scenario, or for the cells that ``vary`` makes of one."""
+"""The report of an evaluation: who flew, an overview, and a section for each scenario or each group that ``vary`` makes."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import refuse_existing
 from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.evaluation.flightlog import read_tracks
+from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
     SURVIVAL,
@@ -15,10 +17,11 @@ from sb3_quad.evaluation.metric_tables import (
     reference_cells,
     scenario_groups,
 )
-from sb3_quad.evaluation.records import Results
+from sb3_quad.evaluation.records import ControllerRecord, Results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.evaluation.tables import Cell, Column, Row, Table
+from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
+from sb3_quad.report.page import PAGE, Section, write_page
 from sb3_quad.report.paths import paths_plot
 from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, hits_plot
 from sb3_quad.report.varied import families_plot, group_plots
@@ -28,18 +31,39 @@ OVERVIEW = (
     "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within 0.25 m and tilted by at"
     " most 10°. Survival: it neither touches the ground nor leaves the range. Where a scenario is varied: least to greatest."
 )
+SMALL_PRINT = (
+    "Small numbers are 95 % intervals, Wilson's for shares, bootstrap for means; they are left out where they are narrower"
+    " than the last digit. Bold: better than all others of the row, with the intervals apart; times and rewards are compared"
+    " only where no flight is lost."
+)
 
 
-@dataclass(frozen=True)
-class Section:
-    """A part of the page; ``anchor`` is part of file names and of the page's address."""
+def write_report(folder: str | Path, overwrite: bool = False, with_pictures: bool = True) -> Path:
+    """Write the report of a folder of results: ``report.html``, its tables as ``report.md``, its plots as files.
 
-    anchor: str
-    heading: str
-    description: str
-    tables: Sequence[Table]
-    plots: Sequence[Plot] = ()
-    facts: str = ""
+    :param overwrite: replace a report that is there.
+    :param with_pictures: also write every plot as PNG and SVG, into ``figures/``.
+    :return: the page.
+    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written;
+        :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could not be written.
+    """
+    results = load_results(folder)
+    if not results.entries:
+        raise ConfigError(f"{folder}: holds no flights, only failures; there is nothing to report")
+    refuse_existing(Path(folder) / PAGE, overwrite)
+    return write_page(folder, f"Suite {results.suite}", facts(results), sections(results, folder), with_pictures)
+
+
+def facts(results: Results) -> str:
+    """What was flown, when and by which version, and how to read the numbers."""
+    flights = sum(entry.metrics.n for entry in results.entries)
+    backends = " and ".join(sorted({entry.backend for entry in results.entries}))
+    dates = sorted({entry.date for entry in results.entries} - {""})
+    return (
+        f"{results.description} {flights:,} flights of {len(results.controllers)} controllers in {len(results.scenarios)}"
+        f" scenarios, {backends} backend, flown {' to '.join(dict.fromkeys([*dates[:1], *dates[-1:]]))} by sb3_quad"
+        f" {results.package_version}. {SMALL_PRINT}"
+    )
 
 
 def sections(results: Results, folder: str | Path) -> list[Section]:
@@ -51,7 +75,10 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     groups = scenario_groups(results)
     shares = [_share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)]
     tables, families = [table for table in shares if table.rows], families_plot(results, groups, colours)
-    parts = [Section("overview", "Success and survival", OVERVIEW, tables, families)]
+    parts = [
+        Section("overview", "Success and survival", OVERVIEW, tables, families),
+        Section("controllers", "Controllers", tables=[_controller_table(results.controllers)]),
+    ]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:
@@ -66,12 +93,26 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
                 cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
                 corner = f"{axis_label(next(iter(first.cell)), first)}: success (%)"
                 tables.append(_share_table(SUCCESS, results, cells, colours, corner))
-        facts = (
+        how = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
-            f"observation noise {in_words(first.noise)}; seed {first.seed}"
+            f"observation noise {in_words(first.noise)}; seed {first.seed}."
         )
-        parts.append(Section(first.group or first.name, heading, first.description, tables, plots, facts))
+        parts.append(Section(first.group or first.name, heading, first.description, tables, plots, how))
+    if results.failures:
+        rows = [(each.controller, each.scenario or "", each.message) for each in results.failures]
+        table = text_table("", ("controller", "scenario", "what happened"), rows, align="left")
+        parts.append(Section("failures", "Failures", tables=[table]))
     return parts
+
+
+def _controller_table(records: Sequence[ControllerRecord]) -> Table:
+    rows = []
+    for record in records:
+        scaled = "Eq. 4.10" if record.scaling == "adaptive" else ""
+        offset = "" if record.offset is None else f", offset μ = ({', '.join(f'{x:.4f}' for x in record.offset)}) m"
+        zip_hash = record.content[:12] if record.algorithm else ""
+        rows.append((record.label, record.spec, record.algorithm or "", zip_hash, scaled + offset))
+    return text_table("", ("name", "controller", "algorithm", "SHA-256", "observation scaled by"), rows, align="left")
 
 
 def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
