@@ -14,8 +14,9 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly, fly_settings
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
+from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.summary import share, summarise
+from sb3_quad.evaluation.statistics import share
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.settings import FlightSettings

@@ -24,11 +24,11 @@ from sb3_quad.envs.rendering.scene import MARKER
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import evaluate
 from sb3_quad.evaluation.flightlog import read_tracks
-from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.metric_tables import SUCCESS, mark_best, time_row
-from sb3_quad.evaluation.records import Failure, HitTrial
+from sb3_quad.evaluation.results import Failure, load_results
+from sb3_quad.evaluation.scenario_flights import HitTrial
 from sb3_quad.evaluation.scenarios.load import parse_suite
-from sb3_quad.evaluation.summary import share
+from sb3_quad.evaluation.statistics import share
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.page import render
 from sb3_quad.report.paths import TARGET

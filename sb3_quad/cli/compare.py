@@ -8,8 +8,8 @@ from sb3_quad.cli.output import console
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
+from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.summary import summarise
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.job import TrainingJob

@@ -1,22 +1,20 @@
-"""The controllers of an evaluation: what a command line names, who they are, and how they are asked."""
+"""The controllers of an evaluation, from what a command line names: labels, records, and what is ready to fly."""
 
 import hashlib
 import importlib
-import inspect
-import re
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.resolve import EXPERTS, import_factory, resolve_expert
 from sb3_quad.controllers.zips import saved_algorithm
-from sb3_quad.evaluation.records import ControllerRecord, Scaling
+from sb3_quad.evaluation.results import ControllerRecord, Scaling, file_name
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
@@ -29,11 +27,18 @@ class ControllerSpec:
     :param label: heads its column.
     :param spec: ``pid``, ``geometric``, the path of an SB3 zip, or ``package.module:factory``.
     :param scaling: ``adaptive``: a policy sees its observation through the thesis's scaling (4.3.1); experts see none.
+    :param settings: :attr:`own`, where its file has been read elsewhere.
     """
 
     label: str
     spec: str
     scaling: Scaling = "none"
+    settings: FlightSettings | None = field(default=None, compare=False)
+
+    @property
+    def is_zip(self) -> bool:
+        """Whether it is an agent in a zip."""
+        return self.spec.endswith(".zip")
 
     @cached_property
     def own(self) -> FlightSettings | None:
@@ -41,7 +46,9 @@ class ControllerSpec:
 
         :raises ConfigError: see :func:`agent_settings`.
         """
-        settings, source = agent_settings(self.spec) if self.spec.endswith(".zip") else (None, None)
+        if self.settings is not None or not self.is_zip:
+            return self.settings
+        settings, source = agent_settings(self.spec)
         return settings if source else None
 
     @property
@@ -50,13 +57,13 @@ class ControllerSpec:
         return (self.own or FlightSettings()).observed
 
     def notice(self, vehicle: str | Path | Vehicle) -> str:
-        """What is to be known of an agent that flies ``vehicle``, in a line: that it knows another, or says none; or empty."""
+        """A warning if the agent was trained on another vehicle than ``vehicle``, or does not say on which; else empty."""
         flown = load_vehicle(vehicle)
         if self.own is None:
             silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
-            return f"{silent} {flown.name}, with the scaling of Table A.2" if self.spec.endswith(".zip") else ""
+            return f"{silent} {flown.name}, with the scaling of Table A.2" if self.is_zip else ""
         known = load_vehicle(self.own.vehicle)
-        if self.own.vehicles is not None or known.flies_as(flown):  # of those it knows none
+        if self.own.vehicles is not None or known.flies_as(flown):  # an agent of many vehicles knows none of them
             return ""
         same = " of other parameters" if known.name == flown.name else ""
         return f"{self.label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"
@@ -70,10 +77,10 @@ def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[Contr
     """
     if scaling not in typing.get_args(Scaling):
         raise ConfigError(unknown("scaling", scaling, typing.get_args(Scaling)))
-    given = [_label_and_spec(text) for text in texts]
-    zips = [spec for label, spec in given if not label and spec.endswith(".zip")]
+    named = [_label_and_spec(text) for text in texts]
+    zips = [spec for label, spec in named if not label and spec.endswith(".zip")]
     found = []
-    for label, spec in given:
+    for label, spec in named:
         name = label or (_short(spec, zips) if spec.endswith(".zip") else spec)
         adapted = scaling == "adaptive" and spec not in EXPERTS
         found.append(ControllerSpec(f"{name} (adaptive)", spec, "adaptive") if adapted else ControllerSpec(name, spec))
@@ -84,11 +91,6 @@ def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[Contr
     return found
 
 
-def file_name(label: str) -> str:
-    """A label as part of file names."""
-    return re.sub(r"[^A-Za-z0-9_.-]+", "_", label).strip("_.") or "_"
-
-
 def describe(spec: ControllerSpec, vehicle: str | Vehicle) -> ControllerRecord:
     """Who a controller is; with adaptive scaling also the offset that it needs, measured by flying to targets.
 
@@ -96,25 +98,27 @@ def describe(spec: ControllerSpec, vehicle: str | Vehicle) -> ControllerRecord:
     :raises ConfigError: an unknown name, a missing file, a module that cannot be imported, a policy whose offset cannot be
         measured since it crashes on the way in more than half of the flights.
     """
-    path = Path(spec.spec)
-    if path.suffix == ".zip":
-        who: dict[str, Any] = {"kind": "model", "spec": path.name, "algorithm": saved_algorithm(path)}
-        content = path.read_bytes()
+    path, is_expert = Path(spec.spec), spec.spec in EXPERTS
+    if spec.is_zip:
+        record = ControllerRecord(
+            label=spec.label, spec=path.name, kind="model", algorithm=saved_algorithm(path), content=_digest(path.read_bytes())
+        )
     else:
-        who = {"kind": "expert" if spec.spec in EXPERTS else "factory", "spec": spec.spec}
-        content = _source(EXPERTS.get(spec.spec, spec.spec))
+        content = _digest(_source(EXPERTS.get(spec.spec, spec.spec)))
+        kind: Literal["expert", "factory"] = "expert" if is_expert else "factory"
+        record = ControllerRecord(label=spec.label, spec=spec.spec, kind=kind, content=content)
     if spec.scaling == "adaptive":
         controller = build(spec, vehicle)
         if isinstance(controller, AdaptiveScaling):
             mean = measure_mean(controller.policy, settings=FlightSettings(vehicle=vehicle, **spec.observed))
-            who |= {"scaling": "adaptive", "offset": mean.tolist()}
-    return ControllerRecord(label=spec.label, content=hashlib.sha256(content).hexdigest(), **who)
+            record = record.model_copy(update={"scaling": "adaptive", "offset": tuple(mean.tolist())})
+    return record
 
 
 def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | None = None) -> Any:
     """A controller, ready to fly.
 
-    :param vehicle: what experts and factories are given, the one they are to know.
+    :param vehicle: what experts and factories are made for.
     :param mean: with adaptive scaling: the position components of μ, (3,), m; None: zero.
     :raises ConfigError: it cannot be loaded.
     :raises ExpertError: a factory that fails.
@@ -123,12 +127,12 @@ def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | 
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
     if spec.own is not None and spec.own.is_needed:
-        raise ConfigError(f"{spec.label}: adaptive scaling is for agents that see the 18 features alone; this one remembers")
+        raise ConfigError(f"{spec.label}: adaptive scaling is for agents that see the 18 features alone; this one sees more")
     return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0), spec.observed["observation_std"])
 
 
 def _label_and_spec(text: str) -> tuple[str, str]:
-    """What a controller is called, empty if nothing is said, and its name or path."""
+    """The label, empty if the text gives none, and the name or path."""
     label, equals, spec = text.partition("=")
     if not equals or "/" in label or "\\" in label:  # an equals sign further on belongs to the path
         path = agent_path(text)
@@ -149,13 +153,14 @@ def _short(path: str, paths: Sequence[str]) -> str:
 
 
 def _source(location: str) -> bytes:
-    """The source of the module that holds an expert or factory, or what else tells its versions apart.
+    """The source of the module that holds an expert or factory.
 
     :raises ConfigError: it cannot be imported.
     """
     import_factory(location, "controller")  # says what is wrong
-    try:
-        file = inspect.getsourcefile(importlib.import_module(location.partition(":")[0]))
-    except TypeError:  # it is built in
-        return location.encode()
+    file = getattr(importlib.import_module(location.partition(":")[0]), "__file__", None)  # None: it is built in
     return location.encode() + (Path(file).read_bytes() if file is not None else b"")
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()

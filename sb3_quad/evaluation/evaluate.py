@@ -1,23 +1,67 @@
-"""A suite for any number of controllers: what is not in the folder yet is flown, the rest is kept."""
+"""A suite for any number of controllers: scenario by scenario flown, summed up and written."""
 
+import hashlib
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
-from sb3_quad.base.files import locked
+from sb3_quad.base.arrays import Arrays
+from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
+from sb3_quad.base.files import locked, write_arrays
+from sb3_quad.base.validate import read_record
 from sb3_quad.base.version import __version__
-from sb3_quad.evaluation.controllers import ControllerSpec, describe
+from sb3_quad.envs import registration
+from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
 from sb3_quad.evaluation.fleets import FLEETS
-from sb3_quad.evaluation.folder import RESULTS, load_results, read_entries, write_results
-from sb3_quad.evaluation.jobs import Job, failure, run_jobs
-from sb3_quad.evaluation.records import ControllerRecord, Failure, Results
-from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Suite
-from sb3_quad.executors import start_executor
-from sb3_quad.vehicles.vehicle import load_vehicle
+from sb3_quad.evaluation.flightlog import episode_arrays
+from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.results import (
+    RESULTS,
+    UNFINISHED,
+    ControllerRecord,
+    Entry,
+    Failure,
+    Results,
+    Unfinished,
+    flights_path,
+    load_results,
+    write_record,
+    write_results,
+)
+from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
+from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
+from sb3_quad.executors import Executor, as_completed, start_executor
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
+_TEXTS = {"title", "description", "reference", "group", "cell"}  # fields of a scenario that change no flight
+
+
+@dataclass(frozen=True)
+class Job:
+    """A controller in a scenario, as the suite has it."""
+
+    spec: ControllerSpec
+    record: ControllerRecord
+    scenario: Scenario
+    backend: str
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """As of :class:`~sb3_quad.evaluation.results.Entry`."""
+        return self.scenario.name, self.record.label
+
+
+class Outcome(NamedTuple):
+    """A job that is done, and the arrays of its flights (``flightlog.py``)."""
+
+    entry: Entry
+    arrays: Arrays
 
 
 def evaluate(
@@ -34,16 +78,17 @@ def evaluate(
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
-    A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the others fly on. What an
-    interrupted call has done is kept and not flown again.
+    A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the others fly on. Results of other
+    controllers and scenarios in the folder are kept. An interrupted call goes on when it is repeated, but for factories, whose
+    code may have changed.
 
     :param folder: of the results.
     :param workers: that fly side by side; with one, and no Ray, this process flies.
-    :param overwrite: replace earlier results of these controllers that were flown otherwise, instead of refusing.
-    :param report: told in one line of each agent that flies another vehicle than it was trained on, or does not say on which.
+    :param overwrite: replace results of other controllers or scenarios of these names, instead of refusing; begin anew.
+    :param report: gets a line for each agent that flies another vehicle than it was trained on, or does not say on which.
     :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is ``address``.
-    :return: all results in the folder, those of earlier calls included; where nothing has been flown, it is not written.
-    :raises ConfigError: an unknown backend; results in the folder of the same names that were flown otherwise; a folder that
+    :return: all results in the folder; where nothing has been flown, it is not written.
+    :raises ConfigError: an unknown backend; other controllers or scenarios of these names in the folder; a folder that
         cannot be written, or that another process is writing to.
     """
     if backend not in FLEETS:
@@ -53,47 +98,115 @@ def evaluate(
     if Path(folder).is_file():
         raise ConfigError(f"{folder}: is a file; the results need a folder, give another with -o")
     failures: list[Failure] = []
-    loaded: list[tuple[ControllerSpec, ControllerRecord]] = []
-    vehicles: dict[str, str] = {}  # by label, where a scenario names none
+    records: dict[ControllerSpec, ControllerRecord] = {}
     for spec in controllers:
         try:
-            own = load_vehicle(spec.own.vehicle if spec.own else DEFAULT_VEHICLE)
-            flies = [own if each.vehicle is None else each.nominal_vehicle() for each in suite.scenarios]
-            loaded.append((spec, describe(spec, flies[0])))
-            vehicles[spec.label] = own.name
-            for line in dict.fromkeys(map(spec.notice, flies)):
-                if line:
-                    report(line)
+            vehicles = [_vehicle(spec, each) for each in suite.scenarios]
+            records[spec] = describe(spec, vehicles[0])
+            for line in dict.fromkeys(filter(None, map(spec.notice, vehicles))):
+                report(line)
         except SB3QuadError as error:
-            failures.append(failure(spec.label, None, error))
-    unfixed = [each for each in suite.scenarios if each.vehicle is None]
-    if any(each.reference for each in unfixed):
-        vehicles["the reference"] = DEFAULT_VEHICLE
-    if len(set(vehicles.values())) > 1 and unfixed:
-        each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
-        report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
-    jobs = [Job(spec, record, each, backend, folder) for each in suite.scenarios for spec, record in loaded]
-    asked, flown = {spec.label for spec in controllers}, {None, *(scenario.name for scenario in suite.scenarios)}
-    with _claimed(Path(folder), bool(jobs)) as place:
+            failures.append(_failure(spec.label, None, error))
+    _report_vehicles(suite, list(records), report)
+    jobs = [Job(spec, record, each, backend) for each in suite.scenarios for spec, record in records.items()]
+    with _claimed(Path(folder), make=bool(jobs)) as place:
         before = load_results(place) if (place / RESULTS).is_file() else None
+        kept = [] if before is None else _kept(place, before, jobs, overwrite)
+        asked = {
+            (scenario, spec.label) for spec in controllers for scenario in (None, *(each.name for each in suite.scenarios))
+        }
         earlier = [] if before is None else before.failures
-        failures[:0] = [each for each in earlier if each.controller not in asked or each.scenario not in flown]
-        missing = _missing(place, jobs, overwrite)
-        done = len(jobs) - len(missing)
+        failures[:0] = [each for each in earlier if (each.scenario, each.controller) not in asked]
+        evaluation = _digest(jobs)
+        done = {} if overwrite else _interrupted(place, evaluation, jobs)
+        missing = [job for job in jobs if job.name not in done]
         try:
-            progress(done, len(jobs), "")
+            progress(len(done), len(jobs), "")
             alone = executor == "local" and min(workers, len(missing)) <= 1
             with nullcontext() if alone else start_executor(executor, workers, address) as working:
-                for job, outcome in run_jobs(missing, working):
-                    done += 1
+                for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
                     if isinstance(outcome, Failure):
                         failures.append(outcome)
-                    progress(done, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+                    else:
+                        write_arrays(place / outcome.entry.flights, compressed=True, **outcome.arrays)
+                        done[job.name] = outcome.entry
+                        write_record(place / UNFINISHED, Unfinished(evaluation=evaluation, entries=list(done.values())))
+                    progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+            (place / UNFINISHED).unlink(missing_ok=True)
         finally:  # an interrupt, too, leaves what is done in order
-            results = _collect(place, before, suite, [record for _, record in loaded], failures)
+            results = _joined(before, suite, records.values(), [*kept, *done.values()], failures)
             if results.entries or before is not None:
                 write_results(place, results)
     return results
+
+
+def fly_job(job: Job, zip_content: bytes | None = None) -> Outcome | Failure:
+    """Fly and sum up; of a controller that fails, its :class:`Failure`.
+
+    :param zip_content: of the controller, for a machine that does not see its file.
+    """
+    if zip_content is not None:
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / job.record.spec
+            path.write_bytes(zip_content)
+            return fly_job(replace(job, spec=replace(job.spec, spec=str(path), settings=job.spec.own)))
+    start = time.perf_counter()
+    try:
+        scenario, seen = job.scenario.flown_by(job.spec.own and job.spec.own.vehicle), job.spec.observed
+        controller = build(job.spec, scenario.nominal_vehicle(), job.record.offset)
+        flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None, own=seen)
+        limit = find_limit(controller, scenario, job.backend, seen)
+    except SB3QuadError as error:
+        return _failure(job.record.label, job.scenario.name, error)
+    entry = Entry(
+        controller=job.record.label,
+        scenario=scenario.name,
+        seed=scenario.seed,
+        backend=job.backend,
+        seconds=round(time.perf_counter() - start, 3),
+        date=time.strftime("%Y-%m-%d", time.gmtime()),
+        metrics=summarise(flights),
+        hit_limit=limit,
+        flights=flights_path(job.record.label, scenario.name),
+    )
+    return Outcome(entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories})
+
+
+def _fly_jobs(jobs: Sequence[Job], executor: Executor | None) -> Iterator[tuple[Job, Outcome | Failure]]:
+    """Fly jobs, and hand out each as it is done: one after another here, or side by side in an executor's workers.
+
+    A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.
+    """
+    if executor is None:
+        yield from ((job, fly_job(job)) for job in jobs)
+        return
+    submitted = {}
+    for job in jobs:
+        travels = executor.remote and job.record.kind == "model"
+        submitted[executor.submit(fly_job, job, Path(job.spec.spec).read_bytes() if travels else None)] = job
+    for task in as_completed(executor):
+        job = submitted[task]
+        try:
+            yield job, task.result()
+        except WorkerDied as ended:
+            yield job, _failure(job.record.label, job.scenario.name, ended)
+
+
+def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
+    """What a controller flies in a scenario: the scenario's vehicle, else its own."""
+    own = spec.own.vehicle if spec.own else DEFAULT_VEHICLE
+    return load_vehicle(own) if scenario.vehicle is None else scenario.nominal_vehicle()
+
+
+def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]) -> None:
+    """Say so if the controllers, or the reference beside them, fly different vehicles where a scenario names none."""
+    unfixed = [each for each in suite.scenarios if each.vehicle is None]
+    vehicles = {spec.label: _vehicle(spec, unfixed[0]).name for spec in specs} if unfixed else {}
+    if any(each.reference for each in unfixed):
+        vehicles["the reference"] = DEFAULT_VEHICLE
+    if len(set(vehicles.values())) > 1:
+        each_flies = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
+        report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
 
 
 @contextmanager
@@ -117,38 +230,44 @@ def _claimed(folder: Path, make: bool) -> Iterator[Path]:
                 folder.rmdir()
 
 
-def _missing(folder: Path, jobs: Sequence[Job], overwrite: bool) -> list[Job]:
-    """The jobs whose flights are not there.
+def _kept(folder: Path, before: Results, jobs: Sequence[Job], overwrite: bool) -> list[Entry]:
+    """The entries in a folder that stay beside those of some jobs.
 
-    :raises ConfigError: flights of the same names are there that were flown otherwise.
+    :raises ConfigError: another controller or scenario of the same name is there.
     """
-    there = {(entry.controller, entry.scenario): entry for entry in read_entries(folder)}
-    asked = {(job.record.label, job.scenario.name): job for job in jobs}
-    keys = {job.scenario.name: job.scenario_key for job in jobs}
-    for name, entry in there.items():
-        job = asked.get(name)
-        if overwrite and job is not None:
-            continue
-        if entry.scenario_key != keys.get(entry.scenario, entry.scenario_key):
-            raise ConfigError(
-                f"{folder}: holds flights of {entry.controller} in {entry.scenario} with other seeds, numbers or another"
-                " scenario; give another folder with -o" + ("" if job is None else ", or replace them with --overwrite")
-            )
-        if job is not None and entry.key != job.key:
-            raise ConfigError(
-                f"{folder}: holds flights of another controller called {entry.controller}; label this one"
-                f" (name={job.spec.spec}), give another folder with -o, or replace them with --overwrite"
-            )
-    return [job for name, job in asked.items() if name not in there or there[name].key != job.key]
+    records, scenarios = {job.record.label: job.record for job in jobs}, {job.scenario.name: job for job in jobs}
+    kept = []
+    for entry in before.entries:
+        record, job = records.get(entry.controller), scenarios.get(entry.scenario)
+        other = ""
+        if job is not None and _flown(job.scenario, job.backend) != _flown(before.scenario(entry.scenario), entry.backend):
+            other = f"of {entry.controller} in {entry.scenario} with other seeds, numbers or another scenario"
+        elif record is not None and not record.is_same(before.controller(entry.controller)):
+            other = f"of another controller called {entry.controller} (name={record.spec} calls this one otherwise)"
+        if other and not (overwrite and record is not None):
+            way_out = "give another folder with -o" + ("" if record is None else ", or replace them with --overwrite")
+            raise ConfigError(f"{folder}: holds flights {other}; {way_out}")
+        if not other and (record is None or job is None):
+            kept.append(entry)
+    return kept
 
 
-def _collect(
-    folder: Path, before: Results | None, suite: Suite, records: list[ControllerRecord], failures: list[Failure]
+def _flown(scenario: Scenario, backend: str) -> tuple[Any, str]:
+    """What the episodes of a scenario depend on."""
+    return scenario.model_dump(exclude=_TEXTS), backend
+
+
+def _joined(
+    before: Results | None,
+    suite: Suite,
+    records: Iterable[ControllerRecord],
+    entries: Iterable[Entry],
+    failures: Sequence[Failure],
 ) -> Results:
     """All that the folder holds by now; what was there before comes first."""
     scenarios = {each.name: each for each in [*(before.scenarios if before else []), *suite.scenarios]}
     controllers = {each.label: each for each in [*(before.controllers if before else []), *records]}
-    entries = {(entry.scenario, entry.controller): entry for entry in read_entries(folder)}
+    flown = {entry.name: entry for entry in entries}
     return Results(
         suite=suite.name,
         description=suite.description,
@@ -156,6 +275,32 @@ def _collect(
         package_version=__version__,
         controllers=list(controllers.values()),
         scenarios=list(scenarios.values()),
-        entries=[entries[key] for key in itertools.product(scenarios, controllers) if key in entries],
-        failures=failures,
+        entries=[flown[name] for name in itertools.product(scenarios, controllers) if name in flown],
+        failures=list(failures),
     )
+
+
+def _interrupted(folder: Path, evaluation: str, jobs: Sequence[Job]) -> dict[tuple[str, str], Entry]:
+    """What an interrupted evaluation of the same digest has flown, but for factories, whose code may have changed."""
+    path = folder / UNFINISHED
+    unfinished = read_record(path, Unfinished) if path.is_file() else None
+    if unfinished is None or unfinished.evaluation != evaluation:
+        return {}
+    certain = {job.name for job in jobs if job.record.kind != "factory"}
+    return {entry.name: entry for entry in unfinished.entries if entry.name in certain}
+
+
+def _digest(jobs: Sequence[Job]) -> str:
+    """SHA-256 of all that the flights of some jobs depend on, the sources of this package included."""
+    digest = hashlib.sha256()
+    for folder in (Path(__file__).parents[1], Path(registration.__file__).parent):
+        for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
+            digest.update(path.read_bytes())
+    for job in jobs:
+        digest.update(repr((job, job.spec.own, _vehicle(job.spec, job.scenario))).encode())
+    return digest.hexdigest()
+
+
+def _failure(controller: str, scenario: str | None, error: SB3QuadError) -> Failure:
+    """The record of an error, in one line; without a scenario, the controller could not be loaded."""
+    return Failure(controller=controller, scenario=scenario, message=" ".join(str(error).split()))

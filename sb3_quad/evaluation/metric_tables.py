@@ -4,9 +4,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
-from sb3_quad.evaluation.records import Estimate, HitLimit, Metrics, Moment, Results
+from sb3_quad.evaluation.metrics import Metrics, Moment
+from sb3_quad.evaluation.results import Results
+from sb3_quad.evaluation.scenario_flights import HitLimit
 from sb3_quad.evaluation.scenarios.load import axis_name
 from sb3_quad.evaluation.scenarios.scenario import NumberOrRange, Reference, Scenario
+from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 
 # The rows, without their cells:

@@ -4,20 +4,39 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from pydantic import Field
 
 from sb3_quad.base.arrays import Arrays, FloatArray
+from sb3_quad.base.validate import Frozen
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import Flights, fly_settings
-from sb3_quad.evaluation.records import Estimate, HitLimit, HitTrial
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.evaluation.summary import share
+from sb3_quad.evaluation.statistics import Estimate, share
 from sb3_quad.simulation.settings import FlightSettings
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
 RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most
 FIRST_GRID, GRID = 16, 8  # factors of a hit that are flown side by side, in the first round and in those after it
 MAX_ROUNDS = 8
+
+
+class HitTrial(Frozen):
+    """The flights with one factor of the wrenches."""
+
+    factor: float
+    survived: Estimate
+
+
+class HitLimit(Frozen):
+    """How large the wrenches of a scenario may get: the factor at which half of the flights are lost."""
+
+    factor: float | None = Field(description="None: more than half survive even the greatest factor tried")
+    low: float = Field(description="greatest factor that more than half survive for certain (95 %)")
+    high: float | None = Field(description="least factor that fewer than half survive for certain; None: not found")
+    force: float = Field(description="largest force of the scenario, N; times the factor is what is survived")
+    torque: float = Field(description="largest torque of the scenario, N m")
+    trials: list[HitTrial] = Field(description="all factors tried, rising")
 
 
 def fly_scenario(

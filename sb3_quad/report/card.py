@@ -6,8 +6,7 @@ from typing import Any
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
-from sb3_quad.evaluation.records import Metrics
-from sb3_quad.evaluation.summary import summarise
+from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.simulation.memory import Memory
 from sb3_quad.simulation.noise import in_words

@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
-from sb3_quad.evaluation.records import Entry, Estimate
+from sb3_quad.evaluation.results import Entry
 from sb3_quad.evaluation.scenarios.scenario import Scenario
+from sb3_quad.evaluation.statistics import Estimate
 
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
 FORCE = "#db1a24"

@@ -7,7 +7,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
 from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.evaluation.flightlog import read_tracks
-from sb3_quad.evaluation.folder import load_results
 from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
     SURVIVAL,
@@ -17,7 +16,7 @@ from sb3_quad.evaluation.metric_tables import (
     reference_cells,
     scenario_groups,
 )
-from sb3_quad.evaluation.records import ControllerRecord, Results
+from sb3_quad.evaluation.results import ControllerRecord, Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table

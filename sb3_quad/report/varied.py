@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.evaluation.records import Metrics, Results
+from sb3_quad.evaluation.metrics import Metrics
+from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import UNITS, axis_label, axis_name
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import POINTS, WIDTH, Plot, band, interval_ends, legend, new_axes, styled

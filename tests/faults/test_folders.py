@@ -18,7 +18,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.cli.commands import publish
-from sb3_quad.evaluation.folder import load_results
+from sb3_quad.evaluation.results import load_results
 from sb3_quad.tuning.study import LEASE, OWNER, dead_trials, open_study
 
 

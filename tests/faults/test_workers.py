@@ -13,7 +13,7 @@ import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.cli import main
-from sb3_quad.evaluation.folder import load_results
+from sb3_quad.evaluation.results import load_results
 
 ROOT = Path(__file__).parents[2]
 SUITE = "name: one\nsource: paper\nscenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]\n"
