@@ -8,13 +8,14 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.validate import validate
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
-from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.tasks import TaskSpec
 
 _INFOS = {"is_success": "success", "survival": "truncated"} | {key: key for key in ("distance", "collision", "out_of_range")}
@@ -47,7 +48,9 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
         task_kwargs: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
-        **keywords: Unpack[BatchKeywords],
+        seed: int | None = None,
+        n_threads: int | None = None,
+        **keywords: Any,
     ) -> None:
         if render_mode is not None:
             raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
@@ -57,10 +60,12 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}  # type: ignore[misc]
-        self.batch = QuadcopterBatch(num_envs, task, task_kwargs, **keywords, autoreset=False)
+        own = {"task": task, "task_kwargs": task_kwargs}
+        settings = validate(FlightSettings, {**own, **keywords}, type(self).__name__)
+        self.batch = QuadcopterBatch(num_envs, settings, seed, n_threads, autoreset=False)
         self.num_envs = self.batch.n
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step, or by the user
-        self.single_observation_space, self.single_action_space = quadcopter_spaces(self.batch.memory.size)
+        self.single_observation_space, self.single_action_space = quadcopter_spaces(self.batch.observation.size)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 

@@ -6,19 +6,19 @@ from typing import Any
 import gymnasium
 import numpy as np
 import numpy.typing as npt
-from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.validate import validate
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
-from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
-from sb3_quad.simulation.checks import check_size, parse_options
+from sb3_quad.envs.reset_options import fixed_rows
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
+from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD
 from sb3_quad.simulation.tasks import TaskSpec
-
-_NO_LIMIT = 2**62  # TimeLimit truncates
 
 
 class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
@@ -57,7 +57,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
 
     `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every control step, then
     `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`, `history` or `position_integral` it is made of
-    frames of these, in all `batch.memory.size` numbers.
+    frames of these, in all `batch.observation.size` numbers.
 
     | Num | Feature | Frame | Unit | std |
     |-----|---------|-------|------|-----|
@@ -127,7 +127,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
     | `observation_mean`, `observation_std` | `None` | mean and std of Eq. 3.16, (18,) each; `None`: 0 and the table above |
     | `last_action` | `False` | whether a frame ends with the action before it, so that it has 22 numbers |
     | `history` | `None` | ages of the frames that are seen, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |
-    | `position_integral` | `None` | fields of :class:`~sb3_quad.simulation.memory.PositionIntegral`, `{}` for its own |
+    | `position_integral` | `None` | fields of :class:`~sb3_quad.simulation.frames.PositionIntegral`, `{}` for its own |
     | `vehicles` | `None` | a distribution of vehicles, one for each episode, such as `{"distribution": "raptor"}` |
     | `randomize` | `None` | fields of :class:`~sb3_quad.simulation.randomization.Randomization`: the world of each episode |
     | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |
@@ -163,17 +163,19 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         render_mode: str | None = None,
         render_width: int = 640,
         render_height: int = 480,
-        **keywords: Unpack[BatchKeywords],
+        seed: int | None = None,
+        **keywords: Any,
     ) -> None:
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
+        own = {"task": task, "task_kwargs": task_kwargs, "max_episode_steps": ENDLESS}  # Gymnasium's TimeLimit truncates
+        settings = validate(FlightSettings, {**own, **keywords}, type(self).__name__)
         # One row of the batched environment, whose body PyBullet moves.
-        keywords.setdefault("max_episode_steps", _NO_LIMIT)
-        self.batch = QuadcopterBatch(1, task, task_kwargs, **keywords, autoreset=False)
+        self.batch = QuadcopterBatch(1, settings, seed, n_threads=1, autoreset=False)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._ready = False
-        self.observation_space, self.action_space = quadcopter_spaces(self.batch.memory.size)
+        self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
         self.metadata = {**self.metadata, "render_fps": round(1.0 / self.vehicle.control_step)}
         self._size = render_width, render_height
@@ -194,7 +196,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         :raises ConfigError: an unknown option, or a value that is no start.
         """
         super().reset(seed=seed)
-        fixed = parse_options(options, self.vehicle)
+        fixed = fixed_rows(options, self.vehicle)
         batch = self.batch
         if seed is not None:
             batch.seed([seed])
@@ -203,8 +205,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
             batch.state[rows, 0] = values
         if not self._body.connected:
             self._open()
-        if batch.sets_vehicle:
-            self._body.become(batch.vehicles[:, 0])
+        self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
         self._ready = True
         if self._renderer is not None:

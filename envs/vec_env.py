@@ -11,14 +11,15 @@ from gymnasium import Wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
-from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import Image
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
+from sb3_quad.base.validate import validate
 from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
-from sb3_quad.simulation.batch import BatchKeywords, QuadcopterBatch
+from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.checks import check_size
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.tasks import TaskSpec
 
 if TYPE_CHECKING:
@@ -53,8 +54,9 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
     infos of other rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are
     fresh. A copy, or what is unpickled, flies on from the same state, and apart.
 
-    See :class:`~sb3_quad.simulation.batch.QuadcopterBatch` for the other arguments.
+    Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
+    :param n_envs: number of rows; ``seed`` and ``n_threads`` as of :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
     :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over ``max_episode_steps``, so
         that the mean return and success of a training are of all its episodes, not at first of crashes alone.
     :param render_mode: ``"rgb_array"``: :meth:`render` gives pictures, without a display; None: it gives none.
@@ -73,16 +75,20 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         render_rows: Sequence[int] = (0,),
         render_width: int = 640,
         render_height: int = 480,
-        **keywords: Unpack[BatchKeywords],
+        seed: int | None = None,
+        n_threads: int | None = None,
+        **keywords: Any,
     ) -> None:
-        self.batch = QuadcopterBatch(n_envs, task, task_kwargs, **keywords)
+        own = {"task": task, "task_kwargs": task_kwargs}
+        settings = validate(FlightSettings, {**own, **keywords}, type(self).__name__)
+        self.batch = QuadcopterBatch(n_envs, settings, seed, n_threads)
         self.render_mode, self._staggered = render_mode, staggered
         self._renderers = self._make_renderers(render_rows, render_width, render_height)
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
-        super().__init__(self.batch.n, *quadcopter_spaces(self.batch.memory.size))
+        super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
         fps: Any = round(1.0 / self.vehicle.control_step)  # SB3's type of it knows lists alone
         self.metadata["render_fps"] = fps
 

@@ -13,6 +13,7 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
 from sb3_quad.report.vehicle import warnings
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
@@ -48,7 +49,7 @@ def test_the_environment_accelerates_as_authority_says(name):
     """Full thrust upwards once the motors have settled; full roll for as long as it turns below 100 rad/s, so not quite."""
     vehicle = load_vehicle(name)
     able = Authority(vehicle)
-    batch = QuadcopterBatch(1, "target_tracking", vehicle=vehicle, noise=0.0, seed=0)
+    batch = QuadcopterBatch(1, FlightSettings(vehicle=vehicle, noise=0.0), seed=0)
     climbing = accelerations(batch, np.ones((1, 4), dtype=np.float32), 9, 80)
     assert climbing[-1] == pytest.approx(able.climb, rel=1e-3)
     for axis in range(3):

@@ -10,10 +10,11 @@ import sb3_quad  # noqa: F401
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.designs import sample_vehicles
+from sb3_quad.simulation.sample_vehicles import sample_vehicles
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, P, W
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, load_vehicle
@@ -28,7 +29,7 @@ def test_a_row_and_pybullet_fly_the_same_vehicle(seed, disturbed):
     keywords = {"task": "state_recovery", "vehicles": RAPTOR, **({"randomize": worlds} if disturbed else {})}
     n, steps = 3, 60
     actions = np.random.default_rng(seed).uniform(-1, 1, (steps, n, 4)).astype(np.float32)
-    batch = QuadcopterBatch(n, **keywords, seed=seed, autoreset=False)
+    batch = QuadcopterBatch(n, FlightSettings(**keywords), seed=seed, autoreset=False)
     batch.reset()
     states = [batch.state.copy()]
     for action in actions:
@@ -70,13 +71,13 @@ def test_sampled_vehicles_are_valid_and_fill_the_ranges():
 def test_a_sampled_vehicle_flies_as_the_row_that_has_it():
     n, seed = 5, 7
     vehicles = sample_vehicles("raptor", n, seed)
-    batch = QuadcopterBatch(n, vehicles=RAPTOR, seed=seed)
+    batch = QuadcopterBatch(n, FlightSettings(vehicles=RAPTOR), seed=seed)
     batch.reset()
     np.testing.assert_allclose(np.stack([each.parameters() for each in vehicles], axis=1), batch.vehicles, rtol=1e-12)
 
 
 def test_every_episode_has_another_vehicle_and_a_seed_the_same():
-    batches = [QuadcopterBatch(16, vehicles=RAPTOR, seed=3) for _ in range(2)]
+    batches = [QuadcopterBatch(16, FlightSettings(vehicles=RAPTOR), seed=3) for _ in range(2)]
     seen = []
     for _ in range(3):
         for each in batches:
@@ -88,7 +89,7 @@ def test_every_episode_has_another_vehicle_and_a_seed_the_same():
 
 def test_forces_in_weights_are_in_those_of_the_row_s_own_vehicle():
     force = {"magnitude": 0.2, "unit": "weight", "direction": [0, 0, -1]}
-    batch = QuadcopterBatch(64, vehicles=RAPTOR, randomize={"force": force}, seed=0)
+    batch = QuadcopterBatch(64, FlightSettings(vehicles=RAPTOR, randomize={"force": force}), seed=0)
     batch.reset()
     np.testing.assert_allclose(-batch.wrench[W.force_world + 2], 0.2 * 9.81 * batch.vehicles[P.mass], rtol=1e-12)
 
@@ -141,5 +142,5 @@ def test_gymnasium_make_takes_a_distribution():
 )
 def test_what_cannot_fly_is_refused_in_one_line(vehicles, line):
     with pytest.raises(ConfigError, match=line) as error:
-        QuadcopterBatch(2, vehicles=vehicles)
+        QuadcopterVecEnv(2, vehicles=vehicles)
     assert "\n" not in str(error.value)

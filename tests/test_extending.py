@@ -26,9 +26,11 @@ from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import FEATURE_NAMES
+from sb3_quad.simulation.settings import FlightSettings
 
 def batch(**task_kwargs):
-    made = QuadcopterBatch(2, "upright_fall", task_kwargs, "trainer_quad", noise=0.0, seed=5, autoreset=False)
+    how = FlightSettings(task="upright_fall", task_kwargs=task_kwargs, vehicle="trainer_quad", noise=0.0)
+    made = QuadcopterBatch(2, how, seed=5, autoreset=False)
     made.reset()
     return made
 

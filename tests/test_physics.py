@@ -7,6 +7,7 @@ from hypothesis import HealthCheck, assume, given, settings
 from hypothesis import strategies as st
 
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 
@@ -80,7 +81,10 @@ def random_actions(rng, steps):
 def batch_of(vehicles, states, wrenches):
     """Rows in these states, that fly on wherever they are."""
     batch = QuadcopterBatch(
-        states.shape[1], vehicle=vehicles, noise=0.0, max_episode_steps=10**6, n_threads=1, autoreset=False
+        states.shape[1],
+        FlightSettings(vehicle=vehicles, noise=0.0, max_episode_steps=10**6),
+        n_threads=1,
+        autoreset=False,
     )
     batch.reset()
     batch.state[:], batch.wrench[:] = states, wrenches

@@ -286,7 +286,7 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: env.reset(options={"state": {"quaternion": (0, 0, 0, 0)}}), "quaternion: must not be zero"),
         (lambda env: env.reset(options={"state": {"position": (0, 0, 0.1)}}), "ground"),
         (lambda env: env.reset(options={"state": 3}), "state"),
-        (lambda env: env.reset(options={"target": (0, 0)}), r"target of shape \(2,\)"),
+        (lambda env: env.reset(options={"target": (0, 0)}), "options: target"),
         (lambda env: env.set_target((0, 0, np.nan)), "target .*finite"),
         (lambda env: env.set_target("up"), "target"),
         (lambda env: env.set_wrench(force=(1, 2)), r"force of shape \(2,\): must be \(3,\)"),

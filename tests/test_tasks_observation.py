@@ -9,6 +9,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.random import EPISODE, KEY_HI, KEY_LO, STEP, new_streams, philox
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.simulation.tasks import SCORED, TASK, TASKS, T, Task, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -18,7 +19,7 @@ ITM = load_vehicle("itm")
 
 def start(n, task, seed=0, **task_kwargs):
     """n rows at the start of their first episode."""
-    rows = QuadcopterBatch(n, task, task_kwargs, autoreset=False, n_threads=1)
+    rows = QuadcopterBatch(n, FlightSettings(task=task, task_kwargs=task_kwargs), n_threads=1, autoreset=False)
     rows.seed(range(seed, seed + n))
     rows.reset()
     return rows

@@ -20,6 +20,7 @@ from sb3_quad.evaluation.expert_metrics import by_start
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.tuning import expert
 from sb3_quad.tuning.expert import ExpertObjective, ExpertSearch, with_gains
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
@@ -99,7 +100,7 @@ def test_recoveries_by_start_count_each_flight_once_per_quantity():
     for quantity in ("tilt", "falling", "body rate"):
         flown, lost = zip(*(counts[start] for start in counts if start.startswith(quantity)), strict=True)
         assert len(flown) == 3 and sum(flown) == 200 and sum(lost) == (~recovered).sum()
-    batch = QuadcopterBatch(200, "state_recovery", noise=0.0, seed=5)
+    batch = QuadcopterBatch(200, FlightSettings(task="state_recovery", noise=0.0), seed=5)
     batch.reset()
     state = batch.true_state()
     upside_down = state.rotation[:, 2, 2] < -0.5

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
 
 ITM = load_vehicle("itm")
@@ -264,7 +265,7 @@ def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(na
     assert turned.rotor_directions == ITM.rotor_directions
     assert any(rotors(own, k * np.pi / 4) == rotors(turned) for k in range(8))
     assert turned.geometric_gains == own.geometric_gains and turned.in_layout_of(ITM) is turned
-    assert QuadcopterBatch(3, vehicle=name, rotor_layout="itm").vehicle_list == [turned] * 3
+    assert QuadcopterBatch(3, FlightSettings(vehicle=name, rotor_layout="itm")).vehicle_list == [turned] * 3
 
 
 def test_a_layout_that_cannot_be_had_is_refused() -> None:

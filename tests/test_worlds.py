@@ -14,6 +14,7 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts import geometric
 from sb3_quad.experts.geometric import GeometricExpert, told_cautious, told_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, VELOCITY, P, W
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -61,7 +62,7 @@ def test_a_row_and_pybullet_fly_the_same_world(seed, names, task, frame, remembe
     keywords = {"task": task, "randomize": worlds, **(MEMORY if remembers else {})}
     n, steps = 3, 120
     actions = np.random.default_rng(seed).uniform(-0.6, 0.9, (steps, n, 4)).astype(np.float32)
-    batch = QuadcopterBatch(n, **keywords, seed=seed, autoreset=False)
+    batch = QuadcopterBatch(n, FlightSettings(**keywords), seed=seed, autoreset=False)
     observations = [batch.reset()]
     states, rewards = [batch.state.copy()], []
     for action in actions:
@@ -82,7 +83,7 @@ def test_a_row_and_pybullet_fly_the_same_world(seed, names, task, frame, remembe
 
 def test_an_episode_has_a_world_of_its_own_within_the_ranges():
     n = 2000
-    batch = QuadcopterBatch(n, randomize={**WORLDS, "share": 0.7, "wrench_share": 0.6}, seed=0)
+    batch = QuadcopterBatch(n, FlightSettings(randomize={**WORLDS, "share": 0.7, "wrench_share": 0.6}), seed=0)
     nominal = load_vehicle("itm").parameters()
     batch.reset()
     first = batch.vehicles.copy()
@@ -131,7 +132,7 @@ def test_a_nominal_world_is_the_one_without_randomize():
 @pytest.mark.parametrize(("std", "unit", "newtons"), [(2.0, "SI", 2.0), (0.1, "weight", 0.1 * 1.727 * 9.81)])
 def test_gusts_have_the_spread_and_the_memory_that_were_asked_for(std, unit, newtons):
     gusts = {"std": std, "unit": unit, "time_constant": 0.2}
-    batch = QuadcopterBatch(4000, randomize={"gusts": gusts}, seed=0, max_episode_steps=10**6)
+    batch = QuadcopterBatch(4000, FlightSettings(randomize={"gusts": gusts}, max_episode_steps=10**6), seed=0)
     batch.reset()
     gusts = [batch.gust[:3].copy()]
     for _ in range(40):
@@ -147,7 +148,7 @@ def test_gusts_have_the_spread_and_the_memory_that_were_asked_for(std, unit, new
 
 
 def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
-    batch = QuadcopterBatch(2, randomize={"force": [1.0, 1.0]}, seed=0)
+    batch = QuadcopterBatch(2, FlightSettings(randomize={"force": [1.0, 1.0]}), seed=0)
     batch.reset()
     batch.set_wrench([3.0, 0.0, 0.0])
     batch.step(np.zeros((2, 4), np.float32))
@@ -162,7 +163,7 @@ def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
     worlds["torque"]["axes"] = [1, 1, 0.33]
     errors = {}
     for expert in (GeometricExpert(), told_geometric()):
-        batch = QuadcopterBatch(240, task, randomize=worlds, seed=0, autoreset=False)
+        batch = QuadcopterBatch(240, FlightSettings(task=task, randomize=worlds), seed=0, autoreset=False)
         batch.reset()
         for _ in range(1000):
             batch.step(expert.actions(batch.true_state()))
@@ -171,7 +172,7 @@ def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
 
 
 def test_who_is_told_of_a_nominal_world_flies_as_the_others():
-    batch = QuadcopterBatch(240, "state_recovery", seed=0)
+    batch = QuadcopterBatch(240, FlightSettings(task="state_recovery"), seed=0)
     batch.reset()
     gains = GeometricExpert().gains
     plain = GeometricExpert(gains=gains.model_copy(update={"yaw_rate": geometric._TOLD_YAW * gains.yaw_rate}))
@@ -186,7 +187,7 @@ def test_who_is_cautious_falls_less_fast_where_the_rotors_lift_hardly_more_than_
     worlds = {"mass": [1.2, 1.25], "force": {"magnitude": [2, 4], "direction": [0, 0, -1]}}
     descent, survival = {}, {}
     for expert in (told_geometric(), told_cautious()):
-        batch = QuadcopterBatch(480, "target_tracking", randomize=worlds, seed=0, autoreset=False)
+        batch = QuadcopterBatch(480, FlightSettings(randomize=worlds), seed=0, autoreset=False)
         batch.reset()
         lowest, lost = np.zeros(480), np.zeros(480, bool)
         for _ in range(600):
@@ -207,7 +208,7 @@ def test_several_vehicles_are_given_round():
     env = QuadcopterVecEnv(7, vehicle=names, seed=0, randomize={"mass": [0.9, 1.1]})
     assert [each.name for each in env.get_attr("vehicle")] == [names[row % 3] for row in range(7)]
     env.reset()
-    for row, factor in enumerate(env.batch.vehicles[P.mass] / env.batch.nominal[P.mass]):
+    for row, factor in enumerate(env.batch.vehicles[P.mass] / env.batch.base_vehicles[P.mass]):
         assert 0.9 <= factor <= 1.1, row
 
 
@@ -222,8 +223,8 @@ def test_several_vehicles_are_given_round():
         ({"motor_gain": [1, 10], "thrust": [1, 1]}, None),
         ({"delay": [0, 0.5]}, "whole control steps"),
         ({"delay": [0, 1000]}, "whole control steps"),
-        ({"force": {"magnitude": [-1, 1]}}, "not negative"),
-        ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "is none"),
+        ({"force": {"magnitude": [-1, 1]}}, "greater than or equal to 0"),
+        ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "must not be zero"),
         ({"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}}, "greater than 0"),
         ({"gusts": {"std": [0, 1], "time_constant": 0}}, "greater than 0"),
         ({"share": 1.5}, "share"),
@@ -232,8 +233,8 @@ def test_several_vehicles_are_given_round():
 )
 def test_worlds_that_cannot_be_are_refused_in_one_line(worlds, says):
     if says is None:
-        QuadcopterBatch(1, randomize=worlds)
+        QuadcopterVecEnv(1, randomize=worlds)
         return
     with pytest.raises(ConfigError, match=r".*") as error:
-        QuadcopterBatch(1, randomize=worlds)
+        QuadcopterVecEnv(1, randomize=worlds)
     assert says in str(error.value) and "\n" not in str(error.value)

@@ -126,7 +126,7 @@ def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | 
     controller = resolve_expert(spec.spec, vehicle, "controller")
     if spec.scaling == "none" or hasattr(controller, "actions"):
         return controller
-    if spec.own is not None and spec.own.is_needed:
+    if spec.own is not None and spec.own.is_extended:
         raise ConfigError(f"{spec.label}: adaptive scaling is for agents that see the 18 features alone; this one sees more")
     return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0), spec.observed["observation_std"])
 

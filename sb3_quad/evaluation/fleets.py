@@ -10,11 +10,10 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.layout import row_slices
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState
 
 MAX_CLIENTS = 512  # PyBullet allows about 1000 physics clients in a process
-ENDLESS = {"max_episode_steps": 2**62}  # who flies says when an episode is over
 
 
 class FleetStep(NamedTuple):
@@ -36,9 +35,9 @@ class BatchFleet:
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        self._batch = QuadcopterBatch(len(seeds), **{**dict(settings), **ENDLESS}, autoreset=False)
+        self._batch = QuadcopterBatch(len(seeds), settings.with_changes(max_episode_steps=ENDLESS), autoreset=False)
         self._batch.seed(seeds)
-        self.vehicle, self.observation_size = self._batch.vehicle_list[0], self._batch.memory.size
+        self.vehicle, self.observation_size = self._batch.vehicle_list[0], self._batch.observation.size
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         """Begin; observations (n, observation_size).
@@ -84,8 +83,8 @@ class PyBulletFleet:
                 f"n_episodes {len(seeds)}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts"
             )
         self._seeds = seeds
-        self._envs = [QuadcopterEnv(**{**dict(settings), **ENDLESS}) for _ in seeds]
-        self.vehicle, self.observation_size = self._envs[0].vehicle, self._envs[0].batch.memory.size
+        self._envs = [QuadcopterEnv(**dict(settings.with_changes(max_episode_steps=ENDLESS))) for _ in seeds]
+        self.vehicle, self.observation_size = self._envs[0].vehicle, self._envs[0].batch.observation.size
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         for row, (env, seed) in enumerate(zip(self._envs, self._seeds, strict=True)):

@@ -21,8 +21,9 @@ from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError, ExportError
 from sb3_quad.base.imports import require
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.memory import Memory
+from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -54,7 +55,7 @@ class Reference(NamedTuple):
     mean: FloatArray = DEFAULT_MEAN
     std: FloatArray = DEFAULT_STD
     output: str = "thrusts"
-    memory: Memory = Memory()
+    memory: ObservationSettings = ObservationSettings()
 
     def actions(self, observations: Float32Array) -> Any:
         """The policy's actions, (n, 4), for observations in physical units, (n, 18), scaled as in training (Eq. 3.16)."""
@@ -74,13 +75,15 @@ class Reference(NamedTuple):
         """
         half = n // 2
         rows = min(_FLIGHTS, half)
-        flights = QuadcopterBatch(rows, _TASK, vehicle=self.vehicle, seed=0, n_threads=1, **_UNSCALED)
+        flights = QuadcopterBatch(rows, FlightSettings(task=_TASK, vehicle=self.vehicle, **_UNSCALED), seed=0, n_threads=1)
         observations, kept = flights.reset(), list[Float32Array]()
         while len(kept) * rows < half:
             kept.append(observations)
             for _ in range(_EVERY):
                 observations = flights.step(self.actions(observations))[0]
-        others = QuadcopterBatch(half, _TASK, _WIDE, self.vehicle, seed=rows, n_threads=1, **_UNSCALED)
+        others = QuadcopterBatch(
+            half, FlightSettings(task=_TASK, task_kwargs=_WIDE, vehicle=self.vehicle, **_UNSCALED), rows, n_threads=1
+        )
         return np.concatenate([np.concatenate(kept)[:half], others.reset()])
 
     def fly(self, call: Call, n: int, by: str) -> tuple[Float32Array, float, str]:
@@ -94,9 +97,9 @@ class Reference(NamedTuple):
         :raises ExportError: see :meth:`largest_error`.
         """
         rows, tasks, integral = max(n // FLIGHT_STEPS, 1), cast(Any, {_TASK: 1.0, _NEAR: 1.0}), self.memory.position_integral
-        same: dict[str, Any] = {"vehicle": self.vehicle, "max_episode_steps": FLIGHT_STEPS, "seed": 0, "n_threads": 1}
+        same: dict[str, Any] = {"task": tasks, "vehicle": self.vehicle, "max_episode_steps": FLIGHT_STEPS}
         seeing = {"observation_mean": self.mean, "observation_std": self.std, **dict(self.memory)}
-        env, twin = (QuadcopterBatch(rows, tasks, **same, **each) for each in (seeing, _UNSCALED))
+        env, twin = (QuadcopterBatch(rows, FlightSettings(**same, **each), 0, n_threads=1) for each in (seeing, _UNSCALED))
         limits = {"position": integral.distance, "velocity": integral.speed} if integral else {}
         seen, features, begins, sure = env.reset(), twin.reset(), np.ones(rows, bool), np.zeros(rows, bool)
         state: Any = None  # of a recurrent policy

@@ -10,7 +10,7 @@ from sb3_quad.simulation.observation import GROUPS
 
 
 class RememberingNetwork(Network):
-    """A network with what :mod:`sb3_quad.simulation.memory` keeps of a flight, as a state, float32 (batch, ``state_size``).
+    """A network with what :mod:`sb3_quad.simulation.frames` keeps of a flight, as a state, float32 (batch, ``state_size``).
 
     The state is zeros as a flight begins. It holds, as far as the policy sees it: the last action (4); the integral s (3), m,
     with a 1 once a flight has begun; the earlier frames, scaled, the latest first.

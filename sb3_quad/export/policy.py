@@ -82,17 +82,17 @@ def export_policy(
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
     if settings.vehicles is not None:
         raise ConfigError(f"model {path}: flies any vehicle; say with --vehicle which one's thrusts the file is to give")
-    row = QuadcopterBatch(1, **dict(settings), n_threads=1)  # it checks them
-    reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.memory)
+    row = QuadcopterBatch(1, settings, n_threads=1)  # it checks them
+    reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.observation)
     network = build_network(reference, f"model {path}")
-    if reference.memory.is_needed:
+    if reference.memory.is_extended:
         network = RememberingNetwork(network.layers, reference)
     metadata = _describe(Path(path), algorithm, network, reference)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
         call, by = load(write(network, metadata))
-        if reference.memory.is_needed:
+        if reference.memory.is_extended:
             observations, error, extent = reference.fly(call, n_observations, by)
         else:
             observations = reference.sample_observations(n_observations)

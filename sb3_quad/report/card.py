@@ -8,7 +8,7 @@ from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
-from sb3_quad.simulation.memory import Memory
+from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.noise import in_words
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
@@ -78,7 +78,9 @@ def write_card(
             cells[NEAR] = Cell(words="–")
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))
     columns = [Column(row.heading) for row in SHOWN]
-    remembered = Memory.model_validate({key: settings[key] for key in Memory.model_fields if key in settings})
+    remembered = ObservationSettings.model_validate(
+        {key: settings[key] for key in ObservationSettings.model_fields if key in settings}
+    )
     kept = ", ".join(f"{key}={value!r}" for key, value in remembered.model_dump(exclude_defaults=True).items())
     return CARD.format(
         name=name,

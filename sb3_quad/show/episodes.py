@@ -19,7 +19,7 @@ from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.parts import Wrench
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan, sample_wrenches
-from sb3_quad.simulation.checks import vector
+from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
@@ -99,7 +99,7 @@ def fixed_setting(
     vehicle = load_vehicle(settings.vehicle)
     start = {}
     if target is not None:
-        start["target"] = vector("--target", target, 3)[None]
+        start["target"] = per_row("--target", target, 1, 3).T
         if target[2] <= vehicle.collision_radius:
             raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
     wrenches = [validate(Wrench, push, "the push")] if push else []

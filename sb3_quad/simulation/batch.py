@@ -1,94 +1,49 @@
 """n quadcopters as arrays: what all environments are made of."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, FloatArray, IntArray
-from sb3_quad.base.cores import available_cpus, use_cpus
+from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.simulation.checks import per_row, row_numbers, row_vehicles, whole_number
-from sb3_quad.simulation.designs import resolve_vehicles
+from sb3_quad.base.validate import validate
+from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
+from sb3_quad.simulation.frames import PositionIntegral, new_frames
 from sb3_quad.simulation.kernel import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
-from sb3_quad.simulation.memory import PositionIntegral, new_frames, resolve_memory
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
-from sb3_quad.simulation.randomization import resolve_randomization
+from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.sampling import GUST_FORCE, GUST_SIZE
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
 from sb3_quad.simulation.threads import batch_lock, first_run, run
-from sb3_quad.simulation.worlds import GUST_FORCE, new_worlds
+from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
+from sb3_quad.vehicles.vehicle import Vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
-MAX_ROWS = 2**20
-COLUMNS = {
-    "vehicle": "vehicles",
-    "nominal": "nominal",
-    "given": "given",
-    "design": "designs",
-    "world": "worlds",
-    "gust": "gust",
-    "scaling": "mean",
-}
-_MEMORY = (  # all that future flight depends on
+MAX_ROWS, MAX_THREADS = 2**20, 2**16
+COLUMNS = {"vehicle": "vehicles", "base": "base_vehicles", "gust": "gust", "scaling": "mean"}
+_KEPT = (  # all that future flight depends on
     *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
-    *("vehicles", "nominal", "gust", "frames", "integral"),
+    *("vehicles", "gust", "frames", "integral"),
 )
-
-
-def share_cores(count: int) -> None:
-    """Have the batches of this process fly with no more than ``count`` threads unless told otherwise; flights are the same."""
-    use_cpus(count)
-
-
-class BatchKeywords(TypedDict, total=False):
-    """Keywords of :class:`QuadcopterBatch` that the environments pass on."""
-
-    vehicle: Any
-    rotor_layout: Any
-    noise: Any
-    observation_mean: Any
-    observation_std: Any
-    last_action: bool
-    history: Any
-    position_integral: Any
-    vehicles: Any
-    randomize: Any
-    max_episode_steps: int | Sequence[int]
-    seed: int | None
-    n_threads: int | None
 
 
 class QuadcopterBatch:
     """n quadcopters, each in an episode of its own; arrays in, arrays out.
 
     :param n_envs: number of rows, from 1 to 2^20.
-    :param task: name, :class:`~sb3_quad.simulation.tasks.Task`, or mixture ``{name: weight}`` sampled from at each reset.
-    :param task_kwargs: fields of the task to override.
-    :param vehicle: name, path or :class:`~sb3_quad.vehicles.vehicle.Vehicle`; or a sequence of them whose time steps agree:
-        row i has number i, counted round.
-    :param rotor_layout: name, path or Vehicle whose order of the rotors a policy knows; see
-        :meth:`~sb3_quad.vehicles.vehicle.Vehicle.in_layout_of`. None: each vehicle's own.
-    :param noise: relative standard deviation of the observation noise, shape () or (n_envs,); or a
-        :class:`~sb3_quad.simulation.noise.Noise` or its fields.
-    :param observation_mean: μ of Eq. 3.16, shape (18,) or (n_envs, 18); None: zero.
-    :param observation_std: σ of Eq. 3.16, likewise; None: Table A.2.
-    :param last_action: whether a policy sees its last action; ``history``, of which age the frames are that it sees;
-        ``position_integral``, whether it sees that: see :class:`~sb3_quad.simulation.memory.Memory`. An observation then has
-        ``memory.size`` numbers, which is 18 by default.
-    :param vehicles: None, or a distribution of vehicles from which each episode has one, see
-        :func:`~sb3_quad.simulation.designs.resolve_vehicles`; ``vehicle`` then says what that does not.
-    :param randomize: None, a :class:`~sb3_quad.simulation.randomization.Randomization` or its fields: what is random in each
-        episode.
-    :param max_episode_steps: control steps after which an episode is truncated; or several, of which row i has number i,
-        counted round.
+    :param settings: how they fly.
     :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the operating system's entropy.
     :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
+    :raises ConfigError: an argument that does not fit; a vehicle that cannot fly as the settings say.
     """
 
     _bound: Arrays
@@ -98,46 +53,45 @@ class QuadcopterBatch:
     def __init__(
         self,
         n_envs: int,
-        task: TaskSpec = "target_tracking",
-        task_kwargs: Mapping[str, Any] | None = None,
-        vehicle: Any = "itm",
-        rotor_layout: Any = None,
-        noise: Any = 0.05,
-        observation_mean: Any = None,
-        observation_std: Any = None,
-        last_action: bool = False,
-        history: Sequence[int] | None = None,
-        position_integral: Any = None,
-        vehicles: Any = None,
-        randomize: Any = None,
-        max_episode_steps: int | Sequence[int] = 1500,
+        settings: FlightSettings | None = None,
         seed: int | None = None,
         n_threads: int | None = None,
         autoreset: bool = True,
     ) -> None:
-        n = self.n = whole_number("n_envs", n_envs, most=MAX_ROWS)
-        self.max_steps = row_numbers("max_episode_steps", max_episode_steps, n, most=2**62)
-        self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads)
-        self.autoreset = autoreset
-        one_each = isinstance(vehicle, Sequence) and not isinstance(vehicle, str)
-        self.vehicle_list = row_vehicles(vehicle if one_each else [vehicle], n, rotor_layout)
-        columns = self.vehicle_list if one_each else self.vehicle_list[:1]
-        self.given = np.stack([each.parameters() for each in columns], axis=1)
-        self.distribution, self.randomize = resolve_vehicles(vehicles), resolve_randomization(randomize)
-        self.memory = resolve_memory(last_action=last_action, history=history, position_integral=position_integral)
-        self.nominal, self.vehicles, self.designs, self.worlds, self.gust = new_worlds(
-            self.randomize, self.distribution, columns, self.given, n
-        ).values()
-        self.frames = new_frames(self.memory, n)
-        self.ages = np.array(self.memory.ages, dtype=np.int64)
-        integral = self.memory.position_integral
+        settings = settings or FlightSettings()
+        n = self.n = whole_number("n_envs", n_envs, 1, MAX_ROWS)
+        self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads, 1, MAX_THREADS)
+        self.autoreset, self.observation = autoreset, settings.observation
+        self.distribution, self.randomize = settings.vehicles, settings.randomize or Randomization()
+
+        several = isinstance(settings.vehicle, (list, tuple))
+        vehicles = load_vehicles(settings.vehicle if several else [settings.vehicle], settings.rotor_layout)
+        self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, n)
+        for each in vehicles:
+            self.randomize.check(each if self.distribution is None else self.distribution.weakest(each))
+        columns = self.vehicle_list if several else vehicles
+        self.base_vehicles = np.stack([each.parameters() for each in columns], axis=1)
+        own = n if self.distribution is not None or self.randomize.sets_vehicle else len(columns)
+        self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.base_vehicles), own)).copy()
+        self.distribution_numbers = NO_DISTRIBUTION if self.distribution is None else self.distribution.numbers()
+        self.randomize_numbers = self.randomize.numbers(vehicles[0].control_step)
+        self.gust = np.zeros((GUST_SIZE, 0 if self.randomize.gusts is None else n))
+
+        integral = self.observation.position_integral
+        self.frames = new_frames(self.observation, n)
+        self.ages = np.array(self.observation.ages, dtype=np.int64)
         self.integral = np.zeros((0 if integral is None else 3, n))
-        self.integral_numbers = np.array((integral or PositionIntegral()).numbers(columns[0].control_step))
-        self.tasks = resolve_tasks(task, task_kwargs)
-        self.task, self.task_kwargs = task, dict(task_kwargs or {})
+        self.integral_numbers = np.array((integral or PositionIntegral()).numbers(vehicles[0].control_step))
+        self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
+
+        self.task: TaskSpec = settings.task
+        self.task_kwargs = dict(settings.task_kwargs or {})
+        self.tasks = resolve_tasks(self.task, self.task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
+        self.max_steps = _steps_of_rows(settings, n)
+        self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
         self.state = np.zeros((STATE_SIZE, n))
-        self.queue = np.zeros((max(self.randomize.longest_delay, *(each.delay for each in columns), 0), 4, n))
+        self.queue = np.zeros((max(self.randomize.longest_delay, *(each.delay for each in vehicles), 0), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         # One column serves all rows until rows are set apart.
@@ -145,28 +99,21 @@ class QuadcopterBatch:
         self.mean = DEFAULT_MEAN[:, None].copy()
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
-        self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
         self.outcome = np.zeros(n, dtype=OUTCOME)
-        self.last_observations = np.zeros((n, self.memory.size), dtype=np.float32)
         self.lock = batch_lock()  # held while compiled code reads and writes the arrays, and while some are replaced
         self._bind()
-        self.set_noise(noise)
-        self.set_observation_scaling(observation_mean, observation_std)
+        self.set_noise(settings.noise)
+        self.set_observation_scaling(settings.observation_mean, settings.observation_std)
         with first_run():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
-
-    @property
-    def sets_vehicle(self) -> bool:
-        """Whether an episode begins with a vehicle of its own."""
-        return self.distribution is not None or self.randomize.sets_vehicle
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
         """New streams of the given rows, from one seed each; their next reset begins the first episode."""
         self.streams[:, self.rows(rows)] = new_streams(seeds)
 
     def reset(self, rows: Rows = None) -> Float32Array:
-        """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, memory.size)."""
+        """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, size)."""
         return self._run(LOOK, self.rows(rows)).observations
 
     def stagger(self) -> None:
@@ -174,15 +121,15 @@ class QuadcopterBatch:
         self.limits[:] = self.max_steps - np.arange(self.n) * self.max_steps // self.n
 
     def observe(self) -> Float32Array:
-        """The present observations, float32 (n, memory.size); the same numbers until the next step."""
+        """The present observations, float32 (n, size), of ``observation.size``; the same numbers until the next step."""
         return self._run(LOOK).observations
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         """One control step of every row.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: observations float32 (n, memory.size), rewards float32 (n,), done bool (n,): fresh arrays. Of rows that are
-            done, ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, success) and
+        :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays. Of rows that are done,
+            ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, success) and
             ``last_observations`` tell how the episode ended, until the row's next one ends; without autoreset they are of
             every row's last step.
         """
@@ -199,7 +146,7 @@ class QuadcopterBatch:
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
-        arrays = step_arrays(self.n, self.memory.size, array)
+        arrays = step_arrays(self.n, self.observation.size, array)
         if not self._do(mode, arrays):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
@@ -213,7 +160,7 @@ class QuadcopterBatch:
         self.outcome["distance"][chosen] = QuadcopterState(self.state[:, chosen]).distance
 
     def _run(self, mode: int, resetting: IntArray | None = None) -> StepArrays:
-        arrays = step_arrays(self.n, self.memory.size)
+        arrays = step_arrays(self.n, self.observation.size)
         if resetting is not None:
             arrays.dones[resetting] = True
         self._do(mode, arrays)
@@ -249,7 +196,7 @@ class QuadcopterBatch:
     def snapshot(self) -> Arrays:
         """Copies of all that future flight depends on, by name."""
         with self.lock:
-            return {name: getattr(self, name).copy() for name in _MEMORY}
+            return {name: getattr(self, name).copy() for name in _KEPT}
 
     def restore(self, snapshot: Arrays) -> None:
         """Undo what has happened since :meth:`snapshot`.
@@ -257,7 +204,7 @@ class QuadcopterBatch:
         :raises ConfigError: the snapshot is of other environments.
         """
         with self.lock:
-            other = sorted(set(snapshot) - set(_MEMORY))
+            other = sorted(set(snapshot) - set(_KEPT))
             try:
                 if other:
                     raise ConfigError(f"{other[0]}: not part of it")
@@ -295,27 +242,30 @@ class QuadcopterBatch:
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a ``Noise``; 0: none."""
         chosen = self.rows(indices)
-        relative, additive = (per_row("noise", each, chosen.size, None)[0] for each in levels(level))
-        if (relative < 0).any():
-            raise ConfigError(f"noise {level!r}: must not be negative")
-        columns = self._columns(indices, one_for_all=np.ndim(level) == 0)
+        noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
+        relative, additive = (per_row("noise", each, chosen.size, None)[0] for each in levels(noise))
+        columns = self._columns(indices, one_for_all=not isinstance(noise, list))
         self.noise_level[columns], self.additive_level[columns] = relative[: columns.size], additive[: columns.size]
 
     def set_observation_scaling(self, mean: Any = None, std: Any = None, indices: Rows = None) -> None:
         """Set μ and σ of Eq. 3.16, (18,) or (rows, 18) each; None leaves one as it is."""
         chosen = self.rows(indices)
-        means = None if mean is None else per_row("observation_mean", mean, chosen.size, OBSERVATION_SIZE)
-        stds = None if std is None else per_row("observation_std", std, chosen.size, OBSERVATION_SIZE)
-        if stds is not None and (stds <= 0).any():
+        given = {"mean": mean, "std": std}
+        arrays = {
+            name: per_row(f"observation_{name}", values, chosen.size, OBSERVATION_SIZE)
+            for name, values in given.items()
+            if values is not None
+        }
+        if (arrays.get("std", np.ones(1)) <= 0).any():
             raise ConfigError("observation_std: every value must be positive")
-        columns = self._columns(indices, one_for_all=np.ndim(mean) < 2 and np.ndim(std) < 2)
-        for array, values in ((self.mean, means), (self.std, stds)):
-            if values is not None:
-                array[:, columns] = values[:, : columns.size]
+        columns = self._columns(indices, one_for_all=max(np.ndim(mean), np.ndim(std)) < 2)
+        for name, values in arrays.items():
+            getattr(self, name)[:, columns] = values[:, : columns.size]
 
     def set_max_episode_steps(self, steps: int | Sequence[int]) -> None:
-        """Control steps after which an episode is truncated, for all rows from the next step on; of several, counted round."""
-        most = row_numbers("max_episode_steps", steps, self.n, most=2**62)
+        """Control steps after which an episode is truncated, for all rows from the next step on; several numbers repeat."""
+        settings = validate(FlightSettings, {"max_episode_steps": steps}, "set_max_episode_steps")
+        most = _steps_of_rows(settings, self.n)
         self._bind(max_steps=most, limits=most.copy())
 
     def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
@@ -361,12 +311,10 @@ class QuadcopterBatch:
                 "physics_step": first.physics_step,
                 "tasks": table.weights.size,
                 **{f"{name}_columns": values[array].shape[1] for name, array in COLUMNS.items()},
-                "gusts": self.randomize.gusts is not None,
-                "sets_vehicle": self.sets_vehicle,
-                "sets_wrench": self.randomize.sets_wrench,
-                "mixed_delays": self.randomize.delay is not None or bool((self.given[P.delay] != len(self.queue)).any()),
-                "own_arms": self.given.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
-                "width": self.memory.size,
+                "mixed_delays": self.randomize.delay is not None
+                or bool((self.base_vehicles[P.delay] != len(self.queue)).any()),
+                "own_arms": self.base_vehicles.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
+                "width": self.observation.size,
                 **dict(zip(("depth", "frame"), self.frames.shape[1:], strict=True)),
                 "ages": self.ages.size,
                 "integrals": len(self.integral),
@@ -383,3 +331,9 @@ class QuadcopterBatch:
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, lock=batch_lock())
         self._bind()
+
+
+def _steps_of_rows(settings: FlightSettings, n: int) -> IntArray:
+    """``max_episode_steps`` of n rows, (n,)."""
+    steps = settings.max_episode_steps
+    return np.array(repeated("max_episode_steps", steps if isinstance(steps, list) else [steps], n), dtype=np.int64)

@@ -25,25 +25,18 @@ from sb3_quad.simulation.block import (
     store_state,
 )
 from sb3_quad.simulation.compiled import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
-from sb3_quad.simulation.designs import DESIGN_SIZE, design
 from sb3_quad.simulation.episodes import count_episode, start_episode
+from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
 from sb3_quad.simulation.layout import first_rows
-from sb3_quad.simulation.memory import forget, integrate, remember, remember_action
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
 from sb3_quad.simulation.physics import fly_block
 from sb3_quad.simulation.random import STEP
+from sb3_quad.simulation.randomization import RANDOMIZATION
 from sb3_quad.simulation.reward import score, succeeds
+from sb3_quad.simulation.sampling import GUST_SIZE, add_gusts, advance_gusts, sample_episode
 from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
 from sb3_quad.simulation.tasks import TASK, S
-from sb3_quad.simulation.worlds import (
-    GUST_SIZE,
-    WORLD_SIZE,
-    add_gusts,
-    advance_gusts,
-    sample_gust,
-    sample_vehicle,
-    sample_wrench,
-)
+from sb3_quad.simulation.vehicle_distribution import DISTRIBUTION_NUMBERS
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 LOOK, SCORE, FLY = range(3)
@@ -65,24 +58,22 @@ OUTCOME = np.dtype(
 )
 """How the last episode of a row ended."""
 
-# Columns of vehicles, random worlds and scaling: 1 where one serves all rows; none of worlds where all are nominal. Control
-# steps of an episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
+# Columns of vehicles and scaling: n, or 1 if all rows share the values; of gusts: n, or 0 without gusts. Control steps of an
+# episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
 SIZES = (
-    *("n", "delay", "substeps", "tasks", "vehicle_columns", "nominal_columns", "given_columns"),
-    *("design_columns", "world_columns", "gust_columns", "scaling_columns", "mixed_delays", "own_arms", "gusts"),
-    *("sets_wrench", "sets_vehicle", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
+    *("n", "delay", "substeps", "tasks", "vehicle_columns", "base_columns", "gust_columns", "scaling_columns"),
+    *("mixed_delays", "own_arms", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
 )
-_MAY_BE_NONE = ("world_columns", "gust_columns", "design_columns")
 _PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
+_DISTRIBUTION, _RANDOMIZATION = sum(DISTRIBUTION_NUMBERS.values()), sum(RANDOMIZATION.values())
 ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and shape, of which a name is one of the sizes
     "state": ("f8", (STATE_SIZE, "n")),
     "queue": ("f8", ("delay", 4, "n")),
     "wrench": ("f8", (WRENCH_SIZE, "n")),
     "vehicles": ("f8", (_PARAMETERS, "vehicle_columns")),  # that fly
-    "nominal": ("f8", (_PARAMETERS, "nominal_columns")),  # from which those differ
-    "given": ("f8", (_PARAMETERS, "given_columns")),  # from which the nominal ones are designed
-    "designs": ("f8", (DESIGN_SIZE, "design_columns")),
-    "worlds": ("f8", (WORLD_SIZE, "world_columns")),
+    "base_vehicles": ("f8", (_PARAMETERS, "base_columns")),  # before anything is random
+    "distribution_numbers": ("f8", (_DISTRIBUTION,)),
+    "randomize_numbers": ("f8", (_RANDOMIZATION,)),
     "gust": ("f8", (GUST_SIZE, "gust_columns")),
     "frames": ("f4", ("n", "depth", "frame")),
     "ages": ("i8", ("ages",)),
@@ -144,7 +135,7 @@ def check_arrays(arrays: Arrays, sizes: Mapping[str, float]) -> None:
         if array.dtype != kind or array.shape != wanted or not array.flags.carray:
             raise ConfigError(f"{name}: {array.dtype} of shape {array.shape}; needed is {np.dtype(kind)} of shape {wanted}")
     for name in (size for size in SIZES if size.endswith("_columns")):
-        if sizes[name] not in (1, sizes["n"]) and not (sizes[name] == 0 and name in _MAY_BE_NONE):
+        if sizes[name] not in (1, sizes["n"]) and not (sizes[name] == 0 and name == "gust_columns"):
             raise ConfigError(f"{name} {sizes[name]}: must be 1, or one for each of {sizes['n']} rows")
     if not ((arrays["task_index"] >= 0) & (arrays["task_index"] < sizes["tasks"])).all():
         raise ConfigError(f"task_index: every number must be one of the {sizes['tasks']} tasks, counted from 0")
@@ -173,7 +164,6 @@ def run_block(job, number, b, fresh):
     tasks = carray(pointer(job.task_parameters_at), (job.tasks, _COLUMNS), np.float64)
     vehicles = carray(pointer(job.vehicles_at), (_PARAMETERS, job.vehicle_columns), np.float64)
     queue = carray(pointer(job.queue_at), (job.delay, 4, n), np.float64)
-    worlds = carray(pointer(job.worlds_at), (WORLD_SIZE, job.world_columns), np.float64)
     gust = carray(pointer(job.gust_at), (GUST_SIZE, job.gust_columns), np.float64)
     wrench = carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64)
     frames = carray(pointer(job.frames_at), (n, job.depth, job.frame), np.float32)
@@ -202,7 +192,7 @@ def run_block(job, number, b, fresh):
         actions = carray(pointer(job.actions_at), (n, 4), np.float32)
         if job.mode == FLY:
             load_rows(wrench, first, count, b.wrench)
-            if job.gusts:
+            if job.gust_columns > 0:
                 add_gusts(b, gust, first, count)
             load_commands(b, actions, queue, job.mixed_delays, first, count)
             fly_block(b, job.physics_step, job.substeps)
@@ -212,17 +202,17 @@ def run_block(job, number, b, fresh):
             streams[STEP, first + lane] += np.uint32(1)
         load_rows(streams, first, count, b.stream)
         observe(b)
-        if job.gusts:
+        if job.gust_columns > 0:
             advance_gusts(b, gust, first, count)
         if job.depth > 0:
             numbers = carray(pointer(job.integral_numbers_at), (4,), np.float64)
             for lane in range(count):
                 i = first + lane
                 step = int64(streams[STEP, i])
-                remember_action(i, step, actions[i], frames)
+                store_action(i, step, actions[i], frames)
                 if job.integrals > 0:
-                    integrate(i, b.feature, lane, b.mean, b.inverse_std, numbers, integral)
-                remember(i, step, b.feature, lane, b.inverse_std, integral, ages, frames, observations)
+                    integrate_position(i, b.feature, lane, b.mean, b.inverse_std, numbers, integral)
+                observe_frames(i, step, b.feature, lane, b.inverse_std, integral, ages, frames, observations)
         else:
             store_observations(b, observations, first, count)
 
@@ -257,31 +247,24 @@ def run_block(job, number, b, fresh):
 
     max_steps = carray(pointer(job.max_steps_at), (n,), np.int64)
     weights = carray(pointer(job.task_weights_at), (job.tasks,), np.float64)
-    nominal = carray(pointer(job.nominal_at), (_PARAMETERS, job.nominal_columns), np.float64)
+    base = carray(pointer(job.base_vehicles_at), (_PARAMETERS, job.base_columns), np.float64)
+    distribution = carray(pointer(job.distribution_numbers_at), (_DISTRIBUTION,), np.float64)
+    randomization = carray(pointer(job.randomize_numbers_at), (_RANDOMIZATION,), np.float64)
     for i in range(first, first + count):
         if dones[i]:
             returns[i], limits[i] = 0.0, max_steps[i]
             count_episode(i, streams)
-            if job.design_columns > 0:
-                given = carray(pointer(job.given_at), (_PARAMETERS, job.given_columns), np.float64)
-                designs = carray(pointer(job.designs_at), (DESIGN_SIZE, job.design_columns), np.float64)
-                design(i, streams, given, designs, nominal)
-            if job.sets_vehicle:
-                sample_vehicle(i, streams, nominal, worlds, vehicles)
-            if job.sets_wrench:
-                sample_wrench(i, streams, nominal, worlds, wrench)
-            if job.gusts:
-                sample_gust(i, streams, nominal, worlds, gust)
+            sample_episode(i, streams, base, distribution, randomization, vehicles, wrench, gust)
             start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
             if job.depth > 0:
-                forget(i, frames, integral)
+                clear_frames(i, frames, integral)
     load_rows(state, first, count, b.state)
     load_rows(streams, first, count, b.stream)
     observe(b)
     if job.depth > 0:
         for lane in range(count):
             i = first + lane
-            remember(i, int64(streams[STEP, i]), b.feature, lane, b.inverse_std, integral, ages, frames, observations)
+            observe_frames(i, int64(streams[STEP, i]), b.feature, lane, b.inverse_std, integral, ages, frames, observations)
     else:
         store_observations(b, observations, first, count)
 

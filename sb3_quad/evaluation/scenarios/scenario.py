@@ -22,10 +22,10 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
-from sb3_quad.simulation.designs import VehicleDistribution
 from sb3_quad.simulation.noise import Noise
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.tasks import RECOVERED, Task
+from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below

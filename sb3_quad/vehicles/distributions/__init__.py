@@ -1,1 +1,1 @@
-"""Vehicle distributions as YAML files; ``simulation/designs.py`` samples from them."""
+"""Vehicle distributions as YAML files; ``simulation/vehicle_distribution.py`` samples from them."""

@@ -1,17 +1,15 @@
 """What a policy sees beside the present features: the last action, earlier frames, and the integral of the position error.
 
 A frame is the scaled features of a control step, with ``last_action`` followed by the action that led there. An observation is
-the frames of some ages, one after the other. :func:`remember` keeps them for a row of the batch.
+the frames of some ages, one after the other. The compiled functions keep the frames of a row and make observations of them.
 """
-
-from typing import Any
 
 import numpy as np
 from numba import float32
 from pydantic import Field, PositiveFloat, field_validator
 
 from sb3_quad.base.arrays import Float32Array
-from sb3_quad.base.validate import Frozen, validate
+from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
@@ -22,8 +20,8 @@ class PositionIntegral(Frozen):
     """s += ``gain`` e dt where e is shorter than ``distance`` and v than ``speed``; each component stays within ±``limit``.
 
     e is the observed position relative to the target, v the observed velocity; s is zero at an episode's start. The policy
-    sees e + s in place of e, also in the frames it remembers: it flies to where that is zero, so that a constant force or a
-    bias of its own leaves no error. It need not have been trained with it.
+    sees e + s in place of e, also in earlier frames. It flies to where e + s is zero, so that neither a constant force nor a
+    bias of its own leaves an error. It need not have been trained with the integral.
     """
 
     gain: PositiveFloat = Field(default=0.5, description="1/s")
@@ -32,14 +30,14 @@ class PositionIntegral(Frozen):
     limit: PositiveFloat = Field(default=3.0, description="m")
 
     def numbers(self, control_step: float) -> list[float]:
-        """What :func:`remember` reads: gain dt, distance², speed², limit."""
+        """What :func:`integrate_position` reads: gain dt, distance², speed², limit."""
         return [self.gain * control_step, self.distance**2, self.speed**2, self.limit]
 
 
-class Memory(Frozen):
-    """What a policy sees; the default is the 18 features alone."""
+class ObservationSettings(Frozen):
+    """What an observation is made of; the default is the 18 features alone."""
 
-    last_action: bool = Field(default=False, description="whether a frame holds the action before it, clipped to [-1, 1]")
+    last_action: bool = Field(default=False, description="whether a frame ends with the action before it, clipped to [-1, 1]")
     history: tuple[int, ...] | None = Field(
         default=None, description="ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode began"
     )
@@ -54,7 +52,7 @@ class Memory(Frozen):
 
     @property
     def ages(self) -> tuple[int, ...]:
-        """Of the frames in an observation, control steps."""
+        """Ages of the observed frames, control steps."""
         return self.history or (0,)
 
     @property
@@ -68,30 +66,22 @@ class Memory(Frozen):
         return len(self.ages) * self.frame_size
 
     @property
-    def is_needed(self) -> bool:
+    def is_extended(self) -> bool:
         """Whether an observation is more than the present features."""
         return self.last_action or self.ages != (0,) or self.position_integral is not None
 
 
-def resolve_memory(**given: Any) -> Memory:
-    """A :class:`Memory`.
-
-    :raises ConfigError: a value that does not fit.
-    """
-    return validate(Memory, {name: value for name, value in given.items() if value is not None}, "env_kwargs")
-
-
 @compiled
-def remember_action(i, step, action, frames):
-    """The action (4,) that row i begins control step ``step`` - 1 with, in place; ``frames`` as of :func:`remember`."""
+def store_action(i, step, action, frames):
+    """Keep the action (4,) that led row i to control step ``step``, in place; ``frames`` as in :func:`observe_frames`."""
     slot = step % frames.shape[1]
     for k in range(frames.shape[2] - OBSERVATION_SIZE):
         frames[i, slot, OBSERVATION_SIZE + k] = min(max(action[k], float32(-1.0)), float32(1.0))
 
 
 @compiled
-def forget(i, frames, integral):
-    """Row i begins an episode, in place."""
+def clear_frames(i, frames, integral):
+    """Clear the last action and the integral as row i begins an episode, in place."""
     for k in range(frames.shape[2] - OBSERVATION_SIZE):
         frames[i, 0, OBSERVATION_SIZE + k] = 0.0
     for axis in range(integral.shape[0]):
@@ -99,8 +89,8 @@ def forget(i, frames, integral):
 
 
 @compiled
-def integrate(i, feature, lane, mean, inverse_std, numbers, integral):
-    """The position integral of row i after a control step, in place, by its scaled features (OBSERVATION_SIZE, lanes).
+def integrate_position(i, feature, lane, mean, inverse_std, numbers, integral):
+    """Advance the position integral of row i by a control step, in place, from its scaled features (OBSERVATION_SIZE, lanes).
 
     :param numbers: float64 (4,), :meth:`PositionIntegral.numbers`.
     """
@@ -119,14 +109,14 @@ def integrate(i, feature, lane, mean, inverse_std, numbers, integral):
 
 
 @compiled
-def remember(i, step, feature, lane, inverse_std, integral, ages, frames, out):
-    """Row i's observation, and its frame for later ones, in place.
+def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, out):
+    """Keep row i's present frame and write its observation, in place.
 
     :param step: control steps since the episode began.
     :param feature: scaled features, float32 (OBSERVATION_SIZE, lanes), of which ``lane`` is the row's.
     :param integral: float64 (3, n), or (0, n) without.
-    :param ages: int64, of the frames.
-    :param frames: float32 (n, depth, frame_size), those of the latest control steps, step s in slot s % depth.
+    :param ages: int64, of the observed frames, control steps.
+    :param frames: float32 (n, depth, frame_size), the frames of the latest control steps, step s in slot s % depth.
     :param out: float32 (n, size).
     """
     depth, size = frames.shape[1], frames.shape[2]
@@ -148,6 +138,7 @@ def remember(i, step, feature, lane, inverse_std, integral, ages, frames, out):
         at += size
 
 
-def new_frames(memory: Memory, n: int) -> Float32Array:
-    """Room for the frames of n rows; none where an observation is the present features."""
-    return np.zeros((n, memory.ages[-1] + 1 if memory.is_needed else 0, memory.frame_size), dtype=np.float32)
+def new_frames(observation: ObservationSettings, n: int) -> Float32Array:
+    """Room for the frames of n rows, (n, depth, frame_size); depth 0 where an observation is the present features."""
+    depth = observation.ages[-1] + 1 if observation.is_extended else 0
+    return np.zeros((n, depth, observation.frame_size), dtype=np.float32)

@@ -1,0 +1,144 @@
+"""What :class:`.Randomization` and :class:`.VehicleDistribution` sample for an episode: a vehicle, and what pushes it."""
+
+import math
+
+import numpy as np
+
+from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.layout import first_rows, row_slices
+from sb3_quad.simulation.observation import GUST_WORDS
+from sb3_quad.simulation.random import GUST, PUSH, VEHICLE, uniforms
+from sb3_quad.simulation.randomization import R, V
+from sb3_quad.simulation.ranges import FIXED, between
+from sb3_quad.simulation.state import P, W
+from sb3_quad.simulation.vehicle_distribution import arm_length, sample_from_distribution
+
+GUSTS = {"force": 3, "keeps": 1, "adds": 1}
+"""Of each row: the present gust, world frame, N; the share of it left after a control step; the spread of what is added."""
+GUST_SIZE = sum(GUSTS.values())
+GUST_FORCE = row_slices(GUSTS)["force"]
+G = first_rows(GUSTS)
+_SEVEN = np.uint64(127)
+_SUM_MEAN, _SUM_STD = 3 * 127 / 2, math.sqrt(3 * (128**2 - 1) / 12)  # of three whole numbers, uniform from 0 to 127
+
+
+@compiled
+def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust):
+    """The vehicle, the constant wrench and the first gust of row i's episode, in place; what is not random stays as it is.
+
+    :param base: float64 (len(PARAMETER_NAMES), n or 1), the vehicles before anything is random.
+    :param distribution: :meth:`.VehicleDistribution.numbers`.
+    :param table: :meth:`.Randomization.numbers`.
+    :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) if one serves all rows.
+    :param wrench: float64 (WRENCH_SIZE, n).
+    :param gust: float64 (GUST_SIZE, n), or (GUST_SIZE, 0) without gusts.
+    """
+    has_own_vehicle = vehicles.shape[1] == wrench.shape[1]
+    if has_own_vehicle:
+        for k in range(vehicles.shape[0]):
+            vehicles[k, i] = base[k, min(i, base.shape[1] - 1)]
+        sample_from_distribution(i, streams, distribution, vehicles)
+    # Forces in weights are those of the vehicle before it is randomised.
+    column, u = min(i, vehicles.shape[1] - 1), uniforms(streams, i, 4, PUSH)
+    is_pushed, weight = u[0] < table[R.wrench_share], vehicles[P.mass, column] * vehicles[P.gravity, column]
+    if table[R.force + 2] != FIXED or table[R.torque + 2] != FIXED:
+        for k in range(wrench.shape[0]):
+            wrench[k, i] = 0.0
+        if is_pushed:
+            moment = weight * arm_length(column, vehicles)
+            _push(table, R.force, u[1], u[2], u[3], weight, wrench, W.force_world, W.force_body, i)
+            _push(table, R.torque, u[4], u[5], u[6], moment, wrench, W.torque_world, W.torque_body, i)
+    if gust.shape[1] > 0:
+        _begin_gusts(i, streams, table, is_pushed, weight, gust)
+    if has_own_vehicle:
+        _randomize_vehicle(i, streams, table, vehicles)
+
+
+@compiled
+def _push(table, k, length, height, azimuth, unit, wrench, world, body, i):
+    """Write a constant force or torque, whose numbers begin at ``k``, to its rows of a wrench; ``unit``: in N or N m."""
+    size = between(table, k, length, 0.0)
+    if table[k + V.by_weight] != 0.0:
+        size *= unit
+    up = 2.0 * height - 1.0
+    across = math.sqrt(max(0.0, 1.0 - up * up))
+    x, y, z = across * math.cos(2.0 * math.pi * azimuth), across * math.sin(2.0 * math.pi * azimuth), up
+    to = k + V.direction
+    if table[to] != 0.0 or table[to + 1] != 0.0 or table[to + 2] != 0.0:
+        x, y, z = table[to], table[to + 1], table[to + 2]
+    rows, axes = body if table[k + V.in_body] != 0.0 else world, k + V.axes
+    wrench[rows, i] = size * x * table[axes]
+    wrench[rows + 1, i] = size * y * table[axes + 1]
+    wrench[rows + 2, i] = size * z * table[axes + 2]
+
+
+@compiled
+def _randomize_vehicle(i, streams, table, vehicles):
+    """Multiply the parameters of vehicle i by the factors of the row's episode, in place."""
+    u = uniforms(streams, i, 6, VEHICLE)
+    if u[0] >= table[R.share]:
+        return
+    mass = between(table, R.mass, u[1], 1.0)
+    vehicles[P.mass, i] *= mass
+    vehicles[P.hover_thrust, i] *= mass
+    for axis in range(3):
+        vehicles[P.ixx + axis, i] *= between(table, R.inertia, u[2 + axis], 1.0)
+    for axis in range(3):  # no body has one moment larger than the other two together
+        others = vehicles[P.ixx + (axis + 1) % 3, i] + vehicles[P.ixx + (axis + 2) % 3, i]
+        vehicles[P.ixx + axis, i] = min(vehicles[P.ixx + axis, i], others)
+    vehicles[P.motor_gain, i] *= between(table, R.motor_gain, u[5], 1.0)
+    thrust = between(table, R.thrust, u[6], 1.0)
+    vehicles[P.thrust_middle, i] *= thrust
+    vehicles[P.thrust_half_range, i] *= thrust
+    arm = between(table, R.arm, u[7], 1.0)
+    x, y = between(table, R.center_of_mass, u[8], 0.0), between(table, R.center_of_mass, u[9], 0.0)
+    for rotor in range(4):  # roll arms are y of the rotors, pitch arms -x
+        vehicles[P.roll_arm_0 + rotor, i] = arm * vehicles[P.roll_arm_0 + rotor, i] - y
+        vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
+    if table[R.delay + 2] != FIXED:
+        vehicles[P.delay, i] = min(math.floor(between(table, R.delay, u[10], 0.0)), table[R.delay + 1] - 1.0)
+
+
+@compiled
+def _begin_gusts(i, streams, table, is_pushed, weight, gust):
+    """How row i's gusts are in its episode, and the first, in place."""
+    for k in range(gust.shape[0]):
+        gust[k, i] = 0.0
+    if not is_pushed:
+        return
+    u = uniforms(streams, i, 4, GUST)
+    std = between(table, R.gust_std, u[0], 0.0)
+    if table[R.gust_by_weight] != 0.0:
+        std *= weight
+    keeps = table[R.gust_keeps]
+    gust[G.keeps, i], gust[G.adds, i] = keeps, std * math.sqrt(1.0 - keeps * keeps)
+    for axis in range(3):  # stationary from the start; two normals from two uniforms (Box-Muller)
+        radius = math.sqrt(-2.0 * math.log(u[2 + 2 * axis]))
+        gust[G.force + axis, i] = std * radius * math.cos(2.0 * math.pi * u[3 + 2 * axis])
+
+
+@compiled
+def add_gusts(b, gust, first, count):
+    """Add the present gusts of a block to its wrench."""
+    wrench = b.wrench
+    for axis in range(3):
+        for lane in range(count):
+            wrench[W.force_world + axis, lane] += gust[G.force + axis, first + lane]
+
+
+@compiled
+def advance_gusts(b, gust, first, count):
+    """Advance the gusts of a block by a control step, in place, by two random words of each lane.
+
+    What is added to a component is the sum of three numbers of seven bits each, scaled. A gust remembers many control steps,
+    so the sum of what was added is normal.
+    """
+    word = b.word
+    for lane in range(count):
+        i = first + lane
+        bits = np.uint64(word[GUST_WORDS, lane]) | np.uint64(word[GUST_WORDS + 1, lane]) << np.uint64(32)
+        for axis in range(3):
+            part = bits >> np.uint64(21 * axis)
+            added = np.float64(np.int64((part & _SEVEN) + (part >> np.uint64(7) & _SEVEN) + (part >> np.uint64(14) & _SEVEN)))
+            kept = gust[G.keeps, i] * gust[G.force + axis, i]
+            gust[G.force + axis, i] = kept + gust[G.adds, i] * ((added - _SUM_MEAN) / _SUM_STD)
