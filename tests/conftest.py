@@ -33,7 +33,8 @@ def same_start(monkeypatch):
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 - SB3's buffers draw from it
     torch.manual_seed(0)
-    monkeypatch.setattr("sb3_quad.cli.compare.FRESH_EPISODES", 4)
+    monkeypatch.setattr("sb3_quad.cli.closing.FRESH_EPISODES", 4)
+    monkeypatch.setattr("sb3_quad.cli.closing.PIPELINE_EPISODES", 4)
 
 
 def _trained(algo: str, folder: Path) -> Path:

@@ -46,7 +46,6 @@ def here(tmp_path, monkeypatch):
     stages[1]["settings"] = {**stages[1]["settings"], "n_epochs": 1}
     (folder / "stages.yml").write_text(yaml.safe_dump({"stages": stages}))
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("sb3_quad.cli.commands.train.FRESH_EPISODES", 4)
     return folder
 
 

@@ -255,7 +255,7 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
         ["train", *algo, "0", "--conf-file", best],
     ]
     (tmp_path / "space.yml").write_text("learning_rate: {low: 1.0e-3, high: 1.0e-2, log: true}\n")
-    code = f"from sb3_quad.cli import compare, main; compare.FRESH_EPISODES = 4; assert not any(map(main, {commands!r}))"
+    code = f"from sb3_quad.cli import closing, main; closing.FRESH_EPISODES = 4; assert not any(map(main, {commands!r}))"
     run(installed / "python", "-c", code, cwd=tmp_path)
     for path in (Path(Path(zip_file).name).with_suffix(".onnx"), Path("pretrained.pt")):
         assert (tmp_path / path).stat().st_size > 10_000

@@ -130,7 +130,6 @@ def small_file(tmp_path):
 
 
 def test_the_reference_agent_stands_in_the_same_table(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sb3_quad.cli.commands.train.FRESH_EPISODES", 4)
     arguments = ["train", "--conf-file", str(small_file(tmp_path)), "-f", str(tmp_path / "logs"), "--eval-episodes", "0"]
     assert main([*arguments, "--reference"]) == 0
     output = capsys.readouterr().out
@@ -142,7 +141,6 @@ def test_the_reference_agent_stands_in_the_same_table(tmp_path, capsys, monkeypa
 
 
 def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("sb3_quad.cli.commands.train.FRESH_EPISODES", 4)
     whole, interrupted = (str(tmp_path / name) for name in ("whole", "interrupted"))
     arguments = ["train", "--conf-file", str(small_file(tmp_path)), "--eval-episodes", "0"]
     assert main([*arguments, "-f", whole]) == 0

@@ -13,7 +13,7 @@ from stable_baselines3.common.buffers import DictRolloutBuffer, ReplayBuffer, Ro
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
-from sb3_quad.cli.arguments.train import DEFAULT_PIPELINE
+from sb3_quad.cli.commands.train import DEFAULT_PIPELINE
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.tasks import TASKS

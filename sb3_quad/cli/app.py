@@ -12,7 +12,7 @@ from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
 from sb3_quad.base.signals import interrupts_leave
 from sb3_quad.base.trust import trusting
 from sb3_quad.base.version import __version__
-from sb3_quad.cli import arguments
+from sb3_quad.cli import commands
 from sb3_quad.cli.parser import Parser
 
 EPILOG = """examples:
@@ -33,10 +33,10 @@ exit codes:
   143  interrupted by SIGTERM, after saving
 """
 COMMANDS = {
-    module.name.replace("_", "-"): importlib.import_module(f"{arguments.__name__}.{module.name}")
-    for module in pkgutil.iter_modules(arguments.__path__)
+    module.name.replace("_", "-"): importlib.import_module(f"{commands.__name__}.{module.name}")
+    for module in pkgutil.iter_modules(commands.__path__)
 }
-"""The module of each command's flags, by the command's name."""
+"""The module of each command by its name: ``--help`` as its docstring, ``add_arguments`` and ``run``."""
 
 
 def make_parser() -> Parser:
@@ -72,10 +72,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         agent = getattr(options, "trained_agent", None)
         if agent is not None and not any(Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds it
             raise ConfigError(f"-i {agent}: no such file")  # at once: what the command imports takes seconds
-        with interrupts_leave():
-            command = importlib.import_module(f"sb3_quad.cli.commands.{options.command.replace('-', '_')}")
+        with interrupts_leave():  # torch and the like, which every command needs, take seconds
+            importlib.import_module("sb3_quad.controllers.zips")
         with trusting(getattr(options, "trust", False)):
-            return int(command.run(options))
+            return int(COMMANDS[options.command].run(options))
     except SB3QuadError as error:
         return _refuse(str(error))
     except KeyboardInterrupt:

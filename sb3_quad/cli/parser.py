@@ -1,15 +1,17 @@
-"""Argument parsing with one-line errors, and the kinds of arguments rl-zoo has."""
+"""Argument parsing with one-line errors, kinds of arguments, and the flags that several commands have."""
 
 import argparse
 import math
 import random
+import typing
 from collections.abc import Mapping
 from typing import Any, NoReturn
+
+from pydantic import BaseModel
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_number, parse_value
 
-TRUST = "let zips run whatever is pickled in them, see docs/security.md"
 BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo {}, docs/zoo.md"
 
 
@@ -27,7 +29,7 @@ class Parser(argparse.ArgumentParser):
         raise ConfigError(message)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """As argparse's, but nothing unknown is passed over: the options of a command are all that there are.
+        """As argparse's, but an unknown option is an error here, where the options of the command are known.
 
         :raises ConfigError: an unknown option, a missing or bad value.
         """
@@ -40,9 +42,22 @@ class Parser(argparse.ArgumentParser):
         return options, rest
 
 
-def pointers(flags: str, where: str) -> dict[str, str]:
-    """:attr:`Parser.elsewhere` of some flags, which stand apart by spaces."""
-    return dict.fromkeys(flags.split(), where)
+class Pairs(argparse.Action):
+    """Keeps ``k:v`` entries as a mapping."""
+
+    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+        """:raises ConfigError: an entry without a colon."""
+        found = {}
+        for entry in values:
+            key, colon, value = entry.partition(":")
+            if not colon or not key:
+                raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
+            found[key.strip()] = parse_value(value)
+        setattr(namespace, self.dest, found)
+
+
+PAIRS: dict[str, Any] = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
+YES_OR_NO = {"action": argparse.BooleanOptionalAction}
 
 
 def whole(text: str) -> int:
@@ -79,32 +94,43 @@ def above_zero(text: str) -> float:
     return number
 
 
-class Pairs(argparse.Action):
-    """Keeps ``k:v`` entries as a mapping."""
+def add_fields(parser: argparse.ArgumentParser, model: type[BaseModel], *names: str, **changes: Mapping[str, Any]) -> None:
+    """Add a flag for each field of a model, made from its name, type, description and default; not given, it is None.
 
-    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
-        """:raises ConfigError: an entry without a colon."""
-        found = {}
-        for entry in values:
-            key, colon, value = entry.partition(":")
-            if not colon or not key:
-                raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
-            found[key.strip()] = parse_value(value)
-        setattr(namespace, self.dest, found)
+    :param model: with fields as of :func:`sb3_quad.training.options.option`.
+    :param names: of the fields; all without any.
+    :param changes: by field, arguments of ``add_argument`` over those made from it.
+    """
+    for name in names or model.model_fields:
+        field = model.model_fields[name]
+        metadata: Any = field.json_schema_extra
+        default = "" if field.default is None or field.default is False else f" ({field.default})"
+        own: dict[str, Any] = {"help": f"{field.description}{default}", "metavar": metadata["metavar"]}
+        kinds = {field.annotation, *typing.get_args(field.annotation)}
+        if bool in kinds:
+            del own["metavar"]
+            own |= YES_OR_NO if name == "progress" else {"action": "store_true", "default": None}
+        elif dict[str, Any] in kinds:
+            own |= PAIRS
+        elif str not in kinds:
+            own["type"] = float if float in kinds else whole
+        parser.add_argument(*metadata["flags"], f"--{name.replace('_', '-')}", **{**own, **changes.get(name, {})})
 
 
-def add_executor(parser: argparse.ArgumentParser) -> None:
-    """The flags that say where tasks are executed."""
+def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
+    """Add flags that several commands have: ``executor`` (with ``--address``), ``trust``, ``overwrite`` and ``progress``."""
     add = parser.add_argument
-    add("--executor", default="local", metavar="KIND", help="local (worker processes here, default) or ray: docs/sweeps.md")
-    add("--address", metavar="WHERE", help="Ray cluster: auto, host:port or ray://host:port (without it, one is started here)")
-
-
-class OneOrMore(argparse.Action):
-    """Keeps a single value as it is, several as a list."""
-
-    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
-        setattr(namespace, self.dest, values[0] if len(values) == 1 else values)
+    if "executor" in names:
+        add(
+            "--executor", default="local", metavar="KIND", help="local (worker processes here, default) or ray: docs/sweeps.md"
+        )
+        add("--address", metavar="WHERE", help="Ray cluster: auto, host:port or ray://host:port (one is started without it)")
+    if "trust" in names:
+        add("--trust", action="store_true", help="let zips run whatever is pickled in them, see docs/security.md")
+    if "overwrite" in names:
+        add("--overwrite", action="store_true", help="replace existing files")
+    if "progress" in names:
+        add("-P", "--progress", help="progress bar (in a terminal: yes)", **YES_OR_NO)
 
 
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:

@@ -1,46 +1,19 @@
 """What one training run is asked to do, beyond its settings."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Any
 
-import torch as th
-from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt
+from pydantic import Field
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.seeds import check_seed
-from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.config import TrainingConfig
+from sb3_quad.training.options import JobOptions
 
 
-def _check_device(device: str) -> str:
-    """SB3 itself takes the CPU, without a word, where there is no CUDA."""
-    if device.startswith("cuda") and not th.cuda.is_available():
-        raise ConfigError(f"device {device}: PyTorch finds no CUDA here; give cpu or auto")
-    return device
-
-
-class TrainingJob(Frozen):
-    """One run of the trainer. All its random numbers follow from ``seed``."""
+class TrainingJob(JobOptions):
+    """One run of the trainer."""
 
     config: TrainingConfig = Field(description="the settings")
-    log_folder: str = Field(default="logs", description="where run folders go")
-    seed: Annotated[int, AfterValidator(check_seed)] = Field(default=0, description="of policy, environments and exploration")
-    device: Annotated[str, AfterValidator(_check_device)] = Field(
-        default="cpu", description="cpu, cuda or auto; small networks are fastest on the cpu"
-    )
-    trained_agent: str | None = Field(default=None, description="zip whose policy and critic to start from")
-    eval_freq: int = Field(default=250_000, description="timesteps between evaluations; below 1 only one at the end")
-    eval_episodes: int = Field(default=48, description="episodes of one evaluation; below 1 none at all")
-    n_eval_envs: PositiveInt | None = Field(default=None, description="None: as many as episodes if batched, else 1")
-    eval_env_kwargs: dict[str, Any] | None = Field(default=None, description="put over env_kwargs in evaluations")
-    save_freq: int = Field(default=-1, description="timesteps between checkpoints; below 1 none")
-    snapshot_every: NonNegativeFloat = Field(default=60.0, description="seconds between snapshots to resume from; 0: none")
-    log_interval: PositiveInt = Field(default=1, description="rollouts between two lines of the log")
-    tensorboard_log: str | None = Field(default=None, description="folder for TensorBoard")
-    progress: bool = Field(default=False, description="whether to show a progress bar")
-    verbose: int = Field(default=0, description="as in SB3")
-    unique: bool = Field(default=False, description="add a UUID to the run folder's name")
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
         """The settings with the environments as evaluations have them, and ``changes`` to their keywords."""

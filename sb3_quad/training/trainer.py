@@ -84,7 +84,7 @@ def train(
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
-        run = claim_run(job.log_folder, config.algo, config.env_id, job.unique)
+        run = claim_run(job.log_folder, config.algo, config.env_id, job.uuid)
         with locked(run.path, "run folder"):
             run.write_yaml(config.settings, job.arguments() | made_with())
             on_start(run)

@@ -18,7 +18,7 @@ import torch
 import yaml
 from stable_baselines3.common.save_util import load_from_zip_file
 
-import sb3_quad.cli.commands.train
+import sb3_quad.cli.closing
 import sb3_quad.training.trim
 from sb3_quad.cli import main
 
@@ -135,7 +135,7 @@ def outcome(folder: Path) -> dict[str, object]:
 def campaign(folder: Path, kills: int, seed: int) -> int:
     """How many kills cost something."""
     for module, name, value in (
-        (sb3_quad.cli.commands.train, "FRESH_EPISODES", 4),
+        (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
         (sb3_quad.training.trim, "N_FLIGHTS", 4),
         (sb3_quad.training.trim, "N_HEADINGS", 4),
     ):

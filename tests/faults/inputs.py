@@ -21,7 +21,7 @@ from typing import Any
 import yaml
 from campaign import forked
 
-import sb3_quad.cli.commands.train
+import sb3_quad.cli.closing
 from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.cli.app import COMMANDS, make_parser
 from sb3_quad.evaluation.scenarios.scenario import Scenario
@@ -148,5 +148,5 @@ def campaign(folder: Path, count: int | None, seed: int) -> int:
 
 if __name__ == "__main__":
     target, asked, *more = sys.argv[1:]
-    sb3_quad.cli.commands.train.FRESH_EPISODES = 2
+    sb3_quad.cli.closing.FRESH_EPISODES = sb3_quad.cli.closing.PIPELINE_EPISODES = 2
     sys.exit(campaign(Path(target), None if asked == "all" else int(asked), int(more[0]) if more else 0) > 0)

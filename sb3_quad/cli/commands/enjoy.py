@@ -1,53 +1,121 @@
-"""``enjoy``: flights to look at, in a window, as a film or as poses in one picture."""
+"""Watch controllers fly: in PyBullet's window, as a film, or as poses in one picture; several side by side.
+
+examples:
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs          the latest run's agent, in a window
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
+  sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 -o recovery.mp4
+  sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
+  sb3-quad enjoy agent.zip --target 5 0 20 --force -20 -20 0 --torque -5 -5 -5 --at 2.5 --for 0.02 -o hit.mp4 --speed 0.5
+  sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml -n 3000 --no-render
+
+A controller is pid, geometric, the path of an SB3 zip or a run folder, or package.module:factory; name=… labels it.
+The first agent says which vehicle, task and observation all fly with, unless --env, --task, --scenario or --env-kwargs do.
+Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
+"""
 
 import argparse
 import io
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from PIL import Image as Pillow
-from rich.console import Console
-
-from sb3_quad.base.arrays import Image
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.arguments.enjoy import DEFAULT_ENV
-from sb3_quad.cli.output import progress_bar
-from sb3_quad.cli.parser import given
+from sb3_quad.cli.parser import BRIDGE, PAIRS, Parser, above_zero, add_common, given, natural, positive, whole
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.envs.rendering.window import has_display
-from sb3_quad.evaluation.controllers import ControllerSpec, build, parse_controllers
-from sb3_quad.show.episodes import Recording, Setting, fixed_setting, fly_all, scenario_setting
-from sb3_quad.show.film import FPS, check_film, film_frames, frame_times, show_in_window, write_film
-from sb3_quad.show.sequence import sequence
-from sb3_quad.simulation.checks import check_size
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.algorithms import get_algorithm
-from sb3_quad.training.runs import find_run
 
+LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects"
+DEFAULT_ENV = "QuadTargetTracking-v0"
+LAST = "last checkpoint"
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
+    parser.elsewhere = dict.fromkeys(LACKED.split(), BRIDGE.format("enjoy"))
+    parser.set_defaults(trained_agent=None)
+    parser.add_argument("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
+    task = add_flight_arguments(parser)
+    task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery, instead of --env")
+    task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of --env")
+    add, vector = parser.add_argument, {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+    add("-n", "--n-timesteps", type=positive, metavar="N", help="control steps, in as many episodes as needed (one episode)")
+    add("--no-render", action="store_true", help="only fly and print how it went")
+    add("--target", help="where to fly to, m", **vector)
+    add("--force", help="an external force, world frame, N", **vector)
+    add("--torque", help="an external torque, body frame, N m", **vector)
+    add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
+    add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
+    output = "write a film (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
+    add("-o", "--output", metavar="FILE", help=output)
+    add("--record", metavar="FILE", help="write a film, also beside a picture: .mp4 or .gif")
+    add("--sequence", metavar="FILE", help="write a picture, also beside a film: .png")
+    add("--times", nargs="+", type=float, metavar="S", help="times of the sequence's poses, s (wherever they do not overlap)")
+
+
+def add_flight_arguments(parser: Parser) -> Any:
+    """Add the flags of rl-zoo's ``enjoy.py`` for an agent and its episodes, and those of a film.
+
+    :return: the group of flags that say what is flown, one of which may be given.
+    """
+    add = parser.add_argument
+    add("--algo", help="algorithm of a trained agent, looked up in the log folder")
+    task = parser.add_mutually_exclusive_group()
+    task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
+    add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
+    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")
+    which = parser.add_mutually_exclusive_group()
+    best = {"dest": "which", "action": "store_const", "const": "best"}
+    which.add_argument("--load-best", help="the best agent of the evaluations", **best)
+    which.add_argument("--load-checkpoint", dest="which", type=whole, metavar="N", help="the checkpoint after N timesteps")
+    which.add_argument("--load-last-checkpoint", help=f"the {LAST}", **{**best, "const": LAST})
+    add("--n-envs", type=positive, default=1, metavar="N", help="episodes side by side, with consecutive seeds (1)")
+    add("--seed", type=natural, default=0, metavar="N", help="seed of the first episode (0); later ones count up")
+    actions = parser.add_mutually_exclusive_group()
+    actions.add_argument("--deterministic", action="store_true", help="fly the mean of a policy's actions (default)")
+    actions.add_argument("--stochastic", action="store_true", help="sample from a policy's actions")
+    add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
+    add("--size", type=_size, metavar="WxH", help="size of one controller's panel, pixels")
+    add("--speed", type=above_zero, default=1.0, metavar="X", help="playback speed of film and window; 0.5 is slow motion (1)")
+    add_common(parser, "trust", "overwrite", "progress")
+    return task
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text}: must be width and height in pixels, such as 640x480") from None
+    return width, height
 
 
 def run(options: argparse.Namespace) -> int:
     """Fly, show, print how it went. Returns the exit code."""
+    from rich.console import Console
+
+    from sb3_quad.show.episodes import fly_all
+    from sb3_quad.show.film import show_in_window
+
     if options.output:
         vars(options)["sequence" if options.output.lower().endswith(".png") else "record"] = options.output
     window = not (options.no_render or options.record or options.sequence)
     _check(options, window)
-    size = _size(options.size)
     setting, controllers = _setting(options)
     how = options.seed, options.n_timesteps, not options.stochastic, options.n_envs
     with Console(file=sys.stderr).status("flying"):
         episodes = list(fly_all(controllers, setting, *how))
-    _print_outcomes(episodes)
+    for number, episode in enumerate(episodes, 1):
+        for recording in episode:
+            end = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
+            head = f"episode {number}, {recording.name}" if len(episodes) > 1 else recording.name
+            print(f"{head}: {end} after {recording.times[-1]:.2f} s, reward {recording.reward:.2f}")
     if options.sequence:
-        _write_sequence(options, episodes[0], size)
+        _write_sequence(options, episodes[0])
     if options.record:
-        _write_film(options, episodes, size or (PANEL if len(episodes[0]) > 1 else SINGLE))
+        _write_film(options, episodes)
     if window:
-        show_in_window(episodes, *(size or SINGLE), options.speed)
+        show_in_window(episodes, *(options.size or SINGLE), options.speed)
     return 0
 
 
@@ -62,19 +130,22 @@ def known_environment(options: argparse.Namespace) -> str:
     return str(env_id)
 
 
-def chosen_agent(options: argparse.Namespace) -> ControllerSpec:
-    """The agent of record-video's ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
+def chosen_agent(options: argparse.Namespace) -> tuple[str, str]:
+    """Name and path of the agent of ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
-    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that flights to be shown lack.
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that enjoy does not have.
     """
+    from sb3_quad.training.algorithms import get_algorithm
+    from sb3_quad.training.runs import find_run
+
     if options.trained_agent is not None:
-        return ControllerSpec(Path(options.trained_agent).stem, options.trained_agent)
+        return Path(options.trained_agent).stem, options.trained_agent
     if not (Path(options.folder) / options.algo).is_dir():
-        get_algorithm(options.algo)  # says so if there is none of that name
+        get_algorithm(options.algo)  # raises if there is none of that name
     run = find_run(options.folder, options.algo, known_environment(options), options.exp_id)
     if isinstance(options.which, int):
         path = run.checkpoint(options.which)
-    elif options.which == "last checkpoint":
+    elif options.which == LAST:
         path = run.latest_checkpoint()
     else:
         path = run.best_model if options.which == "best" else run.result
@@ -85,39 +156,45 @@ def chosen_agent(options: argparse.Namespace) -> ControllerSpec:
     for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
         if settings.get(key):
             raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
-    return ControllerSpec(f"{options.algo} {path.name}", str(path))
+    return f"{options.algo} {path.name}", str(path)
 
 
 def _check(options: argparse.Namespace, window: bool) -> None:
-    """What can be refused before anything is flown."""
+    """Refuse what can be refused before anything is flown."""
+    from sb3_quad.envs.rendering.window import has_display
+    from sb3_quad.show.film import check_film
+    from sb3_quad.simulation.checks import check_size
+
     if not (options.controllers or options.algo or options.trained_agent):
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
-    if len(given(options, "env", "task", "scenario")) > 1:
-        raise ConfigError("--env, --task and --scenario each say what is flown; give one")
     if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
-    FlightSettings().with_changes(**options.env_kwargs)  # says what does not fit
-    if options.times is not None and not options.sequence:
-        raise ConfigError("--times goes with --sequence")
-    if options.times is not None and min(options.times) < 0:
-        raise ConfigError("--times: must not be negative")
+    if options.times is not None and (not options.sequence or min(options.times) < 0):
+        raise ConfigError("--times goes with --sequence, and must not be negative")
+    if options.size:
+        check_size(*options.size)
+    if options.sequence and Path(options.sequence).suffix.lower() != ".png":
+        raise ConfigError(f"--sequence {options.sequence}: must end in .png")
     if options.record:
         check_film(Path(options.record))
-        refuse_existing(options.record, options.overwrite)
-    if options.sequence:
-        if Path(options.sequence).suffix.lower() != ".png":
-            raise ConfigError(f"--sequence {options.sequence}: must end in .png")
-        refuse_existing(options.sequence, options.overwrite)
+    for file in filter(None, (options.record, options.sequence)):
+        refuse_existing(file, options.overwrite)
     if window and not has_display():
         raise ConfigError("no display to open a window on (DISPLAY is not set); --record flight.mp4 makes a film instead")
 
 
-def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
-    """What is flown, and who flies, by label."""
-    env_id = known_environment(options)
-    chosen = [chosen_agent(options)] if options.algo or options.trained_agent else []
-    specs = {spec.label: spec for spec in [*chosen, *parse_controllers(options.controllers)]}
-    agents = [spec.own for spec in specs.values() if spec.own is not None]  # the first says how all are flown
+def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
+    """What is flown, a :class:`~sb3_quad.show.episodes.Setting`, and who flies, by label."""
+    from sb3_quad.cli.output import warn
+    from sb3_quad.evaluation.controllers import ControllerSpec, build, parse_controllers
+    from sb3_quad.show.episodes import fixed_setting, scenario_setting
+    from sb3_quad.simulation.settings import FlightSettings
+
+    env_id, specs = known_environment(options), parse_controllers(options.controllers)
+    if options.algo or options.trained_agent:
+        specs.insert(0, ControllerSpec(*chosen_agent(options)))
+        print(f"agent: {specs[0].spec}")
+    agents = [spec.own for spec in specs if spec.own is not None]  # the first says how all are flown
     push = given(options, "force", "torque", "start", "duration")
     if options.scenario is not None:
         if options.env_kwargs or options.target or push:
@@ -128,57 +205,33 @@ def _setting(options: argparse.Namespace) -> tuple[Setting, dict[str, Any]]:
         task = options.task or (ENVIRONMENTS[env_id] if options.env and not options.algo else kept.task)
         changes = {"task": task} | ({} if task == kept.task else {"task_kwargs": None}) | options.env_kwargs
         setting = fixed_setting(kept.with_changes(**changes), options.target, push)
-    for spec in chosen:
-        print(f"agent: {spec.spec}")
-    controllers = {label: build(spec, setting.vehicle) for label, spec in specs.items()}
-    for line in filter(None, (spec.notice(setting.vehicle) for spec in specs.values())):
-        print(f"warning: {line}", file=sys.stderr)
-    own = {
-        label: {name: value for name, value in spec.observed.items() if name not in options.env_kwargs}
-        for label, spec in specs.items()
-    }
+    controllers, own = {}, {}
+    for spec in specs:
+        warn(spec.notice(setting.vehicle))
+        controllers[spec.label] = build(spec, setting.vehicle)
+        own[spec.label] = {name: value for name, value in spec.observed.items() if name not in options.env_kwargs}
     return setting._replace(own=own), controllers
 
 
-def _write_sequence(options: argparse.Namespace, episode: Sequence[Recording], size: tuple[int, int] | None) -> None:
-    with Console(file=sys.stderr).status("drawing"):
-        picture = sequence(episode, options.times, size)
+def _write_sequence(options: argparse.Namespace, episode: Sequence[Any]) -> None:
+    from PIL import Image
+    from rich.console import Console
+
+    from sb3_quad.show.sequence import sequence
+
     buffer = io.BytesIO()
-    Pillow.fromarray(picture).save(buffer, format="png", optimize=True)
+    with Console(file=sys.stderr).status("drawing"):
+        Image.fromarray(sequence(episode, options.times, options.size)).save(buffer, format="png", optimize=True)
     write_bytes(options.sequence, buffer.getvalue())
     print(f"saved {options.sequence}")
 
 
-def _write_film(options: argparse.Namespace, episodes: Sequence[Sequence[Recording]], size: tuple[int, int]) -> None:
-    """Draw flights and write them as a film, with a progress bar; ``size`` of a panel, pixels."""
+def _write_film(options: argparse.Namespace, episodes: Sequence[Sequence[Any]]) -> None:
+    from sb3_quad.cli.output import with_progress
+    from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
+
+    size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
-
-    def frames() -> Iterator[Image]:
-        show(0, total, "frames")
-        drawn = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
-        for number, frame in enumerate(drawn, 1):
-            yield frame
-            show(number, total, "frames")
-
-    with progress_bar(options.progress) as show:
-        write_film(Path(options.record), frames())
+    frames = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
+    write_film(Path(options.record), with_progress(frames, total, "frames", options.progress))
     print(f"saved {options.record}, {total / FPS:.1f} s")
-
-
-def _print_outcomes(episodes: Sequence[Sequence[Recording]]) -> None:
-    for number, episode in enumerate(episodes, 1):
-        for recording in episode:
-            how = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
-            head = f"episode {number}, {recording.name}" if len(episodes) > 1 else recording.name
-            print(f"{head}: {how} after {recording.times[-1]:.2f} s, reward {recording.reward:.2f}")
-
-
-def _size(text: str) -> tuple[int, int] | None:
-    if not text:
-        return None
-    try:
-        width, height = (int(part) for part in text.lower().split("x"))
-    except ValueError:
-        raise ConfigError(f"--size {text}: must be width and height in pixels, such as 640x480") from None
-    check_size(width, height)
-    return width, height

@@ -1,21 +1,61 @@
-"""``evaluate``: any number of controllers through a suite of scenarios, side by side on the same episodes."""
+"""Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv.
+
+controllers:
+  pid, geometric          the experts
+  path/to/agent.zip       an agent of any Stable-Baselines3 algorithm, or the run folder of one
+  package.module:factory  a function that takes the vehicle and returns a controller
+  name=…                  any of these, under that name in the tables
+
+examples:
+  sb3-quad evaluate pid geometric                              the thesis's chapter 4 for both experts
+  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip" --suite thesis -o evaluations/mine
+  sb3-quad evaluate pid agent.zip --suite quick                a quick look, in less than a minute
+  sb3-quad evaluate agent.zip --suite robustness --workers 2
+  sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
+  sb3-quad evaluate agent.zip --scaling adaptive --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10
+  sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
+  sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
+  sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
+
+Results are kept in a folder: the same command again flies only what is missing, and further controllers are added.
+"""
 
 import argparse
 import sys
 import time
 
 from sb3_quad.base.errors import MissingExtra
-from sb3_quad.cli.arguments.evaluate import DEFAULT_FOLDER
-from sb3_quad.cli.commands.report import report
-from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.evaluation.controllers import parse_controllers
-from sb3_quad.evaluation.evaluate import evaluate
-from sb3_quad.evaluation.metric_tables import overview
-from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.cli.parser import YES_OR_NO, Parser, add_common, whole
+
+DEFAULT_FOLDER = "evaluations"
+
+
+def add_arguments(parser: Parser) -> None:
+    add = parser.add_argument
+    add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
+    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, quadcopters, quick, or a YAML file")
+    add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
+    add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
+    add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
+    add("--seed", type=whole, metavar="N", help="seed of each scenario, instead of its own")
+    add("--vehicle", metavar="V", help="vehicle for all, by name or YAML file (each agent's own, where the suite names none)")
+    add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
+    add("--scaling", default="none", metavar="KIND", help="none (default), or adaptive: the thesis's μ and α (4.3.1)")
+    add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
+    add("--overwrite", action="store_true", help="replace results of these controllers from other settings")
+    add("--report", default=True, help="update report.html and its plots (yes)", **YES_OR_NO)
+    add_common(parser, "executor", "trust", "progress")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly, print the table, tell where everything is. Returns the exit code."""
+    """Fly, print the table, print where everything is. Returns the exit code."""
+    from sb3_quad.cli.commands.report import report
+    from sb3_quad.cli.output import console, progress_bar, warn
+    from sb3_quad.evaluation.controllers import parse_controllers
+    from sb3_quad.evaluation.evaluate import evaluate
+    from sb3_quad.evaluation.metric_tables import overview
+    from sb3_quad.evaluation.scenarios.load import load_suite
+
     suite = load_suite(options.suite).with_changes(options.scenario, options.episodes, options.seed, options.vehicle)
     controllers = parse_controllers(options.controllers, options.scaling)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
@@ -23,25 +63,20 @@ def run(options: argparse.Namespace) -> int:
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
         how = options.backend, options.workers, options.overwrite
-        results = evaluate(suite, controllers, folder, *how, show, _warn, options.executor, options.address)
-    flown = results.model_copy(update={"scenarios": list(suite.scenarios)})
-    labels = [spec.label for spec in controllers if any(entry.controller == spec.label for entry in results.entries)]
-    if labels:
-        console().print(overview(flown, labels))
-    if results.entries:
+        results = evaluate(suite, controllers, folder, *how, show, warn, options.executor, options.address)
+    asked, flown = {spec.label for spec in controllers}, {entry.controller for entry in results.entries}
+    if asked & flown:
+        labels = [spec.label for spec in controllers if spec.label in flown]
+        console().print(overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), labels))
+    if flown:
         print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
-    if options.report and results.entries:
+    if options.report and flown:
         try:
             report(folder, overwrite=True, pictures=True)
         except MissingExtra as error:
             print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
-    asked = {spec.label for spec in controllers}
     failures = [failure for failure in results.failures if failure.controller in asked]
     for failure in failures:
         where = "" if failure.scenario is None else f", scenario {failure.scenario}"
         print(f"failed: {failure.controller}{where}: {failure.message}", file=sys.stderr)
     return 1 if failures else 0
-
-
-def _warn(line: str) -> None:
-    print(f"warning: {line}", file=sys.stderr)

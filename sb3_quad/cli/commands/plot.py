@@ -1,4 +1,10 @@
-"""``plot``: learning curves of one or more runs as a picture."""
+"""Draw learning curves: success, reward and losses over timesteps and wall-clock time, with mean and range over seeds.
+
+examples:
+  sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
+  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
+  sb3-quad plot "PPO+BC=logs/ppo_bc/QuadStateRecovery-v0_*" --thesis state_recovery --show survival reward losses
+"""
 
 import argparse
 import glob
@@ -6,15 +12,40 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
-from sb3_quad.cli.arguments.plot import THESIS
-from sb3_quad.evaluation.learning_curves import read_curve
-from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.report.curves import plot_curves
-from sb3_quad.report.plots import picture
+from sb3_quad.cli.parser import Parser
+
+PANELS = ("success", "survival", "reward", "losses")
+THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}  # its scenarios by task
+
+
+def add_arguments(parser: Parser) -> None:
+    add = parser.add_argument
+    add("groups", nargs="+", metavar="NAME=PATTERN", help="an agent's name and its run folders; quote a *")
+    lines = "horizontal lines: success in %%, reward"
+    add("--line", action="append", default=[], type=_line, metavar="NAME:SUCCESS:REWARD", help=lines)
+    thesis = f"draw what the thesis prints of {', '.join(THESIS)} as horizontal lines"
+    add("--thesis", choices=[*THESIS], metavar="TASK", help=thesis)
+    add("--show", nargs="+", choices=PANELS, default=[], metavar="PANEL", help=f"of {', '.join(PANELS)} (success reward)")
+    add("--task", help="show the evaluations on this one of the runs' eval_tasks instead of on their own task")
+    add("--title", default="", help="title of the picture")
+    add("-o", "--output", default="curves.png", metavar="FILE", help="picture to write: .png, .svg or .pdf (curves.png)")
+
+
+def _line(text: str) -> tuple[str, dict[str, float]]:
+    try:
+        name, success, reward = text.split(":")
+        return name, {"success": float(success) / 100, "survival": float(success) / 100, "reward": float(reward)}
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:31.9:-16.1") from None
 
 
 def run(options: argparse.Namespace) -> int:
     """Read the runs, draw, write. Returns the exit code."""
+    from sb3_quad.evaluation.learning_curves import read_curve
+    from sb3_quad.evaluation.scenarios.load import load_suite
+    from sb3_quad.report.curves import plot_curves
+    from sb3_quad.report.plots import picture
+
     groups = {}
     for text in options.groups:
         name, separator, pattern = text.partition("=")
@@ -27,25 +58,12 @@ def run(options: argparse.Namespace) -> int:
     kind = Path(options.output).suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
         raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
-    lines = {**(_thesis(THESIS[options.thesis]) if options.thesis else {}), **dict(map(_line, options.line))}
+    lines = {}
+    if options.thesis:  # its success is our survival
+        for name, reference in load_suite("thesis").scenario(THESIS[options.thesis]).reference.items():
+            lines[f"thesis: {name}"] = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
     show = options.show or (["survival" if options.thesis else "success", "reward"])
-    figure = plot_curves(groups, lines, options.title, show)
-    write_bytes(options.output, picture(figure, kind, dpi=130))
+    curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
+    write_bytes(options.output, picture(curves, kind, dpi=130))
     print(f"saved {options.output}")
     return 0
-
-
-def _thesis(scenario: str) -> dict[str, dict[str, float]]:
-    """What the thesis prints of a scenario; its success is our survival."""
-    (found,) = (each for each in load_suite("thesis").scenarios if each.name == scenario)
-    printed = {"survival", "reward"}
-    known = {name: each.model_dump(include=printed, exclude_none=True) for name, each in found.reference.items()}
-    return {f"thesis: {name}": heights for name, heights in known.items() if heights}
-
-
-def _line(text: str) -> tuple[str, dict[str, float]]:
-    try:
-        name, success, reward = text.split(":")
-        return name, {"success": float(success) / 100, "survival": float(success) / 100, "reward": float(reward)}
-    except ValueError:
-        raise ConfigError(f"--line {text!r}: give NAME:SUCCESS:REWARD, such as expert:31.9:-16.1") from None

@@ -1,4 +1,16 @@
-"""``sweep``: many trainings, compared on the same fresh episodes."""
+"""Train many seeds and settings, here or on a Ray cluster; compare all on the same fresh episodes.
+
+examples:
+  sb3-quad sweep my_sweep.yaml --dry-run                   lists the runs
+  sb3-quad sweep my_sweep.yaml --workers 4                 four worker processes, one core each
+  sb3-quad sweep pid                                       a sweep of the package: nominal, pid, random_worlds, recovery
+  sb3-quad sweep --seed 0 1 2 --conf-file imitation.yml two_stage.yml
+  sb3-quad sweep --seed 0 1 2 --algo dagger --env QuadStateRecovery-v0 -n 240000 --suite quick
+  sb3-quad sweep my_sweep.yaml --executor ray --address auto
+  sb3-quad sweep --resume logs/sweep/my_sweep_1            goes on after Ctrl-C or a crash
+
+A folder is left: run folders, results.csv, results.json, report.md and report.html. The file's keys: docs/sweeps.md.
+"""
 
 import argparse
 import sys
@@ -7,67 +19,127 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError, MissingExtra
-from sb3_quad.base.files import locked
-from sb3_quad.base.imports import import_packages
-from sb3_quad.base.signals import StopSignals
-from sb3_quad.base.validate import validate
-from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
-from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.cli.parser import given
-from sb3_quad.executors import start_executor
-from sb3_quad.sweep.drive import execute
-from sb3_quad.sweep.expand import expand, suite_of
-from sb3_quad.sweep.folder import Plan, SweepFolder
-from sb3_quad.sweep.page import write_report
-from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.results import Found, evaluate, tables, write_results
-from sb3_quad.sweep.spec import SweepSpec, load_sweep
-from sb3_quad.training.pipeline import is_pipeline
-from sb3_quad.training.runs import claim_folder
+from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
+from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.training.options import JobOptions, SettingsOptions
 
-KEPT_BY_RESUME = (
-    *("sweep", "seed", "conf_file", "algo", "env", "n_timesteps", "hyperparams", "env_kwargs", "eval_freq", "eval_episodes"),
-    *("suite", "episodes", "storage"),
+JOB = (
+    "eval_env_kwargs",
+    "trained_agent",
+    "n_eval_envs",
+    "device",
+    "eval_freq",
+    "eval_episodes",
+    "save_freq",
+    "snapshot_every",
 )
-LISTS = ("conf_file", "algo")  # flags that take several values: a grid, where they do
+
+
+def add_arguments(parser: Parser) -> None:
+    add = parser.add_argument
+    add("sweep", nargs="?", metavar="SWEEP", help="YAML file, or a name; the flags below go before what it says")
+    add("--seed", nargs="+", type=seed, metavar="N", help="seeds of each configuration (0)")
+    add("-conf", "--conf-file", nargs="+", metavar="FILE", help="settings files, of single runs or pipelines (imitation.yml)")
+    add("--algo", nargs="+", help="algorithms of single runs (dagger)")
+    add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
+    add_fields(parser, SettingsOptions)
+    add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
+    add_fields(parser, JobOptions, *JOB, "log_folder", trained_agent={"type": agent_path})
+    add("--suite", metavar="SUITE", help="what the agents fly in the end (fresh episodes of both tasks, 240 each)")
+    add("--episodes", type=positive, metavar="N", help="episodes of each scenario in the end")
+    add("--gym-packages", nargs="+", metavar="MODULE", help="modules that register further environments")
+    add("--workers", type=positive, metavar="N", help="runs side by side (the cores)")
+    add("--storage", metavar="WHERE", help="folder or URL through which run folders travel from Ray's workers")
+    add("--dry-run", action="store_true", help="list the runs, train nothing")
+    add("--resume", metavar="FOLDER", help="go on with a sweep: what is not finished in its folder")
+    add_common(parser, "executor", "trust", "progress")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Train, compare, tell where everything is. Returns the exit code."""
+    """Train, compare, print where everything is. Returns the exit code."""
+    from sb3_quad.base.imports import import_packages
+    from sb3_quad.sweep.expand import expand, suite_of
+    from sb3_quad.sweep.folder import Plan, SweepFolder
+    from sb3_quad.sweep.spec import SweepSpec
+
     if options.resume is not None:
-        for name in given(options, *KEPT_BY_RESUME):
+        for name in given(options, "sweep", *SweepSpec.model_fields, "suite", "episodes"):
             raise ConfigError(f"--resume keeps the sweep's own settings; leave --{name.replace('_', '-')} away")
         place = SweepFolder(options.resume)
-        return run_sweep(options, place.read(), place)
-    return run_spec(options, spec_of(options))
-
-
-def run_spec(options: argparse.Namespace, spec: SweepSpec) -> int:
-    """A new sweep, or with ``--dry-run`` the list of its runs. Returns the exit code."""
+        return _go_on(options, place.read(), place)
+    spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
     plan = Plan(spec=spec, runs=tuple(expand(spec)), suite=suite_of(spec))
-    if options.dry_run:
-        for each in plan.runs:
-            print(f"{each.name}: {_what(each)}")
-        print(f"{_count(len(plan.runs), 'run')} of {_count(len(plan.configurations), 'configuration')}")
-        return 0
-    return run_sweep(options, plan, None)
+    if not options.dry_run:
+        return _go_on(options, plan, None)
+    for each in plan.runs:
+        stages = [] if each.pipeline is None else [f"{stage.algo} on {stage.env}" for stage in each.pipeline.stages]
+        single = f"{each.algo} on {each.env}, {each.settings.get('n_timesteps', 0):,} timesteps"
+        print(f"{each.name}: " + (f"pipeline {each.stem}: {', '.join(stages)}" if stages else single))
+    print(f"{_count(len(plan.runs), 'run')} of {_count(len(plan.configurations), 'configuration')}")
+    return 0
 
 
-def run_sweep(options: argparse.Namespace, plan: Plan, place: SweepFolder | None) -> int:
+def _spec(options: argparse.Namespace) -> Any:
+    """The :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line: a file's, with the flags over it."""
+    from sb3_quad.base.validate import validate
+    from sb3_quad.sweep.spec import SweepSpec, load_sweep
+
+    data: dict[str, Any] = {"name": "sweep"}
+    if options.sweep is not None:
+        data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
+    flags = given(options, *SweepSpec.model_fields)
+    for name in {"hyperparams", "env_kwargs"} & flags.keys():
+        flags[name] = {**data.get(name, {}), **flags[name]}
+    grid = {key: values for key, values in data.get("grid", {}).items() if key not in flags}
+    for name in ("conf_file", "algo"):
+        if isinstance(values := flags.get(name), list):
+            data.pop(name, None)
+            flags.pop(name)
+            (grid if len(values) > 1 else flags)[name] = values if len(values) > 1 else values[0]
+    evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
+    return validate(
+        SweepSpec, _with_defaults({**data, **flags, "grid": grid, "evaluation": evaluation}), options.sweep or "command line"
+    )
+
+
+def _with_defaults(data: Mapping[str, Any]) -> Mapping[str, Any]:
+    """A sweep that trains, where nothing is said, what ``train`` does: its pipeline, or its algorithm in its environment."""
+    from sb3_quad.training.pipeline import is_pipeline
+
+    said = {**data, **data["grid"]}
+    files = said.get("conf_file") or []
+    if data.get("configurations") or any(is_pipeline(file) for file in ([files] if isinstance(files, str) else files)):
+        return data
+    if not said.keys() & {"conf_file", "algo", "env"}:
+        return {**data, "conf_file": DEFAULT_PIPELINE}
+    return {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV, **data}
+
+
+def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
     """Do what is left of a sweep. Returns the exit code.
 
-    :param place: its folder; None: a new one.
+    :param plan: a :class:`~sb3_quad.sweep.folder.Plan`.
+    :param place: the :class:`~sb3_quad.sweep.folder.SweepFolder`; None: a new one.
     """
-    start = time.perf_counter()
-    needs, workers = plan.spec.resources, options.workers or available_cpus()
-    workers = min(workers, len(plan.runs))
+    from sb3_quad.base.cores import available_cpus
+    from sb3_quad.base.files import locked
+    from sb3_quad.base.signals import StopSignals
+    from sb3_quad.cli.output import console, progress_bar
+    from sb3_quad.executors import start_executor
+    from sb3_quad.sweep.drive import execute
+    from sb3_quad.sweep.folder import SweepFolder
+    from sb3_quad.sweep.page import write_report
+    from sb3_quad.sweep.results import evaluate, tables, write_results
+    from sb3_quad.training.runs import claim_folder
+
+    start, needs = time.perf_counter(), plan.spec.resources
+    workers = min(options.workers or available_cpus(), len(plan.runs))
     with start_executor(options.executor, workers, options.address, needs.num_cpus, needs.num_gpus) as executor:
         if place is None:
-            name = plan.spec.name or "sweep"
-            place = SweepFolder(claim_folder(Path(options.log_folder) / "sweep", name))
+            place = SweepFolder(claim_folder(Path(options.log_folder or "logs") / "sweep", plan.spec.name or "sweep"))
             place.write(plan)
         where = f"{executor.workers} side by side, executor {options.executor}"
         print(f"sweep {place.path}: {_count(len(plan.runs), 'run')}, {where}")
@@ -77,76 +149,24 @@ def run_sweep(options: argparse.Namespace, plan: Plan, place: SweepFolder | None
             executor.close()
             found = evaluate(plan, records)
             write_results(place, plan, records, found)
-            code = _finish(place, plan, records, found, time.perf_counter() - start)
-    if signals.received is not None:
-        print(f"to go on: --resume {place.path}")
-        return signals.exit_code
-    return code
-
-
-def spec_of(options: argparse.Namespace) -> SweepSpec:
-    """The sweep that a command line describes: a file's, with the flags over it.
-
-    :raises ConfigError: see :func:`~sb3_quad.sweep.spec.load_sweep`.
-    """
-    data: dict[str, Any] = {}
-    if options.sweep is not None:
-        data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
-    flags = given(options, "seed", "env", "n_timesteps", "eval_freq", "eval_episodes", "storage")
-    for name in ("hyperparams", "env_kwargs"):
-        if getattr(options, name) is not None:
-            flags[name] = {**data.get(name, {}), **getattr(options, name)}
-    grid = {key: value for key, value in data.get("grid", {}).items() if key not in flags}
-    for name in LISTS:
-        values = getattr(options, name)
-        if values is not None:
-            grid.pop(name, None)
-            data.pop(name, None)
-            if len(values) > 1:
-                grid[name] = values
-            else:
-                flags[name] = values[0]
-    evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
-    whole = {**data, **flags, "grid": grid, "evaluation": evaluation}
-    return validate(SweepSpec, with_defaults(whole), options.sweep or "command line")
-
-
-def with_defaults(data: Mapping[str, Any]) -> dict[str, Any]:
-    """What ``train`` trains where nothing is said: its pipeline, or its algorithm in its environment."""
-    whole, grid = {"name": "sweep", **data}, data.get("grid", {})
-    if whole.get("configurations"):
-        return whole
-    files = grid.get("conf_file", [whole["conf_file"]] if whole.get("conf_file") else [])
-    if not files and not any(key in whole or key in grid for key in ("algo", "env")):
-        return {**whole, "conf_file": DEFAULT_PIPELINE}
-    if isinstance(files, list) and not any(is_pipeline(file) for file in files):
-        missing = {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV}
-        whole |= {key: value for key, value in missing.items() if key not in whole and key not in grid}
-    return whole
-
-
-def _finish(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, seconds: float) -> int:
-    """Print the tables, write the report, tell what failed. Returns the exit code."""
-    if found.groups:
-        shown = tables(found)
-        for table in (table for each in shown.values() for table in each):
-            console().print(table)
-        try:
-            write_report(place, plan, records, found, shown)
-        except MissingExtra as error:
-            print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
+            if found.groups:
+                shown = tables(found)
+                for table in (table for each in shown.values() for table in each):
+                    console().print(table)
+                try:
+                    write_report(place, plan, records, found, shown)
+                except MissingExtra as error:
+                    print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
     failures = [record for record in records.values() if record.state == "failed"]
-    print(f"{found.n_finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed; {seconds:.1f} s")
+    finished = f"{found.n_finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
+    print(f"{finished}; {time.perf_counter() - start:.1f} s")
     print(f"saved in {place.path}: results.csv, results.json, runs/" + (", report.md, report.html" if found.groups else ""))
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
+    if signals.received is not None:
+        print(f"to go on: --resume {place.path}")
+        return signals.exit_code
     return 1 if failures else 0
-
-
-def _what(each: Any) -> str:
-    if each.pipeline is not None:
-        return f"pipeline {each.stem}: " + ", ".join(f"{stage.algo} on {stage.env}" for stage in each.pipeline.stages)
-    return f"{each.algo} on {each.env}, {each.settings['n_timesteps']:,} timesteps"
 
 
 def _count(number: int, noun: str) -> str:

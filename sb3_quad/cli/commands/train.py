@@ -1,94 +1,129 @@
-"""``train``: one training run, and its agent beside the expert at the end; or a pipeline of several."""
+"""Train an agent. Without arguments: DAgger in random worlds, from the geometric expert that is told the truth.
+
+examples:
+  sb3-quad train                                          imitation in random worlds, in the batched environment
+  sb3-quad train --conf-file two_stage.yml                the same, then PPO with a cloning term
+  sb3-quad train --conf-file nominal/two_stage.yml        both stages for one vehicle in still air
+  sb3-quad train --conf-file pid/two_stage.yml            both stages from the PID expert
+  sb3-quad train --conf-file thesis/two_stage.yml         the thesis's recipe as it prints it; hours
+  sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
+  sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
+  sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
+  sb3-quad train --seed 0 1 2                             three seeds side by side, one table: a sweep
+  sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
+  sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
+  sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadStateRecovery-v0_1/trimmed_model.zip
+  sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
+  sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
+"""
 
 import argparse
 import time
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from sb3_quad.algorithms.networks import share_out
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.imports import import_packages
-from sb3_quad.base.seeds import seed_for
-from sb3_quad.base.validate import validate
-from sb3_quad.cli.arguments.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
-from sb3_quad.cli.compare import agent_and_expert, print_tables
-from sb3_quad.cli.next_commands import print_next
-from sb3_quad.cli.output import console, shows_progress
-from sb3_quad.cli.parser import given
-from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
-from sb3_quad.controllers.zips import load_model
-from sb3_quad.training.config import TrainingConfig, load_config
-from sb3_quad.training.job import TrainingJob, describe
-from sb3_quad.training.pipeline import (
-    REFERENCE,
-    PipelineResult,
-    is_pipeline,
-    is_pipeline_run,
-    load_pipeline,
-    resume_pipeline,
-    run_pipeline,
-    with_reference,
-    with_settings,
-)
-from sb3_quad.training.runs import open_run
-from sb3_quad.training.trainer import TrainingResult, resume, train
+from sb3_quad.cli.parser import BRIDGE, PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.training.options import JobOptions, SettingsOptions
 
+DEFAULT_PIPELINE = "imitation.yml"
+DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
+SEARCH = "is of rl-zoo's search for hyperparameters, here a command of its own: sb3-quad tune --help, docs/tune.md"
+ELSEWHERE = {
+    SEARCH: "-optimize --optimize-hyperparameters --n-trials --max-total-trials --sampler --pruner --n-startup-trials "
+    "--n-evaluations --storage --study-name --n-jobs --trial-id --no-optim-plots --optimization-log-path",
+    BRIDGE.format("train"): "--track --wandb-project-name --wandb-entity --wandb-group -tags --wandb-tags "
+    "--save-replay-buffer --truncate-last-trajectory",
+}
+"""By what to call instead, flags of rl-zoo's ``train.py`` that ours lacks."""
 KEPT_BY_RESUME = (
-    *("algo", "env", "conf_file", "n_timesteps", "n_envs", "vec_env", "expert", "hyperparams", "env_kwargs"),
-    *("eval_env_kwargs", "trained_agent", "log_folder", "seed"),
+    *("algo", "env", "conf_file", "hyperparams", "eval_env_kwargs", "trained_agent", "log_folder", "seed", "reference"),
+    *SettingsOptions.model_fields,
 )
-FRESH_EPISODES = 960  # in each table of a pipeline
-THESIS_COLUMNS = ("expert", "IL-agent", "RL-agent", REFERENCE.name)
+NOT_OF_SWEEPS = ("resume", "reference", "uuid", "tensorboard_log", "num_threads", "verbose", "log_interval")
+
+
+def add_settings(parser: Parser) -> None:
+    """Add the flags for what is trained, which ``tune`` has as well."""
+    parser.elsewhere = {flag: place for place, flags in ELSEWHERE.items() for flag in flags.split()}
+    add = parser.add_argument
+    add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
+    add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
+    add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
+    add_fields(parser, SettingsOptions)
+    add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
+    add_fields(
+        parser, JobOptions, "eval_env_kwargs", "trained_agent", "n_eval_envs", "device", trained_agent={"type": agent_path}
+    )
+    add("--num-threads", type=positive, metavar="N", help="threads (the cores; one where PyTorch computes)")
+    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
+    add_common(parser, "trust", "progress")
+
+
+def add_arguments(parser: Parser) -> None:
+    """Add the flags of rl-zoo's ``train.py``, with their meanings."""
+    add_settings(parser)
+    add = parser.add_argument
+    several = "seed (0); negative: a random one, recorded in args.yml; several: a run each, compared, as sweep does"
+    add("--seed", type=seed, nargs="+", metavar="N", help=several)
+    add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
+    add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose")
+    add(
+        "--reference", action="store_true", default=None, help="with a pipeline: also PPO alone on the same budget, to compare"
+    )
+    add("--resume", metavar="RUN_FOLDER", help="continue an interrupted or killed run with all its settings")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Train, compare, tell where everything is. Returns the exit code."""
-    if isinstance(options.seed, list):
+    """Train, compare, print where everything is. Returns the exit code."""
+    from sb3_quad.base.validate import validate
+    from sb3_quad.cli.closing import close_pipeline, close_run
+    from sb3_quad.cli.output import shows_progress
+    from sb3_quad.training import pipeline as stages
+    from sb3_quad.training.job import TrainingJob, describe
+    from sb3_quad.training.trainer import resume, train
+
+    seeds = vars(options)["seed"] or []
+    if len(seeds) > 1:
         return _sweep(options)
+    options.seed = seeds[0] if seeds else None
     prepare(options)
     start = time.perf_counter()
-    arguments = {**given(options, *TrainingJob.model_fields), "progress": shows_progress(options.progress)}
+    arguments = {**given(options, *JobOptions.model_fields), "progress": shows_progress(options.progress)}
     if options.resume is not None:
-        for name in [*given(options, *KEPT_BY_RESUME), *["reference"] * options.reference]:
+        for name in given(options, *KEPT_BY_RESUME):
             raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
-        folder = Path(options.resume)
-        if is_pipeline_run(folder):
-            return _finish_stages(resume_pipeline(folder, **arguments), start)
-        return _finish(resume(options.resume, **arguments))
-    arguments["unique"] = options.uuid
+        if stages.is_pipeline_run(Path(options.resume)):
+            finished = stages.resume_pipeline(Path(options.resume), **arguments)
+            return close_pipeline(finished, time.perf_counter() - start)
+        return close_run(resume(options.resume, **arguments))
     conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
-    if conf_file is not None and is_pipeline(conf_file):
+    if conf_file is not None and stages.is_pipeline(conf_file):
         for flag, value in (("-n", options.n_timesteps), ("-i", options.trained_agent)):
             if value is not None:
                 own = f"a pipeline's stages have their own in {conf_file}"
                 raise ConfigError(f"{flag} goes with a single run (--algo, --env); {own}")
-        pipeline = with_settings(load_pipeline(conf_file), _changed_settings(options))
-        pipeline = with_reference(pipeline) if options.reference else pipeline
-        return _finish_stages(run_pipeline(pipeline, arguments, Path(conf_file).stem), start)
+        pipeline = stages.with_settings(stages.load_pipeline(conf_file), changed_settings(options))
+        pipeline = stages.with_reference(pipeline) if options.reference else pipeline
+        finished = stages.run_pipeline(pipeline, arguments, Path(conf_file).stem)
+        return close_pipeline(finished, time.perf_counter() - start)
     if options.reference:
         raise ConfigError("--reference goes with a pipeline, such as train without --algo and --env")
     job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
     print(describe(job))
-    return _finish(train(job))
+    return close_run(train(job))
 
 
 def _sweep(options: argparse.Namespace) -> int:
-    """Several seeds, one configuration. Returns the exit code."""
-    from sb3_quad.cli.commands import sweep  # only where it is asked for
-    from sb3_quad.sweep.spec import SweepSpec
+    """Train one configuration with several seeds, by ``sweep`` with its defaults. Returns the exit code."""
+    from sb3_quad.cli.commands import sweep
 
-    for name in ("resume", "reference", "uuid", "tensorboard_log", "num_threads", "verbose", "log_interval"):
-        if getattr(options, name):
-            raise ConfigError(f"--{name.replace('_', '-')} goes with one seed; several make a sweep, docs/sweeps.md")
-    names = ("algo", "env", "conf_file", "trained_agent", "seed", "hyperparams", "n_timesteps", "n_envs", "vec_env", "expert")
-    others = ("env_kwargs", "eval_env_kwargs", "device", "eval_freq", "eval_episodes", "n_eval_envs", "save_freq")
-    data = {"name": "train", **given(options, *names, *others, "snapshot_every"), "gym_packages": options.gym_packages}
-    spec = validate(SweepSpec, sweep.with_defaults(data), "command line")
-    defaults = {"dry_run": False, "workers": None, "executor": "local", "address": None}
-    options.log_folder = options.log_folder or "logs"
-    return sweep.run_spec(argparse.Namespace(**{**vars(options), **defaults}), spec)
+    for name in given(options, *NOT_OF_SWEEPS):
+        raise ConfigError(f"--{name.replace('_', '-')} goes with one seed; several make a sweep, docs/sweeps.md")
+    defaults = {"sweep": None, "name": "train", "dry_run": False, "workers": None, "executor": "local", "address": None}
+    return sweep.run(argparse.Namespace(**{**vars(options), **defaults}))
 
 
 def prepare(options: argparse.Namespace) -> None:
@@ -96,6 +131,11 @@ def prepare(options: argparse.Namespace) -> None:
 
     :raises ConfigError: a module that cannot be imported.
     """
+    import torch
+
+    from sb3_quad.algorithms.networks import share_out
+    from sb3_quad.base.imports import import_packages
+
     import_packages(options.gym_packages, "--gym-packages")
     if options.num_threads is None:
         share_out()
@@ -103,47 +143,13 @@ def prepare(options: argparse.Namespace) -> None:
         torch.set_num_threads(options.num_threads)
 
 
-def make_config(options: argparse.Namespace) -> TrainingConfig:
-    """The settings that a command line describes."""
-    algo, env_id = options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV
-    return load_config(algo, env_id, options.conf_file, _changed_settings(options))
+def make_config(options: argparse.Namespace) -> Any:
+    """The :class:`~sb3_quad.training.config.TrainingConfig` that a command line describes."""
+    from sb3_quad.training.config import load_config
+
+    return load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, changed_settings(options))
 
 
-def _changed_settings(options: argparse.Namespace) -> dict[str, Any]:
-    return {**(options.hyperparams or {}), **given(options, "n_timesteps", "n_envs", "vec_env", "expert", "env_kwargs")}
-
-
-def _finish(result: TrainingResult) -> int:
-    """Print the table of a single run's agent, tell where everything is. Returns the exit code."""
-    if result.exit_code != 0:
-        return result.exit_code
-    told = f"trained in {result.seconds:.1f} s"
-    if result.job.config.task is not None:
-        start = time.perf_counter()
-        console().print(agent_and_expert(result.job, result.model))
-        told += f", flown for this table in {time.perf_counter() - start:.1f} s"
-    print(told)
-    print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
-    print_next(result.run)
-    return 0
-
-
-def _finish_stages(result: PipelineResult, start: float) -> int:
-    """Print both tasks' tables, tell where everything is. Returns the exit code.
-
-    :param start: when the pipeline began, s.
-    """
-    if result.exit_code != 0:
-        return result.exit_code
-    seconds, config = time.perf_counter() - start, result.job.config
-    times = {name: entry.seconds for name, entry in result.stages.items()}
-    controllers = {"expert": resolve_expert(config.expert or DEFAULT_EXPERT, result.job.flight_settings.vehicle)}
-    controllers |= {name: load_model(entry.agent) for name, entry in result.stages.items()}
-    how = result.job.flight_settings.in_any_task()
-    print_tables(controllers, how, FRESH_EPISODES, seed_for("table", result.job.seed), THESIS_COLUMNS)
-    print("; ".join(f"{name}: {value:.0f} s" for name, value in times.items()) + f"; in all: {seconds:.0f} s")
-    for name, entry in result.stages.items():
-        print(f"{name}: {entry.agent}")
-    print(f"saved in {result.folder}")
-    print_next(open_run([entry for name, entry in result.stages.items() if name != REFERENCE.name][-1].run))
-    return 0
+def changed_settings(options: argparse.Namespace) -> dict[str, Any]:
+    """What a command line puts over a settings file."""
+    return {**(options.hyperparams or {}), **given(options, *SettingsOptions.model_fields)}

@@ -1,4 +1,17 @@
-"""``tune``: a search for an algorithm's hyperparameters."""
+"""Search for hyperparameters: train with one choice after another, and write the best as a settings file.
+
+examples:
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30               around zoo_configs/dagger.yml
+  sb3-quad tune --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip -n 3e6
+  sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler random --pruner none --seed 1
+  sb3-quad tune --algo dagger --storage logs/my_study.log           again or in another terminal: continues that study
+  sb3-quad tune --algo dagger --storage sqlite:///study.db --study-name noise_free --env-kwargs noise:0
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30 --workers 4   four trials side by side
+  sb3-quad tune --algo dagger --search-space my_space.yml --hyperparams n_epochs:4
+  sb3-quad train --algo dagger --env QuadTargetTracking-v0 --conf-file logs/tune/dagger/QuadTargetTracking-v0_1/best.yml
+
+The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. Needs: pip install '.[tune]' from a clone.
+"""
 
 import argparse
 import sys
@@ -6,25 +19,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
-
-from optuna.trial import FrozenTrial
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError, WorkerDied
 from sb3_quad.base.signals import StopSignals
-from sb3_quad.base.validate import validate
-from sb3_quad.cli.commands.train import make_config, prepare
-from sb3_quad.cli.compare import agent_and_expert
-from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.cli.parser import given
-from sb3_quad.controllers.zips import load_model
-from sb3_quad.evaluation.tables import text_table
-from sb3_quad.executors import start_executor
-from sb3_quad.training.config import build_config
-from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.runs import claim_folder, file_name, open_run
-from sb3_quad.tuning.results import BEST, PLOT, TRIALS, in_words, settings_of, train_command, varied, write_plot, write_results
-from sb3_quad.tuning.search import ERROR, HOPELESS, REWARD, RUN, SUCCESS, Search, train_trial
-from sb3_quad.tuning.space import load_space
+from sb3_quad.cli.commands.train import add_settings, make_config, prepare
+from sb3_quad.cli.parser import Parser, add_common, given, natural, positive, seed, whole
 
 JOURNAL = "study.log"
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
@@ -32,8 +32,31 @@ STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
 SHOWN = 5  # trials in the table
 
 
+def add_arguments(parser: Parser) -> None:
+    """Add the flags of rl-zoo's ``train.py --optimize-hyperparameters``, with their meanings."""
+    add_settings(parser)
+    add = parser.add_argument
+    add("--n-trials", type=natural, default=500, metavar="N", help="trials of this process (500); 0: only write results")
+    add("--max-total-trials", type=positive, metavar="N", help="trials of the whole study, failed ones excluded (no limit)")
+    add("--workers", type=positive, default=1, metavar="N", help="trials side by side, one core each (1)")
+    add_common(parser, "executor")
+    add("--sampler", default="tpe", metavar="NAME", help="proposes the trials: tpe (default), random or cmaes")
+    add("--pruner", default="median", metavar="NAME", help="cuts poor trials short: median (default), halving or none")
+    add("--n-startup-trials", type=whole, default=10, metavar="N", help="random trials before sampler and pruner start (10)")
+    add("--n-evaluations", type=whole, default=10, metavar="N", help="evaluations per trial, for the pruner (10)")
+    add("--storage", metavar="WHERE", help="journal file, or URL of a database (study.log in the new folder)")
+    add("--study-name", metavar="NAME", help="name of the study in the storage (ALGO_ENV)")
+    add("--search-space", metavar="FILE", help="YAML file of what is varied (the package's, for the algorithm)")
+    add("-f", "--log-folder", default="logs", metavar="DIR", help="results go to DIR/tune/ALGO/ENV_N (logs)")
+    add("--seed", type=seed, metavar="N", help="seed of trainings and sampler (0); negative: a random one")
+    add("--eval-episodes", type=whole, metavar="N", help="episodes per evaluation (batch: 240, else 48)")
+
+
 def run(options: argparse.Namespace) -> int:
     """Search, report, write. Returns the exit code."""
+    from sb3_quad.cli.output import progress_bar
+    from sb3_quad.tuning.results import write_results
+
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
@@ -42,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
             done = count()
             show(next(done), options.n_trials, "trials")
 
-            def after_each(trial: FrozenTrial) -> None:
+            def after_each(trial: Any) -> None:
                 write_results(search)
                 print(_line(search, trial))
                 show(next(done), options.n_trials, "trials")
@@ -58,13 +81,14 @@ def run(options: argparse.Namespace) -> int:
     return signals.exit_code
 
 
-def _share(
-    options: argparse.Namespace, search: Search, signals: StopSignals, after_each: Callable[[FrozenTrial], None]
-) -> None:
+def _share(options: argparse.Namespace, search: Any, signals: StopSignals, after_each: Callable[[Any], None]) -> None:
     """Have workers train the trials, each of which opens the study.
 
     :raises TrainingError: the first trials of all have failed.
     """
+    from sb3_quad.executors import start_executor
+    from sb3_quad.tuning.search import ERROR, HOPELESS, train_trial
+
     if options.address is not None and options.storage is None:
         raise ConfigError("--address: workers elsewhere need a study that they see; name one with --storage")
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
@@ -93,8 +117,15 @@ def _share(
                 executor.cancel()
 
 
-def _make_search(options: argparse.Namespace) -> Search:
-    """The search that a command line describes; the folder of its results is new."""
+def _make_search(options: argparse.Namespace) -> Any:
+    """The :class:`~sb3_quad.tuning.search.Search` that a command line describes; the folder of its results is new."""
+    from sb3_quad.base.validate import validate
+    from sb3_quad.training.config import build_config
+    from sb3_quad.training.job import TrainingJob
+    from sb3_quad.training.runs import claim_folder, file_name
+    from sb3_quad.tuning.search import Search
+    from sb3_quad.tuning.space import load_space
+
     config = make_config(options)
     if options.eval_env_kwargs is not None:  # into the settings, so that the best ones have it too
         evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
@@ -115,7 +146,11 @@ def _make_search(options: argparse.Namespace) -> Search:
         raise
 
 
-def _line(search: Search, trial: FrozenTrial) -> str:
+def _line(search: Any, trial: Any) -> str:
+    """One line that says how a trial ended."""
+    from sb3_quad.tuning.results import in_words, varied
+    from sb3_quad.tuning.search import ERROR
+
     seconds = trial.duration.total_seconds() if trial.duration is not None else 0.0
     values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
     if trial.state.name == "FAIL":
@@ -125,8 +160,10 @@ def _line(search: Search, trial: FrozenTrial) -> str:
     return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
 
 
-def _print_results(search: Search) -> None:
-    """The best trials, the best agent on fresh episodes, and where everything is."""
+def _print_results(search: Any) -> None:
+    """Print the best trials, the best agent on fresh episodes, and where everything is."""
+    from sb3_quad.tuning.results import BEST, PLOT, TRIALS, train_command, write_plot
+
     if search.best is not None:
         write_plot(search)
         _print_best(search, search.best)
@@ -137,8 +174,17 @@ def _print_results(search: Search) -> None:
         print(f"to train: {train_command(search)}")
 
 
-def _print_best(search: Search, best: FrozenTrial) -> None:
-    """The best trials, and the best agent on episodes by which nothing was chosen, where its run folder is at hand."""
+def _print_best(search: Any, best: Any) -> None:
+    """Print the best trials, and the best agent on episodes by which nothing was chosen, if its run folder is at hand."""
+    from sb3_quad.cli.closing import agent_and_expert
+    from sb3_quad.cli.output import console
+    from sb3_quad.controllers.zips import load_model
+    from sb3_quad.evaluation.tables import text_table
+    from sb3_quad.training.config import build_config
+    from sb3_quad.training.runs import open_run
+    from sb3_quad.tuning.results import settings_of, varied
+    from sb3_quad.tuning.search import REWARD, RUN, SUCCESS
+
     known, path = search.job.config, Path(best.user_attrs[RUN])
     trials = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
     rows = [("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in trials))]
@@ -152,6 +198,6 @@ def _print_best(search: Search, best: FrozenTrial) -> None:
         print(f"agent: {run.model}")
 
 
-def _count(search: Search) -> str:
+def _count(search: Any) -> str:
     counts = {word: len(search.trials(state)) for state, word in STATES.items()}
     return ", ".join(f"{count} {word}" for word, count in counts.items() if count) or "no trial yet"

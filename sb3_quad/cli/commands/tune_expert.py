@@ -1,24 +1,48 @@
-"""``tune-expert``: gains of the geometric expert for a vehicle, into a copy of its YAML."""
+"""Find the geometric expert's gains for a vehicle; write its YAML with them and the resulting metrics.
+
+examples:
+  sb3-quad tune-expert                                   for ITM, into itm_tuned.yaml
+  sb3-quad tune-expert --vehicle my.yaml -o tuned.yaml   for your own vehicle
+  sb3-quad tune-expert -n 2000                           continues the first search, up to 2000 gains in all
+  sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
+
+The first gains stay where those found are no better on fresh episodes.
+Ctrl-C writes the best gains so far; the same command continues. Needs pip install '.[tune]' from a clone.
+"""
 
 import argparse
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_text
-from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.signals import StopSignals
-from sb3_quad.cli.output import console, progress_bar
-from sb3_quad.evaluation.expert_metrics import measure_expert
-from sb3_quad.evaluation.tables import text_table
-from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.tuning.expert import ExpertSearch, fresh_cost, with_gains
-from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
+from sb3_quad.cli.parser import Parser, add_common, natural, positive
 
 FRESH_EPISODES, FRESH_SETS = 960, 4
 
 
+def add_arguments(parser: Parser) -> None:
+    add = parser.add_argument
+    add("--vehicle", default="itm", metavar="V", help="name or YAML file (itm); the search starts from its gains, if any")
+    add("-o", "--output", metavar="FILE", help="YAML file to write (VEHICLE_tuned.yaml)")
+    add("-n", "--trials", type=positive, default=800, metavar="N", help="gains to try, including those in the journal (800)")
+    add("--journal", metavar="FILE", help="file that keeps the search (OUTPUT, ending in .journal)")
+    add("--starts", type=positive, default=40_000, metavar="N", help="recoveries; the hardest sixtieth is flown (40000)")
+    add("--targets", type=positive, default=300, metavar="N", help="tracking episodes (300)")
+    add("--seed", type=natural, default=0, help="seed of the search and its episodes (0)")
+    add_common(parser, "overwrite", "progress")
+
+
 def run(options: argparse.Namespace) -> int:
     """Search, measure on fresh episodes, write. Returns the exit code."""
+    from sb3_quad.base.seeds import row_seeds, seed_for
+    from sb3_quad.cli.output import console, progress_bar
+    from sb3_quad.evaluation.expert_metrics import measure_expert
+    from sb3_quad.evaluation.tables import text_table
+    from sb3_quad.experts.geometric import GeometricExpert
+    from sb3_quad.tuning.expert import ExpertSearch, fresh_cost, with_gains
+    from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
+
     vehicle, (text, _) = load_vehicle(options.vehicle), VEHICLES.text(options.vehicle)
     output = Path(options.output or f"{vehicle.name}_tuned.yaml")
     if output.suffix not in (".yaml", ".yml"):
@@ -44,28 +68,26 @@ def run(options: argparse.Namespace) -> int:
     seeds = row_seeds(seed_for("expert", options.seed), FRESH_SETS)
     tried = search.first, search.best
     results = [measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, FRESH_EPISODES) for each in tried]
-    costs = [fresh_cost(metrics) for metrics, _ in results]
-    chosen = 1 if costs[1] < costs[0] else 0
-    gains, (measured, recoveries) = tried[chosen], results[chosen]
-    content = with_gains(text, gains.model_copy(update={"measured": measured}))
+    measured = [metrics for metrics, _ in results]
+    chosen = 1 if fresh_cost(measured[1]) < fresh_cost(measured[0]) else 0
+    content = with_gains(text, tried[chosen].model_copy(update={"measured": measured[chosen]}))
     search.note_output(content.encode("utf-8"))
     write_text(output, content)
 
     rows = [
-        ("state recovery: episodes", *(str(each.recovery_episodes) for each, _ in results)),
-        ("state recovery: survival", *(f"{100 * each.recovery_survival:.2f} %" for each, _ in results)),
-        ("target tracking: episodes", *(str(each.tracking_episodes) for each, _ in results)),
-        ("target tracking: survival", *(f"{100 * each.tracking_survival:.2f} %" for each, _ in results)),
-        ("target tracking: mean time to 0.1 m", *(f"{each.time_to_0_1_m:.3f} s" for each, _ in results)),
-        ("target tracking: mean reward", *(f"{each.tracking_reward:.3f}" for each, _ in results)),
+        ("state recovery: episodes", *(str(each.recovery_episodes) for each in measured)),
+        ("state recovery: survival", *(f"{100 * each.recovery_survival:.2f} %" for each in measured)),
+        ("target tracking: episodes", *(str(each.tracking_episodes) for each in measured)),
+        ("target tracking: survival", *(f"{100 * each.tracking_survival:.2f} %" for each in measured)),
+        ("target tracking: mean time to 0.1 m", *(f"{each.time_to_0_1_m:.3f} s" for each in measured)),
+        ("target tracking: mean reward", *(f"{each.tracking_reward:.3f}" for each in measured)),
     ]
     console().print(text_table("on fresh episodes, true state", ("gains", "before", "best of the search"), rows))
     if not chosen:
         print("the search found nothing better on fresh episodes: the file keeps the gains that it began with")
     starts = []
-    for start, (flown, lost) in recoveries.items():
-        survival = f"{100 * (1 - lost / flown):.2f} %" if flown else ""
-        starts.append((start, str(flown), str(lost), survival))
+    for start, (flown, lost) in results[chosen][1].items():
+        starts.append((start, str(flown), str(lost), f"{100 * (1 - lost / flown):.2f} %" if flown else ""))
     console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "survival"), starts))
     print(f"{search.trials_done} gains tried, least cost {search.study.best_value:.3f}; journal: {journal}")
     print(f"saved {output}")

@@ -1,0 +1,121 @@
+"""What a command prints at its end: agents and experts on the same fresh episodes, where everything is, what to type next."""
+
+import shlex
+import time
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.cli.output import console
+from sb3_quad.controllers.agent_settings import agent_settings
+from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
+from sb3_quad.controllers.zips import load_model
+from sb3_quad.envs.registration import ENVIRONMENTS
+from sb3_quad.envs.rendering.window import has_display
+from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
+from sb3_quad.evaluation.metrics import summarise
+from sb3_quad.evaluation.scenarios.load import load_suite
+from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.training.job import TrainingJob
+from sb3_quad.training.pipeline import REFERENCE, PipelineResult
+from sb3_quad.training.runs import RunFolder, open_run
+from sb3_quad.training.trainer import TrainingResult
+
+FRESH_EPISODES, PIPELINE_EPISODES = 240, 960  # in a table after a single run, and after a pipeline
+THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
+SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of its suite, by task
+
+
+def task_table(
+    controllers: Mapping[str, Any], settings: FlightSettings, n: int, seed: int, beside: Iterable[str] = ()
+) -> Table:
+    """The table of some controllers over the same episodes of a task.
+
+    :param settings: how all of them fly.
+    :param n: how many episodes.
+    :param beside: the columns of the thesis that stand beside them, if they fly the thesis's vehicle.
+    """
+    seeds = row_seeds(seed, n)
+    measured = [metric_cells(summarise(fly_settings(each, settings, seeds))) for each in controllers.values()]
+    scenario = load_suite("thesis").scenario(SCENARIOS[settings.task])
+    shown = [name for name in beside if name in scenario.reference and settings.vehicle == THESIS_VEHICLE]
+    columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
+    rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
+    title = f"{settings.task}: {n} fresh episodes, the same for all" + ("" if settings.noise else ", true state")
+    return Table(columns, rows, title=title, caption=CAPTION)
+
+
+def print_tables(
+    controllers: Mapping[str, Any], how: Mapping[str, Any], n: int, seed: int, beside: Iterable[str] = ()
+) -> None:
+    """Print a table as of :func:`task_table` for each task.
+
+    :param how: the controllers fly in any task: vehicle, noise and scaling.
+    """
+    for task in SCENARIOS:
+        console().print(task_table(controllers, FlightSettings(task=task, **how), n, seed, beside))
+
+
+def agent_and_expert(job: TrainingJob, model: Any) -> Table:
+    """The table of the agent of a job and of its expert over the same episodes, which no training has seen.
+
+    :param job: of an environment of this package.
+    """
+    settings = job.flight_settings
+    controllers = {"agent": model, "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle)}
+    agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
+    return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))
+
+
+def close_run(result: TrainingResult) -> int:
+    """Print the table of a single run's agent and where everything is. Returns the exit code."""
+    if result.exit_code != 0:
+        return result.exit_code
+    summary = f"trained in {result.seconds:.1f} s"
+    if result.job.config.task is not None:
+        start = time.perf_counter()
+        console().print(agent_and_expert(result.job, result.model))
+        summary += f", flown for this table in {time.perf_counter() - start:.1f} s"
+    print(summary)
+    print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
+    _print_next(result.run)
+    return 0
+
+
+def close_pipeline(result: PipelineResult, seconds: float) -> int:
+    """Print both tasks' tables of all stages' agents and where everything is. Returns the exit code.
+
+    :param seconds: that the pipeline took.
+    """
+    if result.exit_code != 0:
+        return result.exit_code
+    flown = result.job.flight_settings
+    controllers = {"expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle)}
+    controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
+    beside = ("expert", "IL-agent", "RL-agent", REFERENCE.name)
+    print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)
+    times = [f"{name}: {stage.seconds:.0f} s" for name, stage in result.stages.items()]
+    print("; ".join([*times, f"in all: {seconds:.0f} s"]))
+    for name, stage in result.stages.items():
+        print(f"{name}: {stage.agent}")
+    print(f"saved in {result.folder}")
+    _print_next(open_run([stage for name, stage in result.stages.items() if name != REFERENCE.name][-1].run))
+    return 0
+
+
+def _print_next(run: RunFolder) -> None:
+    """Print the commands that show, measure and export a run's agent, if it flies an environment of this package."""
+    if run.name not in ENVIRONMENTS:
+        return
+    agent, label = str(run.result), f"{run.path.parent.name}_{run.path.name}"
+    picture = [] if has_display() else ["-o", f"{label}.png"]
+    vehicle = ["--vehicle", "itm"] if agent_settings(agent)[0].vehicles else []  # else the one that it was trained on
+    print("next:")
+    for command in (
+        ["enjoy", agent, "--env", run.name, *picture],
+        ["evaluate", agent, "--suite", "quick", "-o", f"evaluations/{label}"],
+        ["export", agent, "--format", "torchscript", *vehicle],
+    ):
+        print("  " + shlex.join(["sb3-quad", *command]))

@@ -1,0 +1,65 @@
+"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, and keys of a sweep's file; cheap to import."""
+
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import check_seed
+from sb3_quad.base.validate import Frozen
+
+
+def option(default: Any, description: str, *flags: str, metavar: str | None = "N") -> Any:
+    """A field that is also a flag.
+
+    :param flags: rl-zoo's short names of it.
+    """
+    return Field(default=default, description=description, json_schema_extra={"flags": list(flags), "metavar": metavar})
+
+
+def _check_device(device: str) -> str:
+    """Refuse CUDA where there is none, as SB3 would take the CPU without a word."""
+    import torch
+
+    if device.startswith("cuda") and not torch.cuda.is_available():
+        raise ConfigError(f"device {device}: PyTorch finds no CUDA here; give cpu or auto")
+    return device
+
+
+class SettingsOptions(Frozen):
+    """Keys of a settings file that have a flag of their own; None leaves what the file says."""
+
+    n_timesteps: int | None = option(None, "timesteps, in whole rollouts; fewer than one shorten it", "-n")
+    n_envs: int | None = option(None, "environments side by side")
+    vec_env: str | None = option(
+        None, "batch (compiled), dummy (PyBullet, one process) or subproc (one process each)", metavar="KIND"
+    )
+    expert: str | None = option(None, "pid, geometric, path/to/model.zip or package.module:factory", metavar="SPEC")
+    env_kwargs: dict[str, Any] | None = option(None, "environment keywords, such as noise:0", metavar="K:V")
+
+
+class JobOptions(Frozen):
+    """What a training is told beyond its settings. All its random numbers follow from ``seed``."""
+
+    eval_env_kwargs: dict[str, Any] | None = option(None, "environment keywords for evaluations only", metavar="K:V")
+    trained_agent: str | None = option(
+        None,
+        "agent to start from (policy and critic): an SB3 on-policy zip, a run folder, or a name such as itm-recovery",
+        "-i",
+        metavar="ZIP",
+    )
+    n_eval_envs: PositiveInt | None = option(None, "environments of an evaluation (batch: one per episode; else 1)")
+    device: Annotated[str, AfterValidator(_check_device)] = option("cpu", "cpu, cuda or auto", metavar=None)
+    log_folder: str = option("logs", "folder for the run folders", "-f", metavar="DIR")
+    seed: Annotated[int, AfterValidator(check_seed)] = option(0, "seed of policy, environments and exploration")
+    eval_freq: int = option(250_000, "timesteps between evaluations; below 1: one at the end")
+    eval_episodes: int = option(48, "episodes per evaluation; 0: no evaluations")
+    save_freq: int = option(-1, "timesteps between checkpoints; below 1: none")
+    snapshot_every: NonNegativeFloat = option(
+        60.0, "seconds between snapshots, from which --resume goes on after a crash; 0: none", metavar="SECONDS"
+    )
+    log_interval: PositiveInt = option(1, "rollouts between two tables of --verbose 1")
+    tensorboard_log: str | None = option(None, "folder for TensorBoard", "-tb", metavar="DIR")
+    verbose: Literal[0, 1, 2] = option(0, "1: SB3's tables, 2: debugging")
+    uuid: bool = option(False, "add a UUID to the run folder's name", "-uuid", metavar=None)
+    progress: bool = option(False, "progress bar", "-P", metavar=None)
