@@ -57,7 +57,7 @@ class Pairs(argparse.Action):
 
 
 PAIRS: dict[str, Any] = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
-YES_OR_NO = {"action": argparse.BooleanOptionalAction}
+YES_OR_NO: dict[str, Any] = {"action": argparse.BooleanOptionalAction}
 
 
 def whole(text: str) -> int:

@@ -39,7 +39,8 @@ def add_arguments(parser: Parser) -> None:
     task = add_flight_arguments(parser)
     task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery, instead of --env")
     task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of --env")
-    add, vector = parser.add_argument, {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
+    add = parser.add_argument
+    vector: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     add("-n", "--n-timesteps", type=positive, metavar="N", help="control steps, in as many episodes as needed (one episode)")
     add("--no-render", action="store_true", help="only fly and print how it went")
     add("--target", help="where to fly to, m", **vector)
@@ -66,7 +67,7 @@ def add_flight_arguments(parser: Parser) -> Any:
     add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
     add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")
     which = parser.add_mutually_exclusive_group()
-    best = {"dest": "which", "action": "store_const", "const": "best"}
+    best: dict[str, Any] = {"dest": "which", "action": "store_const", "const": "best"}
     which.add_argument("--load-best", help="the best agent of the evaluations", **best)
     which.add_argument("--load-checkpoint", dest="which", type=whole, metavar="N", help="the checkpoint after N timesteps")
     which.add_argument("--load-last-checkpoint", help=f"the {LAST}", **{**best, "const": LAST})
@@ -115,7 +116,8 @@ def run(options: argparse.Namespace) -> int:
     if options.record:
         _write_film(options, episodes)
     if window:
-        show_in_window(episodes, *(options.size or SINGLE), options.speed)
+        width, height = options.size or SINGLE
+        show_in_window(episodes, width, height, options.speed)
     return 0
 
 
@@ -230,8 +232,8 @@ def _write_film(options: argparse.Namespace, episodes: Sequence[Sequence[Any]]) 
     from sb3_quad.cli.output import with_progress
     from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
 
-    size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
+    width, height = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
-    frames = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
+    frames = (frame for episode in episodes for frame in film_frames(episode, width, height, options.speed))
     write_film(Path(options.record), with_progress(frames, total, "frames", options.progress))
     print(f"saved {options.record}, {total / FPS:.1f} s")
