@@ -1,8 +1,6 @@
 """Trainings that end before their time: neither a signal nor a diverging loss costs the model."""
 
-import random
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,14 +9,11 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import TrainingError
 from sb3_quad.base.files import model_bytes, save_model
 from sb3_quad.base.signals import StopSignals
 
-ENVIRONMENT = "environment."  # before the names of the environments' arrays
-MEMORY = "memory."  # before those of what the algorithm remembers beside its zip
-PAUSE = 1.0  # s between two snapshots of an off-policy algorithm
+PAUSE = 1.0  # s between two snapshots of an off-policy algorithm, whose rollouts are short
 
 
 class StopOnSignal(BaseCallback):
@@ -76,15 +71,14 @@ class StopOnSignal(BaseCallback):
 
 
 class Snapshot(NamedTuple):
-    """A training between two rollouts: everything it needs to continue as if nothing had happened, except a dataset."""
+    """A model between two rollouts."""
 
     timesteps: int
     model: bytes  # the zip
-    state: Arrays  # random numbers, and arrays under ``ENVIRONMENT`` and ``MEMORY``
 
 
 class LastGoodModel(BaseCallback):
-    """Takes a :class:`Snapshot` whenever a rollout starts; of an off-policy algorithm, whose rollouts are short, one a second.
+    """Takes a :class:`Snapshot` whenever a rollout starts; of an off-policy algorithm at most one a second.
 
     >>> from stable_baselines3 import PPO
     >>> from sb3_quad.envs import QuadcopterVecEnv
@@ -95,60 +89,23 @@ class LastGoodModel(BaseCallback):
     >>> last_good.snapshot.timesteps, PPO.load(io.BytesIO(last_good.snapshot.model), device="cpu").num_timesteps
     (800, 800)
 
-    :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
     :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from before that update.
     """
 
     snapshot: Snapshot | None = None
-    _seconds = -np.inf  # when it was taken
+    _taken = -np.inf  # when it was, s
 
-    def __init__(self, hurry: Callable[[], bool] = lambda: False) -> None:
-        super().__init__()
-        self._hurry = hurry
-
-    @property
-    def is_fresh(self) -> bool:
-        """Whether the rollout under way is in its first step after the snapshot, so that no buffer holds more than it."""
-        after = self.num_timesteps - self.training_env.num_envs
-        return not isinstance(self.model, OffPolicyAlgorithm) or self.snapshot is None or self.snapshot.timesteps == after
+    def _is_due(self) -> bool:
+        return not isinstance(self.model, OffPolicyAlgorithm) or time.monotonic() >= self._taken + PAUSE
 
     def _on_rollout_start(self) -> None:
-        if isinstance(self.model, OffPolicyAlgorithm) and time.monotonic() < self._seconds + PAUSE and not self._hurry():
+        if not self._is_due():
             return
-        self._seconds = time.monotonic()
+        self._taken = time.monotonic()
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
                 raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")
-        batch = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
-        arrays = {} if batch is None else batch.snapshot()
-        remembered: Arrays = getattr(self.model, "memory", dict)()
-        state = random_state() | {f"{ENVIRONMENT}{name}": array for name, array in arrays.items()}
-        state |= {f"{MEMORY}{name}": array for name, array in remembered.items()}
-        self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model), state)
+        self.snapshot = Snapshot(self.model.num_timesteps, model_bytes(self.model))
 
     def _on_step(self) -> bool:
         return True
-
-
-def random_state() -> Arrays:
-    """The states of torch's, NumPy's and Python's global random number generators."""
-    _, keys, position, has_normal, normal = np.random.get_state(legacy=True)  # noqa: NPY002 - SB3 samples from it
-    version, words, gauss = random.getstate()
-    return {
-        "torch": th.get_rng_state().numpy().copy(),
-        "numpy.keys": np.array(keys),
-        "numpy.rest": np.array([position, has_normal, normal], dtype=np.float64),
-        "python.words": np.array([version, *words], dtype=np.int64),
-        "python.gauss": np.array([np.nan if gauss is None else gauss]),
-    }
-
-
-def set_random_state(state: Arrays) -> None:
-    """Undo what has happened to the random numbers since ``random_state``."""
-    th.set_rng_state(th.from_numpy(np.array(state["torch"], dtype=np.uint8)))
-    position, has_normal, normal = (float(value) for value in state["numpy.rest"])
-    legacy = ("MT19937", np.array(state["numpy.keys"], dtype=np.uint32), int(position), int(has_normal), normal)
-    np.random.set_state(legacy)  # noqa: NPY002
-    version, *words = (int(word) for word in state["python.words"])
-    gauss = float(state["python.gauss"][0])
-    random.setstate((version, tuple(words), None if np.isnan(gauss) else gauss))

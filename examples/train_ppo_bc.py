@@ -11,7 +11,7 @@ import argparse
 from sb3_quad import PPOBC, GeometricExpert
 from sb3_quad.callbacks import BestModel, CoefficientSchedule, StopOnSignal
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.training.handover import transfer_policy
+from sb3_quad.training.transfer import transfer_policy
 
 parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
 parser.add_argument(

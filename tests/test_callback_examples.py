@@ -20,7 +20,6 @@ def test_every_callback_is_public():
     own = {each for _, each in everything if isinstance(each, type) and each.__module__ in modules}
     found = {each.__name__ for each in own if issubclass(each, BaseCallback) and each is not EveryTimesteps}
     assert found == set(callbacks.__all__)
-    assert callbacks.TrajectoryFigures is callbacks.TrajectoryPlots  # a former name, as configuration files may have it
 
 
 @pytest.mark.parametrize("name", callbacks.__all__)

@@ -19,8 +19,9 @@ from sb3_quad.callbacks import best_model
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal, random_state, set_random_state
-from sb3_quad.training.progress import ProgressBar
+from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
+from sb3_quad.training.snapshots import random_state, set_random_state
+from sb3_quad.training.trainer import ProgressBar
 
 
 class Walk(gymnasium.Env):

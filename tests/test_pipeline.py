@@ -20,24 +20,33 @@ from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs, with_settings
 from sb3_quad.training.trainer import train
-from sb3_quad.training.trim import scale_position, shift_position, trim
+from sb3_quad.training.trim import Trim, scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
+TINY["policy_kwargs"] = {"net_arch": [8, 8]}
 STAGES = [
     {"name": "one", "algo": "dagger", "env": "QuadTargetTracking-v0", "pass_on": "last"},
     {"name": "two", "algo": "ppo_bc", "env": "QuadStateRecovery-v0", "pass_on": "last", "settings": {"n_epochs": 1}},
 ]
 
 
-def write(tmp_path, stages, **extra):
+def write(tmp_path, stages):
     path = tmp_path / "stages.yml"
-    path.write_text(yaml.safe_dump({"stages": stages, **extra}), encoding="utf-8")
+    path.write_text(yaml.safe_dump({"stages": stages}), encoding="utf-8")
     return path
+
+
+def tiny(tmp_path, stages=STAGES):
+    return with_settings(load_pipeline(write(tmp_path, stages)), TINY)
 
 
 @pytest.fixture
 def job(tmp_path):
     return {"log_folder": str(tmp_path / "logs"), "eval_episodes": 4, "eval_freq": 0}
+
+
+def quiet(line):
+    pass
 
 
 def policy(path):
@@ -46,18 +55,16 @@ def policy(path):
 
 def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
     stages = [STAGES[0], {**STAGES[1], "settings": {"learning_rate": 0.0, "n_epochs": 1}}]
-    pipeline = with_settings(load_pipeline(write(tmp_path, stages)), {**TINY, "policy_kwargs": {"net_arch": [8, 8]}})
-    result = run_pipeline(pipeline, job, "stages", lambda line: None)
+    result = run_pipeline(tiny(tmp_path, stages), job, "stages", quiet)
     one, two = (policy(entry.agent) for entry in result.stages.values())
     assert result.exit_code == 0 and all(np.array_equal(one[key], two[key]) for key in one if key != "log_std")
     status = yaml.safe_load((result.folder / "pipeline.yml").read_text(encoding="utf-8"))
-    assert [entry["run"] for entry in status["done"]] == [entry.run for entry in result.stages.values()]
+    assert status["runs"] == [entry.run for entry in result.stages.values()]
 
 
 def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
-    pipeline = with_settings(load_pipeline(write(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]])), TINY)
     with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward 1.*logs/dagger"):
-        run_pipeline(pipeline, job, "stages", lambda line: None)
+        run_pipeline(tiny(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]]), job, "stages", quiet)
     assert not (tmp_path / "logs" / "ppo_bc").exists()
 
 
@@ -80,27 +87,30 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
     assert not (tmp_path / "logs").exists()
 
 
-def test_flags_of_a_single_run_are_refused(tmp_path, capsys):
+def test_flags_of_a_single_run_are_refused(capsys):
     assert main(["train", "-n", "100"]) == 2 and "-n goes with a single run" in capsys.readouterr().err
     assert main(["train", "--algo", "dagger", "--reference"]) == 2 and "--reference" in capsys.readouterr().err
 
 
-def test_shifting_the_position_is_seen_by_the_actor_as_a_move():
+def test_moved_and_scaled_positions_are_part_of_the_actor():
     env = QuadcopterVecEnv(16, task="state_recovery", noise=0.0, seed=1)
     model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
-    offset = np.array([0.3, -0.2, 0.5])
-    observations = env.reset()
+    observations, offset, std = env.reset(), np.array([0.3, -0.2, 0.5]), np.full(3, 10 / np.sqrt(3))
+    moved, longer = observations.copy(), observations.copy()
     before = model.predict(observations, deterministic=True)[0]
-    shift_position(model, offset, np.full(3, 10 / np.sqrt(3)))
-    moved = observations.copy()
-    moved[:, :3] -= (offset / (10 / np.sqrt(3))).astype(np.float32)
+    shift_position(model, offset, std)
+    moved[:, :3] -= (offset / std).astype(np.float32)
     np.testing.assert_allclose(model.predict(moved, deterministic=True)[0], before, atol=1e-5)
+    longer[:, :3] /= 0.8
+    before = model.predict(longer, deterministic=True)[0]
+    scale_position(model, 0.8)
+    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], before, atol=1e-5)
 
 
 def test_an_agent_that_crashes_cannot_be_trimmed():
-    env = QuadcopterVecEnv(4, seed=1)
+    model = PPO("MlpPolicy", QuadcopterVecEnv(4, seed=1), n_steps=8, batch_size=8, seed=0, device="cpu")
     with pytest.raises(ConfigError, match="offset from the target cannot be measured"):
-        hover_offset(PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"), n_flights=8)
+        hover_offset(model, n_flights=8)
 
 
 @pytest.mark.slow
@@ -113,20 +123,8 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     assert result.before > 0.4 and result.after < 0.05
 
 
-def test_scaling_the_position_is_seen_by_the_actor_as_a_longer_way():
-    env = QuadcopterVecEnv(16, noise=0.0, seed=1)
-    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")
-    observations = env.reset()
-    longer = observations.copy()
-    longer[:, :3] /= 0.8
-    expected = model.predict(longer, deterministic=True)[0]
-    scale_position(model, 0.8)
-    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], expected, atol=1e-5)
-
-
 def small_file(tmp_path):
-    settings = {**TINY, "policy_kwargs": {"net_arch": [8, 8]}}
-    return write(tmp_path, [{**stage, "settings": {**settings, **stage.get("settings", {})}} for stage in STAGES])
+    return write(tmp_path, [{**stage, "settings": {**TINY, **stage.get("settings", {})}} for stage in STAGES])
 
 
 def test_the_reference_agent_stands_in_the_same_table(tmp_path, capsys, monkeypatch):
@@ -156,7 +154,6 @@ def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, mo
     monkeypatch.setattr(PPOBC, "train", train)
     assert main([*arguments, "-f", interrupted]) == 130
     folder = next((tmp_path / "interrupted" / "stages").iterdir())
-    assert len(yaml.safe_load((folder / "pipeline.yml").read_text(encoding="utf-8"))["done"]) == 1
     capsys.readouterr()
     assert main(["train", "--resume", str(folder)]) == 0
     assert capsys.readouterr().out.count("fresh episodes, the same for all") == 2
@@ -175,44 +172,48 @@ def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
 def two_stages(tmp_path):
     """The first is to be trimmed."""
     first = {**STAGES[0], "conf_file": "nominal/dagger.yml"}
-    stages = [{**first, "trim": "hover"}, {**first, "name": "two"}]
-    return with_settings(load_pipeline(write(tmp_path, stages)), {**TINY, "policy_kwargs": {"net_arch": [8]}})
+    return tiny(tmp_path, [{**first, "trim": "hover"}, {**first, "name": "two"}])
+
+
+def no_trim(model, seed, settings):
+    return Trim(1.0, 0.0)
 
 
 def test_a_stage_is_not_trained_anew_when_its_trimming_was_interrupted(tmp_path, job, monkeypatch):
     def interrupted(model, seed, settings):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setitem(pipeline_module.TRIMS, "hover", (interrupted, ""))
+    monkeypatch.setattr(pipeline_module, "trim_hover", interrupted)
     lines = []
     result = run_pipeline(two_stages(tmp_path), job, "stages", lines.append)
     assert result.exit_code == 143 and f"--resume {result.folder}" in lines[-1]
 
-    monkeypatch.setitem(pipeline_module.TRIMS, "hover", (lambda model, seed, settings: None, ""))
-    after = resume_pipeline(result.folder, lambda line: None)
+    monkeypatch.setattr(pipeline_module, "trim_hover", no_trim)
+    after = resume_pipeline(result.folder, quiet)
     assert after.stages["one"].agent.endswith("trimmed_model.zip")
     assert len(list((tmp_path / "logs" / "dagger").iterdir())) == 2
-    again = resume_pipeline(result.folder, lambda line: None)  # as after a kill in the final tables
-    assert again.stages == after.stages
+    monkeypatch.setattr(pipeline_module, "trim_hover", interrupted)
+    again = resume_pipeline(result.folder, quiet)  # as after a kill in the final tables
+    assert [each.agent for each in again.stages.values()] == [each.agent for each in after.stages.values()]
 
 
 def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(tmp_path, job, monkeypatch):
     def killed(*args, **kwargs):
         raise SystemExit
 
-    pipeline, folder = two_stages(tmp_path), tmp_path / "logs" / "stages" / "stages_1"
-    monkeypatch.setitem(pipeline_module.TRIMS, "hover", (lambda model, seed, settings: None, ""))
+    folder = tmp_path / "logs" / "stages" / "stages_1"
+    monkeypatch.setattr(pipeline_module, "trim_hover", no_trim)
     monkeypatch.setattr(pipeline_module, "train", killed)  # the first stage has no run folder yet
     with pytest.raises(SystemExit):
-        run_pipeline(pipeline, job, "stages", lambda line: None)
+        run_pipeline(two_stages(tmp_path), job, "stages", quiet)
     monkeypatch.setattr(pipeline_module, "train", train)
     passed_on = pipeline_module._passed_on
     monkeypatch.setattr(pipeline_module, "_passed_on", killed)  # its model is saved
     with pytest.raises(SystemExit):
-        resume_pipeline(folder, lambda line: None)
+        resume_pipeline(folder, quiet)
     monkeypatch.setattr(pipeline_module, "_passed_on", passed_on)
     (model,) = (tmp_path / "logs" / "dagger").rglob("Quad*.zip")
     before = model.stat().st_mtime_ns
-    result = resume_pipeline(folder, lambda line: None)
+    result = resume_pipeline(folder, quiet)
     assert result.exit_code == 0 and result.stages["one"].timesteps == 256
     assert model.stat().st_mtime_ns == before

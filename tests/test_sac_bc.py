@@ -19,8 +19,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_quad import SACBC, PIDExpert
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.training import handover
-from sb3_quad.training.handover import transfer_policy
+from sb3_quad.training import transfer
+from sb3_quad.training.transfer import transfer_policy
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 32, "buffer_size": 2000, "seed": 3, "device": "cpu"}
 ALL = {"expert_timesteps": 64, "expert_fraction": 0.25, "bc_coef": 0.5, "expert_proposal": True}
@@ -254,7 +254,7 @@ def test_a_loss_that_is_not_finite_ends_the_training():
 @pytest.mark.parametrize("algorithm", [SACBC, TD3])
 def test_an_actor_takes_over_what_an_on_policy_zip_flies(tmp_path, monkeypatch, algorithm):
     for name, value in {"CLONE_STEPS": 500, "CLONE_BATCH": 128, "CLONE_ROWS": 4000}.items():
-        monkeypatch.setattr(handover, name, value)
+        monkeypatch.setattr(transfer, name, value)
     env = make_vec_env("Pendulum-v1", 8, seed=0)
     teacher = PPO("MlpPolicy", env, seed=0, device="cpu")
     with th.no_grad():

@@ -252,7 +252,7 @@ def test_a_value_becomes_what_its_type_says(kind, value, expected):
         (type[RolloutBuffer], ReplayBuffer, "must be a subclass of RolloutBuffer"),
         (dict[str, Any], "abc", "must be a valid dictionary"),
         (Literal["a", "b"], "c", "must be 'a' or 'b'"),
-        (float, "inf", "must be a finite number"),
+        (float, "inf", "must be finite"),
         (Any, float("nan"), "must be finite"),
     ],
 )

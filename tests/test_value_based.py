@@ -16,12 +16,12 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training import handover
+from sb3_quad.training import transfer
 from sb3_quad.training.config import build_config, load_config
-from sb3_quad.training.handover import transfer_policy
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import resume, train
+from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.trim import trim
 from sb3_quad.tuning.space import load_space
 
@@ -50,7 +50,7 @@ def make_job(folder, algo, **changes):
 def short_clone(monkeypatch):
     """A hand-over to SAC takes no time, and its clone flies badly."""
     for name, value in {"CLONE_STEPS": 20, "CLONE_BATCH": 32, "CLONE_ROWS": 80, "CLONE_FLIGHT": 10}.items():
-        monkeypatch.setattr(handover, name, value)
+        monkeypatch.setattr(transfer, name, value)
 
 
 def state(run):
@@ -110,8 +110,8 @@ def clone(tmp_path_factory):
     policy_kwargs = {"net_arch": {"pi": [64, 64], "qf": [8]}, "activation_fn": th.nn.Tanh}
     model = SAC("MlpPolicy", env, policy_kwargs=policy_kwargs, buffer_size=240, seed=0, device="cpu")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(handover, "CLONE_STEPS", 1000)
-        patch.setattr(handover, "CLONE_BATCH", 512)
+        patch.setattr(transfer, "CLONE_STEPS", 1000)
+        patch.setattr(transfer, "CLONE_BATCH", 512)
         transfer_policy(pretrained("itm-recovery"), model)
     path = tmp_path_factory.mktemp("clone") / "sac.zip"
     FlightSettings().write_into(model)
@@ -181,7 +181,7 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
         ("td3", {"noise_type": "pink"}, "noise_type"),
         ("td3", {"noise_std": -0.1}, "noise_std"),
         ("sac_bc", {"buffer_size": 0}, "buffer_size"),
-        ("sac_bc", {"buffer_size": 2**39}, "of memory"),
+        ("sac_bc", {"buffer_size": 2**39}, "this machine's memory"),
         ("sac_bc", {"expert_fraction": 2.0}, "from 0 to 1"),
         ("sac_bc", {"train_freq": [2, "episode"]}, "counts episodes"),
         ("sac_bc", {"ent_coef": "much"}, "cannot be made"),

@@ -92,10 +92,3 @@ def test_files_of_any_place(here):
         parse_mapping_file(here / "a.yml")
     with pytest.raises(ConfigError, match=r"^here: not valid YAML"):
         parse_yaml("a: [", "here")
-
-
-def test_former_names_find_the_files_where_they_are_now():
-    settings = YamlFolder(
-        "settings", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("nominal",), former={"geometric/": "nominal/"}
-    )
-    assert settings.text("geometric/dagger.yml") == settings.text("nominal/dagger.yml") != settings.text("dagger.yml")

@@ -10,7 +10,6 @@ import torch as th
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays
-from sb3_quad.base.memory import check_memory
 
 
 class AggregatedDataset:
@@ -20,7 +19,6 @@ class AggregatedDataset:
     :param observation_shape: shape of one observation
     :param action_dim: length of one action
     :param dtype: of the observations; actions are float32
-    :raises ConfigError: more than this machine's memory holds
     """
 
     row_pairs = 1  # pairs in a row
@@ -35,8 +33,6 @@ class AggregatedDataset:
         """Room for ``capacity`` rows of each array, float32 where ``dtypes`` says nothing else."""
         self.capacity = capacity
         types = {name: np.dtype(dtypes.get(name, np.float32)) for name in shapes}
-        size = sum(int(np.prod(shape)) * types[name].itemsize for name, shape in shapes.items())
-        check_memory(f"dataset_capacity {capacity * self.row_pairs:,}", capacity * size)
         # np.empty takes no memory before it is written to, so a large capacity costs what is in use.
         self._stores = {name: th.from_numpy(np.empty((capacity, *shape), types[name])) for name, shape in shapes.items()}
         self.added = 0  # since it was empty
@@ -137,7 +133,6 @@ class SequenceDataset(AggregatedDataset):
     :param capacity: most pairs held; those of whole sequences, and of one at least.
     :param n_steps: of a sequence.
     :param memory_shape: (n_layers, size) of each of the two arrays of the actor's recurrent state.
-    :raises ConfigError: more than this machine's memory holds
     """
 
     def __init__(

@@ -6,14 +6,10 @@ import re
 from contextlib import suppress
 from typing import Any
 
-import yaml
-
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
-from sb3_quad.base.yaml_files import LimitedLoader
+from sb3_quad.base.yaml_files import UniqueKeyLoader
 
-_NUMBER = re.compile(r"[+-]?(\d+(_\d+)*(\.\d*)?|\.\d+)([eE][+-]?\d{1,9})?")
-_DIGITS = 400  # of a number, at most; Python refuses to read whole numbers of some thousands
 _ACTIVATIONS = ("ELU", "GELU", "Hardtanh", "LeakyReLU", "Mish", "ReLU", "ReLU6", "SELU", "Sigmoid", "SiLU", "Softplus", "Tanh")
 _OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
 CLASSES = (*(f"nn.{name}" for name in _ACTIVATIONS), *(f"optim.{name}" for name in _OPTIMIZERS))
@@ -26,9 +22,11 @@ def parse_number(value: Any) -> Any:
     >>> parse_number("1e-3"), parse_number("2_000"), parse_number("mse"), parse_number(3)
     (0.001, 2000, 'mse', 3)
     """
-    if not isinstance(value, str) or len(value) > _DIGITS or not _NUMBER.fullmatch(value.strip()):
-        return value
-    return float(value) if re.search(r"[.eE]", value) else int(value)
+    if isinstance(value, str):
+        for kind in (int, float):
+            with suppress(ValueError):
+                return kind(value)
+    return value
 
 
 def parse_value(text: str, key: str = "") -> Any:
@@ -87,21 +85,19 @@ class _AsLiterals(ast.NodeTransformer):
         return ast.Constant(text) if _CLASS_NAME.match(text) else node
 
 
-class ZooLoader(LimitedLoader):
-    """Of rl_zoo3's YAML, which may call any function there: ordered mappings, tuples and the names of ``CLASSES`` alone."""
+class ZooLoader(UniqueKeyLoader):
+    """Reads the YAML that rl_zoo3 writes: also ordered mappings, tuples and names of classes, none of which is imported."""
 
-    def construct_python(self, tag: str, node: Any) -> Any:  # torch.nn.modules.activation.Tanh becomes nn.Tanh
-        kind, _, name = tag.partition(":")
-        with suppress(TypeError, ValueError):
-            match kind, name.split("."):
-                case "tuple", _:
-                    return self.construct_sequence(node, deep=True)
-                case "object/apply", ["collections", "OrderedDict"]:
-                    (pairs,) = self.construct_sequence(node, deep=True)
-                    return dict(pairs)
-                case "name", ["torch", module, *_, attribute] if f"{module}.{attribute}" in CLASSES:
-                    return f"{module}.{attribute}"
-        raise yaml.YAMLError(f"{tag} is nothing that settings may hold")
+    def construct_python(self, tag: str, node: Any) -> Any:
+        match tag.split(":"):
+            case ["tuple"]:
+                return self.construct_sequence(node, deep=True)
+            case ["object/apply", "collections.OrderedDict"]:
+                (pairs,) = self.construct_sequence(node, deep=True)
+                return dict(pairs)
+            case ["name", name] if name.startswith("torch."):  # torch.nn.modules.activation.Tanh: nn.Tanh
+                return ".".join([name.split(".")[1], name.split(".")[-1]])
+        raise ValueError(f"{tag}: no such value in settings")
 
 
 ZooLoader.add_multi_constructor("tag:yaml.org,2002:python/", ZooLoader.construct_python)

@@ -1,8 +1,7 @@
 """YAML files by name, where they come with the package, or by path."""
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -13,57 +12,28 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
 
 SUFFIXES = (".yaml", ".yml")
-MAX_CHARACTERS, MAX_DEPTH, MAX_VALUES = 2**20, 50, 100_000  # of a file; levels; values, with those that aliases repeat
 
 
-class LimitedLoader(yaml.SafeLoader):
-    """PyYAML's SafeLoader; it refuses a key given twice, an alias of what it is part of, and what is too deep or too much."""
+class UniqueKeyLoader(yaml.SafeLoader):
+    """PyYAML's SafeLoader silently keeps the last of two equal keys; this one refuses them."""
 
-    _depth = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        self._depth += 1
-        if self._depth > MAX_DEPTH:
-            raise yaml.YAMLError(f"nested more than {MAX_DEPTH} levels deep")
-        node = super().compose_node(parent, index)
-        self._depth -= 1
+    def compose_mapping_node(self, anchor: Any) -> Any:
+        node = super().compose_mapping_node(anchor)
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if twice := [key for key, times in keys.items() if times > 1]:
+            raise yaml.YAMLError(f"{', '.join(twice)}: given twice{node.start_mark}")
         return node
 
-    def get_single_node(self) -> Any:
-        node = super().get_single_node()
-        if node is not None and self._count(node, {}) > MAX_VALUES:
-            raise yaml.YAMLError(f"its aliases stand for more than {MAX_VALUES:,} values")
-        return node
 
-    def _count(self, node: Any, known: dict[Any, int]) -> int:
-        """The values in a node, those of an alias as often as it stands there; 0 in ``known`` marks what is being counted."""
-        if node in known:
-            if known[node] == 0:
-                raise yaml.YAMLError(f"an alias of what it is part of{node.start_mark}")
-            return known[node]
-        known[node], parts = 0, []
-        if isinstance(node, yaml.SequenceNode):
-            parts = node.value
-        elif isinstance(node, yaml.MappingNode):
-            keys = Counter((key.tag, key.value) for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-            if twice := [name for (_, name), times in keys.items() if times > 1]:
-                raise yaml.YAMLError(f"{', '.join(twice)}: given twice{node.start_mark}")
-            parts = [part for pair in node.value for part in pair]
-        known[node] = 1 + sum(self._count(part, known) for part in parts)
-        return known[node]
-
-
-def parse_yaml(text: str, where: str, loader: type[LimitedLoader] = LimitedLoader) -> Any:
-    """:raises ConfigError: text that is not YAML, or is too much of it, in one line."""
-    if len(text) > MAX_CHARACTERS:
-        raise ConfigError(f"{where}: has more than {MAX_CHARACTERS:,} characters; this is no file of settings")
+def parse_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = UniqueKeyLoader) -> Any:
+    """:raises ConfigError: text that is not YAML, in one line."""
     try:
         return yaml.load(text, Loader=loader)
-    except Exception as error:  # beside YAMLError, whatever a value raises that is none of its tag's
+    except Exception as error:  # a value may raise anything when it does not fit its tag
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
 
 
-def parse_mapping_file(path: Path, loader: type[LimitedLoader] = LimitedLoader) -> dict[str, Any]:
+def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader] = UniqueKeyLoader) -> dict[str, Any]:
     """The keys and values of a YAML file.
 
     :raises ConfigError: it is missing, unreadable or holds something else.
@@ -86,7 +56,6 @@ class YamlFolder:
     :param suffix: of the files.
     :param in_name: whether the suffix is part of the name, as in ``thesis/dagger.yml``.
     :param folders: further ones inside the package, in the order in which their names are listed.
-    :param former: beginnings of names that once were, and what they are now; former names still find the files.
     """
 
     kind: str
@@ -94,7 +63,6 @@ class YamlFolder:
     suffix: str = ".yaml"
     in_name: bool = False
     folders: tuple[str, ...] = ()
-    former: Mapping[str, str] = field(default_factory=dict)
 
     def names(self) -> list[str]:
         """The names of the files in the package."""
@@ -103,7 +71,7 @@ class YamlFolder:
     def is_path(self, source: str | Path) -> bool:
         """Whether a source is the path of a file rather than a name.
 
-        A name that could be a path, since it ends as one, stands for the user's file if there is one.
+        Where the suffix is part of the name, a source is a path if the user has such a file.
         """
         if isinstance(source, Path) or (self.in_name and Path(source).is_file()):
             return True
@@ -117,8 +85,6 @@ class YamlFolder:
         if self.is_path(source):
             return read_text(source), str(source)
         name, files = str(source), self._files()
-        for former, now in self.former.items():
-            name = name if not name.startswith(former) else now + name.removeprefix(former)
         if name not in files:
             raise ConfigError(f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file")
         return files[name].read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"

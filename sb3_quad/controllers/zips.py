@@ -13,7 +13,6 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.imports import require
-from sb3_quad.base.memory import check_unpacked
 from sb3_quad.base.trust import trusted
 from sb3_quad.controllers.unpickle import unpickle
 
@@ -39,17 +38,14 @@ _STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}  # for t
 def saved_data(path: str | Path | io.BytesIO) -> dict[str, Any]:
     """The attributes of the model in an SB3 ``.zip`` as its JSON has them; those that are pickled there stay so.
 
-    :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a zip bomb.
+    :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
     """
     file = path if isinstance(path, io.BytesIO) else Path(path)
     if isinstance(file, Path) and not file.is_file():
         raise ConfigError(f"model {file}: " + ("no run with an agent in this folder" if file.is_dir() else "no such file"))
     try:
-        check_unpacked(file)
         with zipfile.ZipFile(file) as archive:
             return dict(json.loads(archive.read("data")))
-    except ConfigError:
-        raise
     except Exception as error:  # what a damaged archive raises depends on where the damage is
         raise ConfigError(f"model {file}: not a complete SB3 zip ({type(error).__name__}: {error})") from None
 

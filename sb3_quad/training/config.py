@@ -38,7 +38,6 @@ SETTINGS = YamlFolder(
     ".yml",
     in_name=True,
     folders=("any_quadcopter", "nominal", "pid", "robust", "thesis", "value_based"),
-    former={"geometric/": "nominal/", "robust/dagger": "dagger", "robust/ppo_bc": "ppo_bc"},
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VEC_ENVS = ("batch", "dummy", "subproc")

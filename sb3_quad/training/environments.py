@@ -1,22 +1,23 @@
 """The vectorised environment of a job: batched, one process, or one process each; the same learning problem in all."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
 import gymnasium
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
-from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepReturn
 
 import sb3_quad  # noqa: F401  (registers the environments, also in a worker process)
-from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.training.config import TrainingConfig
 from sb3_quad.training.values import instance
+
+WORKER_ENDED = (
+    "a worker process of the environments ended (its error, if it had time for one, is above; else out of memory?);"
+    " vec_env dummy needs none"
+)
 
 
 class _Dummy(RowSeeds, DummyVecEnv):
@@ -24,22 +25,7 @@ class _Dummy(RowSeeds, DummyVecEnv):
 
 
 class _Subproc(RowSeeds, SubprocVecEnv):
-    """SB3's waits for ever, when closed, for the answers of a worker process that has ended; this one ends the others.
-
-    :raises TrainingError: a worker process ended, in ``reset`` and ``step``.
-    """
-
-    def reset(self) -> VecEnvObs:
-        with _worker_errors():
-            return super().reset()
-
-    def step_async(self, actions: FloatArray) -> None:
-        with _worker_errors():
-            super().step_async(actions)
-
-    def step_wait(self) -> VecEnvStepReturn:
-        with _worker_errors():
-            return super().step_wait()
+    """SB3's ``close`` waits forever for the answer of a worker process that has ended; this one ends the others."""
 
     def close(self) -> None:
         if not self.closed and (self.waiting or not all(process.is_alive() for process in self.processes)):
@@ -50,17 +36,6 @@ class _Subproc(RowSeeds, SubprocVecEnv):
                 remote.close()
             self.closed = True
         super().close()
-
-
-@contextmanager
-def _worker_errors() -> Iterator[None]:
-    try:
-        yield
-    except (EOFError, ConnectionError):
-        raise TrainingError(
-            "a worker process of the environments ended (its error, if it had time for one, is above; else out of memory?);"
-            " vec_env dummy needs none"
-        ) from None
 
 
 def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False) -> VecEnv:
@@ -83,11 +58,12 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
             keywords = [_of_row(config.env_kwargs, row) for row in range(n_envs)]
             rows = range(n_envs) if staggered else [0] * n_envs
             make = partial(_make_one, config.env_id, config.env_wrapper, in_worker, n_envs)
-            with _worker_errors():
-                env = (_Subproc if in_worker else _Dummy)([partial(make, *each) for each in zip(keywords, rows, strict=True)])
+            env = (_Subproc if in_worker else _Dummy)([partial(make, *each) for each in zip(keywords, rows, strict=True)])
             env.seed(seed)
     except SB3QuadError:
         raise
+    except (EOFError, ConnectionError):
+        raise TrainingError(WORKER_ENDED) from None
     except (TypeError, ValueError, AssertionError) as error:
         raise ConfigError(f"{config.env_id}: cannot be made with env_kwargs {config.env_kwargs} ({error})") from error
     for path, kwargs in config.vec_env_wrapper:

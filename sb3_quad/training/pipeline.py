@@ -15,8 +15,9 @@ A pipeline's file names its stages in order; :class:`Stage` lists the keys::
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -28,21 +29,17 @@ from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.seeds import LARGEST, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.controllers.zips import load_zip, saved_data
+from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import check_tensorboard, resume, train
+from sb3_quad.training.trainer import resume, train
 from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
-TRIMS = {  # by the name that a stage gives: what trims, and what is reported of it
-    "position": (trim, "steady offset {0.before:.3f} m, now {0.after:.3f} m"),
-    "hover": (trim_hover, "action at the target {0.before:.4f} from hover, now {0.after:.4f}"),
-}
 
 
 class Requirement(Frozen):
@@ -90,22 +87,25 @@ class Pipeline(Frozen):
     )
 
 
-class StageResult(Frozen):
-    """A finished stage."""
-
-    run: str = Field(description="its run folder")
-    agent: str = Field(description="the zip that is passed on")
-    trimmed: bool = Field(default=True, description="whether that is done, where the stage is to be trimmed")
-    timesteps: int
-    seconds: float = Field(description="of training; of a stage that was resumed, since then")
-
-
 class Status(Pipeline):
     """What ``pipeline.yml`` in a pipeline's folder holds."""
 
     job: dict[str, Any] = Field(description="arguments of every job")
-    done: tuple[StageResult, ...]
-    current: str | None = Field(description="the run folder of the stage under way")
+    runs: tuple[str, ...] = Field(description="the run folders of the stages that have begun")
+
+
+class StageResult(NamedTuple):
+    """A finished stage.
+
+    :param run: its run folder.
+    :param agent: the zip that is passed on.
+    :param seconds: of training; of a stage that was resumed, since then.
+    """
+
+    run: str
+    agent: str
+    timesteps: int
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -177,23 +177,20 @@ def run_pipeline(
     :raises ConfigError: settings that do not fit, named with their stage, before the first one starts.
     :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was missed.
     """
-    status = Status(stages=pipeline.stages, job=dict(job), done=(), current=None)
+    status = Status(stages=pipeline.stages, job=dict(job), runs=())
     jobs = stage_jobs(status, status.job)
-    check_tensorboard(jobs[0])
-    return _go_on(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
+    return _train_stages(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
 
 def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **changes: Any) -> PipelineResult:
     """Go on with an interrupted or killed pipeline: within the stage that was under way, then with the stages after it.
-
-    One whose stages are all done is returned as it is.
 
     :param changes: arguments of the jobs to change, as for :func:`~sb3_quad.training.trainer.resume`.
     :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
     """
     status = validate(Status, *SETTINGS.read(folder / STATUS_FILE))
     status = status.model_copy(update={"job": {**status.job, **changes}})
-    return _go_on(folder, status, stage_jobs(status, status.job), report, **changes)
+    return _train_stages(folder, status, stage_jobs(status, status.job), report, **changes)
 
 
 def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
@@ -218,74 +215,62 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
     return jobs
 
 
-def _go_on(
+def _train_stages(
     folder: Path, status: Status, jobs: list[TrainingJob], report: Callable[[str], None], **changes: Any
 ) -> PipelineResult:
-    done = list(status.done)
+    """Train what is left of the stages. A stage's run folder is noted before its training begins."""
+    runs, results = [*status.runs], {}
+    agent: str | None = None
 
-    def write(under_way: str | None) -> None:
-        content = status.model_copy(update={"done": tuple(done), "current": under_way})
-        text = yaml.safe_dump(content.model_dump(mode="json", exclude_defaults=True), sort_keys=False)
-        write_text(folder / STATUS_FILE, text)
+    def note(number: int, run: RunFolder) -> None:
+        runs[number:] = [str(run.path)]
+        write()
+
+    def write() -> None:
+        content = status.model_copy(update={"runs": tuple(runs)}).model_dump(mode="json", exclude_defaults=True)
+        write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
         try:
-            write(status.current)
+            write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                if number == len(done):
-                    report(f"{stage.name}: {describe(job)}")
-                    current = status.current if number == len(status.done) else None
-                    goes_on = done and stage.begin == "before"
-                    start = job.model_copy(update={"trained_agent": done[-1].agent}) if goes_on else job
-                    entry = _train_stage(stage, start, current, report, write, changes)
-                    if entry is not None:
-                        done.append(entry)
-                        write(None)
-                if signals.received is not None:
+                start = job.model_copy(update={"trained_agent": agent}) if agent and stage.begin == "before" else job
+                run = open_run(runs[number]) if number < len(runs) else None
+                finished = _train_stage(stage, start, run, report, partial(note, number), changes)
+                if finished is None or signals.received is not None:
                     break
-                if not done[number].trimmed:
-                    agent = _trim(stage, job, open_run(done[number].run), done[number].agent, report)
-                    done[number] = done[number].model_copy(update={"agent": str(agent), "trimmed": True})
-                    write(None)
+                run, timesteps, seconds = finished
+                agent = str(_trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, run))
+                results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
         except KeyboardInterrupt:
             if signals.received is None:
                 raise
     if signals.received is not None:
         report(f"to go on with the whole pipeline: --resume {folder}")
-    names = [stage.name for stage in status.stages[: len(done)]]
-    return PipelineResult(folder, dict(zip(names, done, strict=True)), jobs[0], signals.exit_code)
+    return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
 def _train_stage(
     stage: Stage,
     job: TrainingJob,
-    current: str | None,
+    run: RunFolder | None,
     report: Callable[[str], None],
-    write: Callable[[str | None], None],
+    on_start: Callable[[RunFolder], None],
     changes: Mapping[str, Any],
-) -> StageResult | None:
-    """Train a stage, or what is left of it; None if it was interrupted.
+) -> tuple[RunFolder, int, float] | None:
+    """Train a stage, or what is left of it.
 
-    :param current: its run folder, if it has one already.
-    :param write: told of its run folder if it gets one.
+    :param run: its run folder, if it has one already.
+    :return: its run folder, timesteps and seconds; None if it was interrupted.
     """
-    run = None if current is None else open_run(current)
-    timesteps, seconds = 0, 0.0
-    if run is not None and run.model.is_file() and not run.resume_state.is_file():  # killed before that was noted
-        timesteps = int(saved_data(run.model)["num_timesteps"])
-        seconds = float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
-    if run is None or timesteps < job.config.n_timesteps:
-        if run is not None and (run.not_begun or run.resume_state.is_file()):
-            result = resume(str(run.path), report, **changes)
-        else:
-            result = train(job, report, on_start=lambda begun: write(str(begun.path)))
-        if result.exit_code != 0:
-            return None
-        run, timesteps, seconds = result.run, result.model.num_timesteps, result.seconds
-    agent = _passed_on(stage, run)
-    return StageResult(
-        run=str(run.path), agent=str(agent), trimmed=stage.trim is None, timesteps=timesteps, seconds=round(seconds, 1)
-    )
+    if run is not None and run.timesteps >= job.config.n_timesteps:
+        return run, run.timesteps, float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
+    report(f"{stage.name}: {describe(job)}")
+    if run is not None and (run.not_begun or run.resume_state.is_file()):
+        result = resume(str(run.path), report, **changes)
+    else:
+        result = train(job, report, on_start=on_start)
+    return None if result.exit_code else (result.run, result.model.num_timesteps, result.seconds)
 
 
 def _passed_on(stage: Stage, run: RunFolder) -> Path:
@@ -306,13 +291,18 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
 
 
-def _trim(stage: Stage, job: TrainingJob, run: RunFolder, agent: str, report: Callable[[str], None]) -> Path:
-    """Trim a stage's agent; the trimmed one lies beside it."""
-    assert stage.trim is not None
-    model = load_zip(get_algorithm(job.config.algo), agent, device=job.device)
-    trimmed, words = TRIMS[stage.trim]
-    scale = {"scale": stage.position_scale} if stage.trim == "position" else {}
-    did = trimmed(model, seed_for("trim", job.seed), job.flight_settings, **scale)
+def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]) -> Path:
+    """The trimmed agent of a stage, which lies beside the one that it is made of."""
+    if run.trimmed_model.is_file():
+        return run.trimmed_model
+    model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, run), device=job.device)
+    seed = seed_for("trim", job.seed)
+    if stage.trim == "hover":
+        did = trim_hover(model, seed, job.flight_settings)
+        words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
+    else:
+        did = trim(model, seed, job.flight_settings, stage.position_scale)
+        words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"
     save_model(model, run.trimmed_model)
-    report(f"trimmed: {words.format(did)}: {run.trimmed_model}")
+    report(f"trimmed: {words}: {run.trimmed_model}")
     return run.trimmed_model

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import stable_baselines3
@@ -17,6 +18,7 @@ from sb3_quad.base.literals import ZooLoader
 from sb3_quad.base.version import __version__
 from sb3_quad.base.yaml_files import parse_mapping_file
 from sb3_quad.controllers.pretrained import BEST, TRIMMED, run_agent
+from sb3_quad.controllers.zips import saved_data
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
 
@@ -36,7 +38,6 @@ class RunFolder:
         self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
         self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run
-        self.dataset = path / "dataset.npz"  # that of an interrupted run, in version 0.1
         self.config = path / name / "config.yml"  # the settings
         self.arguments = path / name / "args.yml"  # of the command line; env_kwargs: what the agent is judged with
         self.command = path / name / "command.txt"  # what was typed
@@ -50,6 +51,12 @@ class RunFolder:
     def not_begun(self) -> bool:
         """Whether the run ended before its first rollout: it holds neither a snapshot nor any model."""
         return not self.resume_state.is_file() and not any(self.path.glob("*.zip"))
+
+    @property
+    def timesteps(self) -> int:
+        """Timesteps of the model at the run's end; 0 before that."""
+        ended = self.model.is_file() and not self.resume_state.is_file()
+        return int(saved_data(self.model)["num_timesteps"]) if ended else 0
 
     def checkpoint(self, timesteps: int) -> Path:
         """Where the model after ``timesteps`` goes."""
@@ -115,19 +122,29 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
 
     :raises ConfigError: a folder that cannot be made.
     """
+    make_folder(parent, "log folder", "-f")
+    number = max(_runs(parent, name), default=0) + 1
+    while True:
+        path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
+        try:
+            path.mkdir()  # fails if another run was quicker
+            return path
+        except FileExistsError:
+            number += 1
+
+
+def make_folder(path: str | Path, what: str, flag: str) -> None:
+    """Make a folder that files are to be written to, unless it is there.
+
+    :param what: the folder in the message, which also names the flag that gives another.
+    :raises ConfigError: it cannot be written.
+    """
     try:
-        parent.mkdir(parents=True, exist_ok=True)
-        number = max(_runs(parent, name), default=0) + 1
-        while True:
-            path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
-            try:
-                path.mkdir()  # fails if another run was quicker
-                return path
-            except FileExistsError:
-                number += 1
+        Path(path).mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=path).close()
     except OSError as error:
         reason = error.strerror or error
-        raise ConfigError(f"log folder {parent}: cannot be written ({reason}); give another with -f") from None
+        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
 
 
 def _runs(parent: Path, name: str) -> dict[int, Path]:

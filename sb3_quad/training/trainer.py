@@ -9,14 +9,12 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback
+from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, ProgressBarCallback
 from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
@@ -29,18 +27,16 @@ from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import LastGoodModel
+from sb3_quad.callbacks.interruption import Snapshot
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.training.algorithms import get_algorithm, takes_expert
 from sb3_quad.training.config import TrainingConfig, build_config
-from sb3_quad.training.environments import make_environments
-from sb3_quad.training.handover import transfer_policy
+from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.needs import check_buffer, check_networks
-from sb3_quad.training.progress import ProgressBar
-from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
+from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, make_folder, open_run
 from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
+from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import instance
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}
@@ -80,7 +76,8 @@ def train(
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
-    check_tensorboard(job)
+    if job.tensorboard_log is not None:  # before there is a run folder, which would stay empty
+        make_folder(job.tensorboard_log, "TensorBoard folder", "-tb")
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
@@ -107,7 +104,6 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
     given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs", *MADE_WITH)}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
-    check_tensorboard(job)
     with StopSignals() as signals, locked(run.path, "run folder"), _environments(job) as (env, eval_envs):
         if run.not_begun:
             model = build_model(job, env)
@@ -117,23 +113,6 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
         return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
-
-
-def check_tensorboard(job: TrainingJob) -> None:
-    """Make the folder for TensorBoard, before a run folder is there that would stay empty.
-
-    :raises ConfigError: it cannot be written.
-    """
-    if job.tensorboard_log is None:
-        return
-    try:
-        Path(job.tensorboard_log).mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=job.tensorboard_log).close()
-    except OSError as error:
-        reason = error.strerror or error
-        raise ConfigError(
-            f"TensorBoard folder {job.tensorboard_log}: cannot be written ({reason}); give another with -tb"
-        ) from None
 
 
 @contextmanager
@@ -174,7 +153,6 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
-    check_buffer(config, env)
     keywords = {**copy.deepcopy(config.hyperparams), **_expert(config)}
     if config.noise_type is not None:
         zeros = np.zeros(env.action_space.shape or ())
@@ -183,10 +161,12 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         keywords["policy_kwargs"] = config.policy_kwargs
     keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
     try:
-        check_networks(config, env)
         model = get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
+    except MemoryError as error:
+        sizes = "n_steps by n_envs, buffer_size or dataset_capacity"
+        raise ConfigError(f"{config.algo}: {sizes} is more than this machine's memory ({one_line(error)})") from None
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
         raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
     asked: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
@@ -212,12 +192,11 @@ def _learn(
     report: Report,
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
+    config = job.config
     last_good, best = SnapshotFile(run, job.snapshot_every, report, lambda: signals.received is not None), None
-    # An off-policy algorithm counts episodes: about as many as rows end their episodes once.
-    log_interval = job.log_interval * (job.config.n_envs if job.config.is_off_policy else 1)
-    if job.config.task is not None and not (job.config.env_wrapper or job.config.vec_env_wrapper):  # flights have none
+    if config.task is not None and not (config.env_wrapper or config.vec_env_wrapper):  # flights have no wrappers
         job.flight_settings.write_into(model)
-    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, job.config.env_id)]
+    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, config.env_id)]
     if eval_envs:
         best = BestModel(
             eval_envs[None],
@@ -228,7 +207,7 @@ def _learn(
             evaluations=run.evaluations,
             report=report,
             others={task: env for task, env in eval_envs.items() if task is not None},
-            expert=getattr(model, "expert", None) if job.config.eval_expert else None,
+            expert=getattr(model, "expert", None) if config.eval_expert else None,
             should_continue=should_continue,
         )
         callbacks.append(best)
@@ -242,10 +221,11 @@ def _learn(
     try:
         try:
             model.learn(
-                job.config.n_timesteps - model.num_timesteps,
+                config.n_timesteps - model.num_timesteps,
                 callback=callbacks,
-                log_interval=log_interval,
-                tb_log_name=f"{job.config.algo}_{run.path.name}",
+                # An off-policy algorithm counts episodes: about as many as rows end their episodes once.
+                log_interval=job.log_interval * (config.n_envs if config.is_off_policy else 1),
+                tb_log_name=f"{config.algo}_{run.path.name}",
                 reset_num_timesteps=model.num_timesteps == 0,
             )
             if best is not None and signals.received is None and not best.stopped:
@@ -254,13 +234,12 @@ def _learn(
             signals.hold()
     except (Exception, KeyboardInterrupt) as error:
         if signals.received is None:
-            _save_after(error, run, last_good, model)
+            _save_after(error, run, last_good.snapshot, model)
             raise
     seconds = time.perf_counter() - start
     if signals.received is None:
         save_model(model, run.model)
-        for only_meanwhile in (run.resume_state, run.dataset):
-            only_meanwhile.unlink(missing_ok=True)
+        run.resume_state.unlink(missing_ok=True)
         return TrainingResult(job, run, model, seconds)
     after = "before the first rollout"
     if last_good.snapshot is not None:
@@ -274,20 +253,34 @@ def _learn(
     return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
 
 
-def _save_after(error: BaseException, run: RunFolder, last_good: LastGoodModel, model: BaseAlgorithm) -> None:
-    """Save the last good model, and say so in ``error``; a numerical breakdown becomes a TrainingError."""
-    snapshot = last_good.snapshot
-    if snapshot is None:
-        return
-    try:
-        write_bytes(run.model, snapshot.model)
-    except ConfigError as second:  # the disk is full for both; what failed first is what counts
-        raise type(error)(f"{error}; nor could the model be saved: {second}") from error
-    where = f"the model after {snapshot.timesteps:,} timesteps is in {run.model}"
+def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None, model: BaseAlgorithm) -> None:
+    """Save the last good model; raise an error of this package's as it is with the place of the model, or from ``error``.
+
+    Returns where ``error`` is of another kind.
+    """
+    where = ""
+    if snapshot is not None:
+        try:
+            write_bytes(run.model, snapshot.model)
+        except ConfigError as second:  # the disk is full for both; what failed first is what counts
+            raise type(error)(f"{error}; nor could the model be saved: {second}") from error
+        where = f"; the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
-        raise type(error)(f"{error}; {where}") from error
+        raise type(error)(f"{error}{where}") from error
+    if isinstance(error, (EOFError, ConnectionError)):
+        raise TrainingError(f"{WORKER_ENDED}{where}") from error
     finite = all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
     if isinstance(error, ValueError) and not finite:
-        raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate; {where}") from error
-    if hasattr(error, "add_note"):  # Python 3.11 and later
-        error.add_note(where)
+        raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate{where}") from error
+    if where and hasattr(error, "add_note"):  # Python 3.11 and later
+        error.add_note(where.removeprefix("; "))
+
+
+class ProgressBar(ProgressBarCallback):
+    """SB3's progress bar, which says when it stands still because the networks learn rather than fly."""
+
+    def _on_rollout_start(self) -> None:
+        self.pbar.set_description("flying")
+
+    def _on_rollout_end(self) -> None:
+        self.pbar.set_description("learning")

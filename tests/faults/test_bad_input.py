@@ -7,7 +7,6 @@ import sys
 import time
 import zipfile
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ import yaml
 from stable_baselines3 import PPO
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.callbacks.interruption import Snapshot
 from sb3_quad.cli.app import main
 from sb3_quad.cli.commands import plot
 from sb3_quad.envs import QuadcopterVecEnv
@@ -119,10 +119,10 @@ def test_a_full_disk_names_what_failed_first(here, monkeypatch):
         raise ConfigError(f"{path}: cannot be written (No space left on device)")
 
     monkeypatch.setattr(trainer, "write_bytes", write_bytes)
-    last_good = SimpleNamespace(snapshot=SimpleNamespace(model=b"", timesteps=5))
+    snapshot = Snapshot(5, b"")
     first = ConfigError("evaluations.npz: cannot be written (No space left on device)")
     with pytest.raises(ConfigError, match=r"^evaluations\.npz: .*; nor could the model be saved: .*Quad\.zip"):
-        trainer._save_after(first, RunFolder(here, "Quad"), last_good, None)
+        trainer._save_after(first, RunFolder(here, "Quad"), snapshot, None)
 
 
 def test_a_full_disk_in_a_search_of_gains_names_the_journal(here, monkeypatch, capsys):

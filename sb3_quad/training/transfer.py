@@ -11,7 +11,6 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
-from sb3_quad.base.memory import check_unpacked
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.zips import load_model
 
@@ -29,11 +28,8 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
         first that does.
     """
     try:
-        check_unpacked(path)
         _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")  # unpickles nothing
         theirs, ours = dict(parameters["policy"]), model.policy.state_dict()
-    except ConfigError:
-        raise
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
     except Exception as error:  # what a damaged archive raises depends on where the damage is
@@ -59,16 +55,13 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
     model.policy.load_state_dict(theirs)
 
 
-hand_over = transfer_policy  # its name in version 0.1
-
-
 CLONE_ROWS = 20_000  # states that are flown for a clone, at least
 CLONE_FLIGHT = 500  # steps of each environment, at least
 CLONE_STEPS = 2_500  # of Adam
 CLONE_ROUNDS = 10  # of flying, then fitting
 CLONE_BATCH = 1024
 CLONE_RATE = 2e-3  # falls to a hundredth
-CLONE_LOG_STD = -2.0  # of a clone that explores by a deviation of its own, without log_std_init: sampled actions fly
+CLONE_LOG_STD = -2.0  # of a SAC actor without log_std_init; its sampled actions still fly
 
 
 def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> float:
@@ -85,29 +78,30 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     """
     env, policy, actor = model.get_env(), model.policy, cast(Any, model.actor)
     assert env is not None
-    n, labeller, rng = env.num_envs, Controller.for_env(teacher, env), np.random.default_rng(seed)
+    n, expert, rng = env.num_envs, Controller.for_env(teacher, env), np.random.default_rng(seed)
+    flown_by_teacher = (np.arange(n) % 2 == 0)[:, None]
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
-    seen: list[Any] = []
-    said: list[Any] = []
+    states: list[Any] = []  # (n, ...) of each step
+    targets: list[Any] = []  # the teacher's actions in them as the actor gives its own, (n, actions)
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
-    for flown in range(steps):
-        labels = labeller.labels(observation, begins)
-        seen.append(observation)
-        said.append(policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1))  # type: ignore[misc]
+    for step in range(steps):
+        labels = expert.labels(observation, begins)
+        states.append(observation)
+        targets.append(policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1))  # type: ignore[misc]
         own, _ = model.predict(observation, deterministic=True)
-        actions = np.where((np.arange(n) % 2 == 0)[:, None], labels, own.reshape(n, -1)).reshape(own.shape)
+        actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
-        if (flown + 1) * CLONE_ROUNDS // steps == flown * CLONE_ROUNDS // steps:
+        if (step + 1) * CLONE_ROUNDS // steps == step * CLONE_ROUNDS // steps:
             continue
-        states, targets = (th.as_tensor(np.concatenate(part), device=model.device) for part in (seen, said))
+        inputs, outputs = (th.as_tensor(np.concatenate(part), device=model.device) for part in (states, targets))
         for _ in range(CLONE_STEPS // CLONE_ROUNDS):
             for group in optimiser.param_groups:
                 group["lr"] = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
-            rows = th.as_tensor(rng.integers(len(states), size=CLONE_BATCH), device=model.device)
-            loss = (policy._predict(states[rows], deterministic=True) - targets[rows]).square().mean()
+            rows = th.as_tensor(rng.integers(len(inputs), size=CLONE_BATCH), device=model.device)
+            loss = (policy._predict(inputs[rows], deterministic=True) - outputs[rows]).square().mean()
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()
