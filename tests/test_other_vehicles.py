@@ -97,7 +97,7 @@ def test_a_suite_flown_by_another_vehicle(here, capsys):
     assert main([*command, "--vehicle", "my.yaml", "-o", "out"]) == 0
     assert "thesis" not in capsys.readouterr().out
     results = json.loads((here / "out" / "results.json").read_text())
-    assert results["scenarios"][0]["vehicle"] == str(here / "my.yaml")
+    assert results["scenarios"][0]["vehicle"] == load_vehicle("my.yaml").model_dump(mode="json")
     assert results["scenarios"][0]["reference"] == {}
     assert main([*command, "--vehicle", "hummingbird", "-o", "out"]) == 2  # other flights of the same name
     assert "another scenario" in capsys.readouterr().err

@@ -14,7 +14,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
+from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
 from sb3_quad.training.config import load_config
 from sb3_quad.training.job import TrainingJob
@@ -72,14 +72,7 @@ def suite_of(spec: SweepSpec) -> Suite | None:
         if asked.scenario:
             raise ConfigError("evaluation: scenario goes with a suite")
         return None
-    suite = load_suite(asked.suite).with_changes(asked.scenario, asked.episodes, asked.seed)
-    scenarios = [each if each.vehicle is None else _with_vehicle(each) for each in suite.scenarios]
-    return suite.model_copy(update={"scenarios": tuple(scenarios)})
-
-
-def _with_vehicle(scenario: Scenario) -> Scenario:
-    """The scenario with the vehicle that it names, rather than the name of a file that other machines do not have."""
-    return scenario.model_copy(update={"vehicle": scenario.nominal_vehicle()})
+    return load_suite(asked.suite).with_changes(asked.scenario, asked.episodes, asked.seed)
 
 
 def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:

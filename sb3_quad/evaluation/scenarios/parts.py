@@ -7,10 +7,8 @@ from pydantic import (
     Field,
     NonNegativeFloat,
     PositiveFloat,
-    SerializerFunctionWrapHandler,
     ValidationInfo,
     field_validator,
-    model_serializer,
     model_validator,
 )
 
@@ -157,11 +155,6 @@ class Wrench(Frozen):
         """The units of force, N, and torque, N m, on a vehicle before its changes."""
         weight = vehicle.mass * vehicle.gravity
         return (weight, weight * vehicle.arm_length) if self.unit == "weight" else (1.0, 1.0)
-
-    @model_serializer(mode="wrap")
-    def _default_left_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """``unit`` is younger than results and their hashes."""
-        return {key: value for key, value in handler(self).items() if (key, value) != ("unit", "SI")}
 
 
 class VehicleChanges(Frozen):

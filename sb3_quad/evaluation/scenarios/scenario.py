@@ -3,18 +3,15 @@
 import itertools
 import math
 from collections.abc import Sequence
-from functools import lru_cache
-from pathlib import Path
+from functools import cache
 from typing import Annotated, Any
 
 from pydantic import (
     Field,
     PositiveFloat,
     PositiveInt,
-    SerializerFunctionWrapHandler,
     ValidationError,
     field_validator,
-    model_serializer,
     model_validator,
 )
 
@@ -31,7 +28,6 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
 DEFAULT_VEHICLE = "itm"
-MAX_CONTROL_STEPS = 10**10  # of all episodes of a scenario together: about half an hour on one core
 NumberOrRange = float | tuple[float, float]
 
 
@@ -100,6 +96,13 @@ class Scenario(Frozen):
     group: str | None = Field(default=None, description="the scenario that this one is a cell of; set by vary")
     cell: dict[str, float] = Field(default_factory=dict, description="this cell's values, by key; set by vary")
 
+    @field_validator("vehicle")
+    @classmethod
+    def _read(cls, value: str | Vehicle | None) -> str | Vehicle | None:
+        return (
+            load_vehicle(value) if isinstance(value, str) and VEHICLES.is_path(value) else value
+        )  # from here on, no file matters
+
     @field_validator("tolerances")
     @classmethod
     def _rising(cls, value: tuple[float, ...]) -> tuple[float, ...]:
@@ -117,9 +120,6 @@ class Scenario(Frozen):
         step = vehicle.control_step
         if self.duration < step:
             raise ValueError(f"duration: {self.duration:g} s is below a control step, {step:g} s")
-        if self.episodes * self.steps > MAX_CONTROL_STEPS:
-            together = f"{self.episodes} of {self.duration:g} s are {self.episodes * self.steps:.3g} control steps"
-            raise ValueError(f"episodes: {together}, at most {MAX_CONTROL_STEPS:.0e} are flown")
         for number, wrench in enumerate(self.wrenches):
             if wrench.duration is not None and wrench.duration < step * (1 - 1e-9):
                 raise ValueError(f"wrenches.{number}: a duration of {wrench.duration:g} s is below a control step, {step:g} s")
@@ -135,11 +135,7 @@ class Scenario(Frozen):
 
         :raises ConfigError: it cannot be loaded.
         """
-        if isinstance(self.vehicle, Vehicle):
-            return self.vehicle
-        name = self.vehicle or DEFAULT_VEHICLE
-        path = Path(name)
-        return _load(name, path.stat().st_mtime_ns if path.is_file() else 0)
+        return self.vehicle if isinstance(self.vehicle, Vehicle) else _by_name(self.vehicle or DEFAULT_VEHICLE)
 
     def flown_by(self, own: Any) -> "Scenario":
         """The scenario with an agent's ``own`` vehicle (None: it has none), unless it names one itself.
@@ -203,34 +199,22 @@ class Scenario(Frozen):
         random = attitude.distribution, attitude.tilt, self.target.distance, self.randomize, self.vehicles
         return not any(random) and all(vector.value is not None or vector.largest == 0.0 for vector in vectors)
 
-    @model_serializer(mode="wrap")
-    def _default_left_out(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """``randomize`` and ``vehicles`` are younger than results and their hashes."""
-        younger = ("randomize", "vehicles")
-        return {key: value for key, value in handler(self).items() if value is not None or key not in younger}
-
     def _check_way(self, vehicle: Vehicle) -> None:
         """See that start and targets lie above ground, within ``max_distance`` of each other and within reach."""
-        start, distance, least = self.start.position, self.target.distance or 0.0, vehicle.collision_radius
-        if start[2] <= least:
-            raise ValueError(f"start.position: {list(start)} touches the ground; z must exceed {least:g} m")
-        for point in self.target.points:
+        start, points, least = self.start.position, self.target.points, vehicle.collision_radius
+        for place, point in (("start.position", start), *(("target", point) for point in points)):
             if point[2] <= least:
-                raise ValueError(f"target: {list(point)} lies below ground; z must exceed {least:g} m")
-        legs = list(itertools.pairwise([start, *self.target.points]))
-        for before, after in legs:
-            if (far := math.dist(before, after)) > self.max_distance:
-                limit = f"an episode ends beyond max_distance {self.max_distance:g} m"
-                raise ValueError(f"target: {list(after)} is {far:.3g} m away, and {limit}")
-        if distance > self.max_distance:
-            raise ValueError(f"target.distance: {distance:g} m is beyond max_distance {self.max_distance:g} m")
+                raise ValueError(f"{place}: {list(point)} touches the ground; z must exceed {least:g} m")
+        legs = list(itertools.starmap(math.dist, itertools.pairwise([start, *points]))) or [self.target.distance or 0.0]
+        if max(legs) > self.max_distance:
+            limit = f"an episode ends beyond max_distance {self.max_distance:g} m"
+            raise ValueError(f"target: {max(legs):.3g} m away, and {limit}")
         # Full thrust in one direction throughout: no point outside this ball can be reached, whatever flies there.
         half, coasting = 0.5 * self.duration**2, self.start.velocity.largest * self.duration
         fall, thrust = vehicle.gravity, vehicle.thrust_limits[1] * vehicle.gravity
-        out = [math.dist(start, (x, y, z + fall * half)) > thrust * half + coasting for x, y, z in self.target.points]
-        out.append(distance > (thrust - fall) * half + coasting)
-        out.append(sum(itertools.starmap(math.dist, legs)) > (thrust + fall) * half + coasting)
-        if any(out):
+        outside = [math.dist(start, (x, y, z + fall * half)) > thrust * half + coasting for x, y, z in points]
+        reach = (thrust - fall if self.target.distance else thrust + fall) * half + coasting
+        if any(outside) or sum(legs) > reach:
             raise ValueError(f"target: cannot be reached within the duration of {self.duration:g} s at full thrust")
 
 
@@ -269,7 +253,7 @@ class Suite(Frozen):
         changes: dict[str, Any] = {"episodes": episodes, "seed": seed}
         changes = {key: value for key, value in changes.items() if value is not None}
         if vehicle is not None:
-            changes |= {"vehicle": str(Path(vehicle).absolute()) if VEHICLES.is_path(vehicle) else vehicle, "reference": {}}
+            changes |= {"vehicle": vehicle, "reference": {}}
         changed = []
         for scenario in self.scenarios:
             if names and scenario.name not in names and scenario.group not in names:
@@ -290,7 +274,7 @@ class Suite(Frozen):
         return self
 
 
-@lru_cache(maxsize=64)
-def _load(vehicle: str, changed: int) -> Vehicle:
-    """A vehicle, read once while its file stays the same: suites have many scenarios."""
+@cache
+def _by_name(vehicle: str) -> Vehicle:
+    """A vehicle of the package, read once: suites have many scenarios."""
     return load_vehicle(vehicle)
