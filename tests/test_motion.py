@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.motion import Motion
+from sb3_quad.evaluation.flights import Motion, fly
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, TARGET, QuadcopterState
 

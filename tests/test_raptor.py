@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_quad.base.errors import ConfigError, ExpertError, MissingExtra
+from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.cli import main
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
@@ -62,9 +62,12 @@ def test_what_an_expert_remembers_goes_on_in_its_environment_and_says_who_begins
     np.testing.assert_array_equal(counter.starts[1], starts)
 
 
-def test_the_observations_of_who_remembers_are_not_scaled():
-    with pytest.raises(ExpertError, match="Counter: has a memory"):
-        AdaptiveScaling(Counter())(QuadcopterVecEnv(2, seed=0).reset())
+def test_scaled_observations_leave_the_state_to_the_controller():
+    counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
+    labeller = Controller.for_env(AdaptiveScaling(counter), env)
+    for _ in range(2):
+        labeller.labels(env.reset())
+    assert counter.given == [None, 1]
 
 
 def tilted(axis, degrees):

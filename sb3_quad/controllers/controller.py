@@ -1,7 +1,7 @@
 """One way to ask a controller, whatever it is: an expert, an SB3 model, a function."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,30 +12,28 @@ from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
 from sb3_quad.simulation.state import QuadcopterState
 
-Ask = Callable[[npt.NDArray[Any], BoolArray | None], Any]  # observations (n, ...); which rows begin an episode (n,)
-
-
-UNSAVED = "unsaved"  # among the names of a memory: whose it is, of which nothing else could be saved
+UNSAVED = "unsaved"  # the only name in what a controller keeps that cannot be saved; its value is whose it is
 
 
 class Controller:
-    """Asks anything that flies for its actions, and checks what it says.
+    """Asks anything that flies for its actions, and checks its answers.
 
     The first of these that fits is used:
 
     1. ``source.actions(state)`` (such as ``GeometricExpert``), where the true state is to be had: it is free of noise.
-    2. ``source.predict(observation)``, deterministic: an SB3 model, or an ``Expert`` of this package without a true state.
+    2. ``source.predict(observation)``: an SB3 model, or an ``Expert`` of this package without a true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
-    2 and 3 get the observations that a policy sees. What a ``predict`` remembers, the second thing that it returns as SB3's
-    recurrent policies do, it is given again as ``state`` when it is asked next, with ``episode_start`` (n,): the rows that
-    have just begun an episode. All rows of a new Controller begin one.
+    2 and 3 get the observations that a policy sees. The state that ``predict`` returns beside the actions, as SB3's recurrent
+    policies do, is given to it again as ``state`` when it is asked next, with ``episode_start`` (n,): the rows that have just
+    begun an episode. All rows of a new Controller begin one.
 
     :param source: the controller, as above.
     :param action_space: a Box.
     :param observation_space: None: not checked.
     :param true_state: gives the present true state; None: there is none.
     :param kind: what messages call it.
+    :param deterministic: whether ``predict`` is asked for the mean of its actions, or a sample.
     :raises ConfigError: a source that is none of the three, or whose spaces do not fit; ``ExpertError`` of an expert.
     """
 
@@ -46,42 +44,36 @@ class Controller:
         observation_space: spaces.Space[Any] | None = None,
         true_state: Callable[[], QuadcopterState] | None = None,
         kind: str = "controller",
+        deterministic: bool = True,
     ) -> None:
         error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
-        self.source, self.kind = source, kind
+        self.source, self.kind, self._deterministic = source, kind, deterministic
         self.name = getattr(source, "__name__", type(source).__name__)
+        who = f"{kind} {self.name}"
         if isinstance(source, type):
-            raise error(f"{kind} {self.name}: is a class; give an instance, such as {self.name}()")
+            raise error(f"{who}: is a class; give an instance, such as {self.name}()")
         if not isinstance(action_space, spaces.Box):
             raise error(f"action space {action_space}: a {kind} gives Box actions only")
+        if not any(hasattr(source, name) for name in ("actions", "predict", "__call__")):
+            raise error(
+                f"{kind} {source!r}: needs actions(state) or predict(observation), or must be a function of observations"
+            )
         self._space, self._action_dim = action_space, int(np.prod(action_space.shape))
         self._low, self._high = (np.float32(bound.reshape(-1)) for bound in (action_space.low, action_space.high))
         for what, ours in (("observation_space", observation_space), ("action_space", action_space)):
             theirs = getattr(source, what, None)
             if isinstance(theirs, spaces.Space) and ours is not None and theirs.shape != ours.shape:
-                label = what.replace("_", " ")
-                raise error(f"{kind} {self.name}: its {label} has shape {theirs.shape}, the environment's {ours.shape}")
-        self._env: VecEnv | None = None
-        self._memory: Any = None
+                raise error(f"{who}: its {what.replace('_', ' ')} has shape {theirs.shape}, the environment's {ours.shape}")
         self.needs_state = hasattr(source, "actions") and true_state is not None
-        if self.needs_state and true_state is not None:
-            self._ask: Ask = lambda observation, episode_start: source.actions(true_state())
-        elif hasattr(source, "predict"):
-            self._ask = self._predict
-        elif callable(source):
-            self._ask = lambda observation, episode_start: source(observation)
-        elif hasattr(source, "actions"):
-            raise error(f"{kind} {self.name}: needs the true state, and this environment has no true_state()")
-        else:
-            raise error(
-                f"{kind} {source!r}: needs actions(state) or predict(observation), or must be a function of observations"
-            )
+        if not (self.needs_state or hasattr(source, "predict") or callable(source)):
+            raise error(f"{who}: needs the true state, and this environment has no true_state()")
+        self._true_state, self._env, self._state = true_state, cast(VecEnv | None, None), cast(Any, None)
 
     @staticmethod
     def for_env(expert: Any, env: VecEnv, present: "Controller | None" = None) -> "Controller":
         """An expert that labels the states of a vector environment; with ``VecNormalize`` it sees normalised observations.
 
-        :param present: given back, with what the expert remembers, if it is of the same expert and environment.
+        :param present: given back, with its state, if it is of the same expert and environment.
         :raises ExpertError: an expert that is none of the three, or whose spaces do not fit the environment.
         """
         if expert is None:
@@ -99,13 +91,13 @@ class Controller:
 
         :param observation: (n, ...): the observations of that state.
         :param rows: bool (n,): the rows that matter; the others get zeros. None: all.
-        :param episode_start: bool (n,): the rows that have just begun an episode, for what a controller remembers. None: none.
+        :param episode_start: bool (n,): the rows that have just begun an episode. None: none.
         :raises ExpertError: of an expert, what it raises itself, actions that are not finite, or not of this shape;
             ``ControllerError`` of others.
         """
         error = ExpertError if self.kind == "expert" else ControllerError
         try:
-            raw = np.asarray(self._ask(observation, episode_start))
+            raw = np.asarray(self._answer(observation, episode_start))
         except SB3QuadError:
             raise
         except (Exception, SystemExit) as failed:  # a controller of the user's may raise anything
@@ -139,29 +131,34 @@ class Controller:
         """SB3's ``predict``, for ``evaluate_policy``; the labels."""
         return self.labels(observation, episode_start), None
 
-    def _predict(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
-        given: dict[str, Any] = {}
-        if self._memory is not None:
-            given = {"state": self._memory} | ({} if episode_start is None else {"episode_start": episode_start})
-        actions, self._memory, *_ = self.source.predict(observation, deterministic=True, **given)
+    def _answer(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
+        if self.needs_state and self._true_state is not None:
+            return self.source.actions(self._true_state())
+        if not hasattr(self.source, "predict"):
+            return self.source(observation)
+        before: dict[str, Any] = {}
+        if self._state is not None:
+            before = {"state": self._state} | ({} if episode_start is None else {"episode_start": episode_start})
+        actions, self._state, *_ = self.source.predict(observation, deterministic=self._deterministic, **before)
         return actions
 
     def memory(self) -> Arrays:
-        """What it remembers, as :meth:`restore` takes it; none where that is no tuple of arrays."""
-        if not isinstance(self._memory, tuple) or not all(isinstance(part, np.ndarray) for part in self._memory):
-            return {} if self._memory is None else {UNSAVED: np.array(self.name)}
-        return {str(number): part.copy() for number, part in enumerate(self._memory)}
+        """The state that ``predict`` is given next, as :meth:`restore` takes it."""
+        if self._state is None:
+            return {}
+        if not isinstance(self._state, tuple) or not all(isinstance(part, np.ndarray) for part in self._state):
+            return {UNSAVED: np.array(self.name)}
+        return {str(number): part.copy() for number, part in enumerate(self._state)}
 
     def restore(self, memory: Arrays) -> None:
         """Go back to a :meth:`memory`.
 
-        :raises ExpertError: one that could not be saved.
+        :raises ExpertError: it could not be saved.
         """
         if UNSAVED in memory:
-            raise ExpertError(
-                f"{self.kind} {memory[UNSAVED]}: what it remembers was no tuple of arrays, so no snapshot holds it; begin anew"
-            )
-        self._memory = tuple(memory[str(number)] for number in range(len(memory))) if memory else None
+            name = memory[UNSAVED]
+            raise ExpertError(f"{self.kind} {name}: its state was no tuple of arrays, so no snapshot holds it; begin anew")
+        self._state = tuple(memory[str(number)] for number in range(len(memory))) if memory else None
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
@@ -172,25 +169,3 @@ def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     if env.has_attr("true_state"):
         return lambda: QuadcopterState.concatenate(env.env_method("true_state"))
     return None
-
-
-def observation_function(source: Any, deterministic: bool = True, remembers: bool = True) -> Callable[[npt.NDArray[Any]], Any]:
-    """A policy or a function as a function from observations (n, ...) to actions (n, ...), for one flight of n rows.
-
-    :param deterministic: whether a policy gives the mean of its actions, or a sample.
-    :param remembers: whether what a policy remembers is kept; False: :class:`ExpertError` of one that does.
-    """
-    if not hasattr(source, "predict"):
-        return source  # type: ignore[no-any-return]
-    memory: Any = None
-
-    def ask(observation: npt.NDArray[Any]) -> Any:
-        nonlocal memory
-        given: dict[str, Any] = {} if memory is None else {"state": memory}
-        answer = source.predict(observation, deterministic=deterministic, **given)
-        memory = answer[1]
-        if memory is not None and not remembers:
-            raise ExpertError(f"{type(source).__name__}: has a memory, so its observations cannot be scaled")
-        return answer[0]
-
-    return ask

@@ -21,7 +21,7 @@ episode_reward        (n,)
 episode_path          (n,)               m
 episode_final_error   (n,)               |r - r_T|, m
 episode_final_offset  (n, 3)             r - r_T, world frame, m; NaN where the flight was lost
-episode_stabilised    (n,)               s until it was stable (``motion.py``); NaN: never
+episode_stabilised    (n,)               s until it was stable (``flights.py``); NaN: never
 episode_sideways      (n,)               largest distance from the straight way to the target, m; NaN: there is none
 episode_time_to       (n, T)             s until |r - r_T| was first within the tolerance; NaN: never
 episode_tolerances    (T,)               m

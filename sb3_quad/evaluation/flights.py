@@ -1,6 +1,6 @@
-"""Flying a controller over fresh episodes, and what is measured on the true state meanwhile.
+"""Flying a controller over fresh episodes, and what is measured on the true state along the way.
 
-Conventions, found by the expert's figures in the thesis (4.3.1): the time to a tolerance is the end of the first control
+Conventions, found by the expert's numbers in the thesis (4.3.1): the time to a tolerance is the end of the first control
 step after which |r - r_T| is within it; the path is that of the whole episode, 15 s, not of the way until arrival.
 """
 
@@ -18,7 +18,6 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.in_flight import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
-from sb3_quad.evaluation.motion import Motion
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings
@@ -27,6 +26,7 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 ACTIONS = quadcopter_spaces()[1]
+TILT, RATE, HOLD = np.radians(45.0), 2.0, 0.2  # stable: tilt (rad), roll and pitch rate (rad/s) below these, for so long (s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Flights:
     path_length: FloatArray  # (n,), m, over the whole episode
     final_error: FloatArray  # (n,), |r - r_T| at the end, m
     final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
-    stabilised: FloatArray  # (n,), s until it was stable again, NaN if it never was, see motion.py
+    stabilised: FloatArray  # (n,), s until it was stable again, NaN if it never was, see Motion
     sideways: FloatArray  # (n,), largest distance from the straight way to the target, m; NaN where there is none
     waypoint_times: FloatArray  # (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
     start: FloatArray  # (n, 13), position, quaternion, velocity (world frame), body rates; SI
@@ -119,27 +119,30 @@ def fly_settings(
     tolerances: Sequence[float] = TOLERANCES,
     hooks: Sequence[Hook] = (),
     plan: Plan | None = None,
+    deterministic: bool = True,
 ) -> Flights:
     """As :func:`fly`, by one record of how the episodes are flown: the first episode of each seed.
 
     :param plan: what happens to the episodes along the way.
+    :param deterministic: whether a policy gives the mean of its actions, or a sample.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     with closing(FLEETS[backend](seeds, settings)) as fleet:
-        return _fly_fleet(fleet, controller, plan or Plan(), settings.longest_episode, tolerances, hooks)
+        spaces = ACTIONS, quadcopter_spaces(fleet.observation_size)[0]
+        asked = Controller(controller, *spaces, fleet.true_state, deterministic=deterministic)
+        return _fly_fleet(fleet, asked, plan or Plan(), settings.longest_episode, tolerances, hooks)
 
 
 def _fly_fleet(
-    fleet: Fleet, controller: Any, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
+    fleet: Fleet, controller: Controller, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
 ) -> Flights:
-    asked = Controller(controller, ACTIONS, quadcopter_spaces(fleet.observation_size)[0], fleet.true_state)
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
     state = fleet.true_state()
     position, error = state.position.copy(), state.distance
-    wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
     motion = Motion(state, control_step)
+    wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     flights = Flights(
@@ -167,7 +170,10 @@ def _fly_fleet(
         if step - 1 in plan.wrenches:
             wrench = plan.wrenches[step - 1]
             fleet.set_wrench(wrench)
-        actions = _ask(asked, observation, flying, (step - 1) * control_step)
+        try:
+            actions = controller.actions(observation, flying)
+        except ControllerError as failed:
+            raise ControllerError(f"{failed}, after {(step - 1) * control_step:.2f} s") from failed
         for hook in hooks:
             hook.before_step(state, observation, wrench, flying)
         observation, step_reward, lost, collided, error, arrived = fleet.step(actions, flying)
@@ -198,12 +204,43 @@ def _fly_fleet(
     return flights
 
 
-def _ask(controller: Controller, observation: Float32Array, flying: BoolArray, time: float) -> Float32Array:
-    """Actions (n, 4) of a controller; zero for rows that are over.
+class Motion:
+    """Watches n flights, step by step.
 
-    :raises ControllerError: it raises something, or gives what are no actions.
+    ``stabilised`` (n,): s until the tilt has come below 45° and the turning about the body's x and y axes below 2 rad/s, both
+    for 0.2 s at least, of which the beginning counts; NaN if that never was. The thesis reads such a time from Fig. 4.9.
+    ``sideways`` (n,): the largest distance from the straight line through start and target, m, on the way and beyond: the
+    oscillations of 4.3.1; NaN where both are one point.
+
+    :param state: at the start.
+    :param control_step: s.
     """
-    try:
-        return controller.actions(observation, flying)
-    except ControllerError as error:
-        raise ControllerError(f"{error}, after {time:.2f} s") from error
+
+    def __init__(self, state: QuadcopterState, control_step: float) -> None:
+        way = state.target - state.position
+        length = np.linalg.norm(way, axis=1, keepdims=True)
+        self._start, self._control_step = state.position.copy(), control_step
+        self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
+        self._since = np.zeros(state.n)  # when the present stable time began
+        self._stable = np.ones(state.n, dtype=np.bool_)
+        self.stabilised = np.full(state.n, np.nan)
+        self.sideways = np.where(length[:, 0] > 0.0, 0.0, np.nan)
+        self.see(0, state, np.ones(state.n, dtype=np.bool_))
+
+    def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
+        """The state after control step ``step``; only flights (n,) that go on count."""
+        time, before = step * self._control_step, self._stable
+        self._stable = _upright(state) & (np.hypot(*state.body_rates.T[:2]) < RATE)
+        self._since[self._stable & ~before] = time
+        held = flying & self._stable & (time - self._since > HOLD - 0.5 * self._control_step)
+        new = held & np.isnan(self.stabilised)
+        self.stabilised[new] = self._since[new]
+        flown = state.position - self._start
+        beside = np.linalg.norm(flown - (flown * self._direction).sum(axis=1, keepdims=True) * self._direction, axis=1)
+        self.sideways[flying] = np.maximum(self.sideways, beside)[flying]
+
+
+def _upright(state: QuadcopterState) -> BoolArray:
+    x, y = state.quaternion.T[1:3]
+    upright: BoolArray = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
+    return upright

@@ -12,7 +12,6 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.controllers.controller import observation_function
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS
 from sb3_quad.simulation.settings import FlightSettings
@@ -28,7 +27,7 @@ def adaptive_factor(distance: npt.ArrayLike) -> FloatArray:
 
 
 class AdaptiveScaling:
-    """A policy behind the thesis's scaling: a function from observations (n, 18) to actions (n, 4).
+    """A policy behind the thesis's scaling, asked by ``predict`` as an SB3 model is.
 
     In the position components it shows the policy (s - μ) / (α σ), where s / σ is what the environment gives. The distance in
     α is the observed one, noise and all, so that a policy needs nothing but its observation.
@@ -42,14 +41,20 @@ class AdaptiveScaling:
         self.policy, self.observation_space = policy, getattr(policy, "observation_space", None)
         self.mean = np.asarray(mean, dtype=np.float64)
         self.std = np.asarray(DEFAULT_STD if std is None else std, dtype=np.float64)[_POSITION]
-        self._ask = observation_function(policy, remembers=False)
 
-    def __call__(self, observation: Float32Array) -> Any:
+    def predict(self, observation: Float32Array, **how: Any) -> tuple[Any, Any]:
+        """The policy's answer to scaled observations, (n, 18), in physical terms those that the environment gives.
+
+        :param how: for the policy's own ``predict``.
+        """
         position = observation[:, _POSITION] * self.std
         factor = adaptive_factor(np.linalg.norm(position, axis=1, keepdims=True))
         adapted = observation.copy()
         adapted[:, _POSITION] = (position - self.mean) / (factor * self.std)
-        return self._ask(adapted)
+        if not hasattr(self.policy, "predict"):
+            return self.policy(adapted), None
+        actions, state, *_ = self.policy.predict(adapted, **how)
+        return actions, state
 
 
 def hover_offset(

@@ -10,7 +10,6 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
-from sb3_quad.controllers.controller import observation_function
 from sb3_quad.envs.rendering.labels import COLOURS
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose
@@ -146,13 +145,12 @@ def fly_all(
         settings = setting.settings.with_changes(max_episode_steps=min(left, longest))
         together: list[Recording] = []
         for name, controller in controllers.items():
-            sampling = hasattr(controller, "predict") and not deterministic
             for each in range(seed, seed + n_envs):
-                flown = observation_function(controller, deterministic=False) if sampling else controller
                 label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
                 try:
                     its = settings.with_changes(**setting.own.get(name, {}))
-                    together.append(_record(label, colour, flown, its, setting.plan(each), each))
+                    flown = controller, its, setting.plan(each), each, deterministic
+                    together.append(_record(label, colour, *flown))
                 except ControllerError as error:
                     raise ControllerError(f"controller {label}: {error}") from error
         yield together
@@ -162,9 +160,11 @@ def fly_all(
         seed += n_envs
 
 
-def _record(name: str, colour: str, controller: Any, settings: FlightSettings, plan: Plan, seed: int) -> Recording:
+def _record(
+    name: str, colour: str, controller: Any, settings: FlightSettings, plan: Plan, seed: int, deterministic: bool
+) -> Recording:
     every = _EveryStep()
-    flights = fly_settings(controller, settings, [seed], "pybullet", (), [every], plan)
+    flights = fly_settings(controller, settings, [seed], "pybullet", (), [every], plan, deterministic)
     wrench = np.zeros((len(every.states), WRENCH_SIZE))
     for first, values in sorted(plan.wrenches.items()):
         wrench[first + 1 :] = values
