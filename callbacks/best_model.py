@@ -14,8 +14,6 @@ from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.controllers.controller import Controller
 
-KEYS = ("timesteps", "results", "ep_lengths", "successes", "seconds")  # of the file
-MORE = ("survivals",)  # where environments report survival
 LIVES = 20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
 Score = tuple[float, float]  # success rate, mean reward
 
@@ -84,7 +82,7 @@ class BestModel(EveryTimesteps):
         # By the group of the log: the environments, the file, its rows and the expert's mean reward; the first group decides.
         self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
         self._paths = {"eval": path} | {f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others}
-        self._rows: dict[str, dict[str, Any]] = {group: {key: [] for key in KEYS} for group in self._envs}
+        self._rows: dict[str, dict[str, list[Any]]] = {group: {} for group in self._envs}
         self._expert_rewards: dict[str, float] = {}
         self._start = 0.0
         self.stopped = False  # by ``should_continue``
@@ -94,14 +92,13 @@ class BestModel(EveryTimesteps):
         super()._on_training_start()
         for group, path in self._paths.items():
             if path.is_file():
-                arrays = read_arrays(path)
-                self._rows[group] = {key: list(array) for key, array in arrays.items() if key in KEYS + MORE or _is_loss(key)}
-                flown = arrays["results"].shape[-1]
+                self._rows[group] = {name: list(array) for name, array in read_arrays(path).items()}
+                flown = len(self._rows[group]["results"][-1])
                 if flown != self._n_episodes:
                     raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")
         rows = self._rows["eval"]
-        self._start = time.perf_counter() - (rows["seconds"] or [0.0])[-1]
-        self.best = max(map(_score, rows["successes"], rows["results"]), default=self.best)
+        self._start = time.perf_counter() - rows.get("seconds", [0.0])[-1]
+        self.best = max(map(_score, rows.get("successes", []), rows.get("results", [])), default=self.best)
 
     def _on_event(self) -> bool:
         self.evaluate()
@@ -128,55 +125,59 @@ class BestModel(EveryTimesteps):
         self.stopped = not self._should_continue(*score)
 
     def _fly(self, group: str, seconds: float) -> Score:
-        env, rows, successes, survived = self._envs[group], self._rows[group], [], []
+        """Evaluate in one group's environments; write and log the results."""
+        env, successes, survivals = self._envs[group], [], []
         unreported = 0  # ends in a row
 
         def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
             nonlocal unreported
-            if local_variables["done"]:  # an environment that knows no success counts as failing: reward decides
-                info = local_variables["info"]
-                if local_variables.get("is_monitor_wrapped") and "episode" not in info:  # evaluate_policy does not count it
-                    unreported += 1
-                    if unreported > LIVES * env.num_envs:
-                        raise TrainingError("evaluation: a wrapper drops info['episode'], by which SB3 counts episodes")
-                    return
-                unreported = 0
-                successes.append(float(info.get("is_success", 0.0)))
-                if "survival" in info:
-                    survived.append(float(info["survival"]))
+            info = local_variables["info"]
+            if not local_variables["done"]:
+                return
+            if local_variables.get("is_monitor_wrapped") and "episode" not in info:  # evaluate_policy does not count it
+                unreported += 1
+                if unreported > LIVES * env.num_envs:
+                    raise TrainingError("evaluation: a wrapper drops info['episode'], by which SB3 counts episodes")
+                return
+            unreported = 0
+            successes.append(float(info.get("is_success", 0.0)))  # without reports all fail, and reward decides
+            survivals.append(float(info.get("survival", np.nan)))
 
         rewards, lengths = self._evaluate(self.model, env, note)
-        for key, value in zip(KEYS, (self.num_timesteps, rewards, lengths, successes, seconds), strict=True):
-            rows[key].append(value)
-        if len(survived) == len(successes):
-            rows.setdefault("survivals", [[np.nan] * self._n_episodes] * (len(rows["timesteps"]) - 1)).append(survived)
-        if group == "eval":
-            self._note_losses(rows)
-        write_arrays(self._paths[group], **rows)
+        values = {"timesteps": self.num_timesteps, "results": rewards, "ep_lengths": lengths, "successes": successes}
+        values["seconds"] = seconds
+        if not np.isnan(survivals).any():
+            values["survivals"] = survivals
+        if group == "eval":  # of the latest update, which the log still holds
+            values |= {name: float(value) for name, value in self.logger.name_to_value.items() if _is_loss(name)}
+        _append(self._rows[group], values)
+        write_arrays(self._paths[group], **self._rows[group])
         success, reward = score = _score(successes, rewards)
-        self.logger.record(f"{group}/success_rate", success)
-        self.logger.record(f"{group}/mean_reward", reward)
-        if survived:
-            self.logger.record(f"{group}/survival_rate", float(np.mean(survived)))
-        self.logger.record(f"{group}/mean_ep_length", float(np.mean(lengths)))
+        logged = {"success_rate": success, "mean_reward": reward, "mean_ep_length": float(np.mean(lengths))}
+        if "survivals" in values:
+            logged["survival_rate"] = float(np.mean(survivals))
         if self._expert is not None:
             if group not in self._expert_rewards:
                 expert = Controller.for_env(self._expert, env)
                 self._expert_rewards[group] = float(np.mean(self._evaluate(expert, env)[0]))
-            self.logger.record(f"{group}/reward_against_expert", reward - self._expert_rewards[group])
+            logged["reward_against_expert"] = reward - self._expert_rewards[group]
+        for name, value in logged.items():
+            self.logger.record(f"{group}/{name}", value)
         return score
-
-    def _note_losses(self, rows: dict[str, Any]) -> None:
-        """Those of the latest update, which the log still holds; NaN where there is none, as before the first."""
-        latest = {name: float(value) for name, value in self.logger.name_to_value.items() if _is_loss(name)}
-        before = len(rows["timesteps"]) - 1
-        for name in {*latest, *filter(_is_loss, rows)}:
-            rows.setdefault(name, [np.nan] * before).append(latest.get(name, np.nan))
 
     def _evaluate(self, model: Any, env: VecEnv, callback: Any = None) -> tuple[Any, Any]:
         """Rewards and lengths of the same episodes each time, (n_episodes,) both."""
         env.seed(self._seed)
         return evaluate_policy(model, env, self._n_episodes, callback=callback, return_episode_rewards=True, warn=False)
+
+
+def _append(rows: dict[str, list[Any]], values: dict[str, Any]) -> None:
+    """Add an evaluation to those before it; NaN stands for what one of them does not have, such as losses before the first."""
+    before = len(rows.get("timesteps", []))
+    for name in {**rows, **values}:
+        example = values[name] if name in values else rows[name][-1]
+        nothing = np.full(np.shape(example), np.nan)
+        rows.setdefault(name, [nothing] * before).append(values.get(name, nothing))
 
 
 def _is_loss(name: str) -> bool:

@@ -114,8 +114,6 @@ class FlightMetrics(BaseCallback):
         }
         return {f"rollout/{name}": float(values.mean()) for name, values in means.items() if values.size}
 
-    figures = metrics  # its former name
-
     def _on_training_start(self) -> None:
         env, state = self.training_env, true_state_of(self.training_env)
         if state is None or not env.has_attr("vehicle"):

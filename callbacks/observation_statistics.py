@@ -10,7 +10,7 @@ from stable_baselines3.common.running_mean_std import RunningMeanStd
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import one_line, read_arrays, refuse_existing, write_arrays, write_text
+from sb3_quad.base.files import one_line, refuse_existing, write_text
 from sb3_quad.base.yaml_files import SUFFIXES, parse_mapping_file
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.simulation.observation import FEATURE_NAMES, FEATURES, GROUPS, OBSERVATION_SIZE
@@ -42,20 +42,20 @@ class ObservationStatistics(EveryTimesteps):
     velocity   ...  5.000 m/s
     body_rates ...  5.000 rad/s
 
-    :param path: a ``.yaml`` or ``.npz`` file for the results, written whole or not at all; None for no file. A training that
-        is continued (``reset_num_timesteps=False``) continues the file; any other refuses an existing one. Its
-        ``observation_std`` is a list as ``env_kwargs`` takes it.
+    :param path: a YAML file for the results, written whole or not at all; None for no file. A training that is continued
+        (``reset_num_timesteps=False``) continues the file; any other refuses an existing one. Its ``observation_std`` is a
+        list as ``env_kwargs`` takes it.
     :param every: timesteps after which they are logged (``observation/std_<group>``) and saved; also done at the end.
     :param verbose: 1: prints the table at the end.
-    :raises ConfigError: another kind of file, ``every`` below 1; when training begins, a file that exists, or observations
+    :raises ConfigError: a file that is no YAML, ``every`` below 1; when training begins, a file that exists, or observations
         that are not one array of numbers.
     """
 
     def __init__(self, path: str | Path | None = None, every: int = 100_000, verbose: int = 0) -> None:
         super().__init__(every, verbose)
         self._path = None if path is None else Path(path)
-        if self._path is not None and self._path.suffix not in (*SUFFIXES, ".npz"):
-            raise ConfigError(f"ObservationStatistics: {path}: must be a .yaml or .npz file")
+        if self._path is not None and self._path.suffix not in SUFFIXES:
+            raise ConfigError(f"ObservationStatistics: {path}: must be a .yaml file")
         self._moments = RunningMeanStd(epsilon=0.0)
         self._quadcopter = False
 
@@ -124,17 +124,14 @@ class ObservationStatistics(EveryTimesteps):
                 print(self.table())
 
     def save(self, path: str | Path) -> None:
-        """Write count, μ, σ and the names of the features, as YAML or npz by the file's suffix.
+        """Write count, μ, σ and the names of the features as YAML.
 
         :raises ConfigError: a folder that cannot be written, a full disk.
         """
         names = list(FEATURE_NAMES) if self._quadcopter else [str(number) for number in range(len(self.mean))]
         moments = {"features": names, "observation_mean": self.mean.tolist(), "observation_std": self.std.tolist()}
-        if Path(path).suffix == ".npz":
-            write_arrays(path, count=self.count, **moments)
-        else:
-            content = {"count": self.count, "groups": self.groups(), **moments}
-            write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=127))
+        content = {"count": self.count, "groups": self.groups(), **moments}
+        write_text(path, yaml.safe_dump(content, sort_keys=False, default_flow_style=None, width=127))
 
 
 def _read(path: Path, moments: RunningMeanStd) -> None:
@@ -143,7 +140,7 @@ def _read(path: Path, moments: RunningMeanStd) -> None:
     :raises ConfigError: a file that is damaged, or of another number of features.
     """
     try:
-        content = read_arrays(path) if path.suffix == ".npz" else parse_mapping_file(path)
+        content = parse_mapping_file(path)
         mean, std = (np.array(content[f"observation_{name}"], dtype=np.float64) for name in ("mean", "std"))
         if not mean.shape == std.shape == moments.mean.shape:
             raise ValueError(f"it is of {mean.size} features, these observations have {moments.mean.size}")

@@ -422,7 +422,7 @@ def test_the_benchmark_says_where_the_time_of_a_training_goes(tmp_path, capsys):
         whole = sum(parts.values())
         rates = next(entry["rates"] for entry in content["results"] if entry["name"] == f"{algorithm}, whole loop")
         assert whole == pytest.approx(sum(40 / rate for rate in rates) / len(rates), rel=0.2)
-    assert "update: optimiser" in capsys.readouterr().out
+    assert "rollout: the rest" in capsys.readouterr().out
 
 
 def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with(monkeypatch):

@@ -4,8 +4,8 @@ import itertools
 import platform
 import re
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from importlib import metadata
@@ -19,11 +19,8 @@ import numba
 import numpy as np
 import torch
 from gymnasium.wrappers import Autoreset
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.algorithms import common
-from sb3_quad.algorithms.networks import Perceptron
 from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.version import __version__
@@ -36,11 +33,7 @@ from sb3_quad.training.trainer import build_model
 ENV_ID = "QuadTargetTracking-v0"
 TRAINED = "QuadStateRecovery-v0"  # by train without arguments
 REPETITIONS = 5
-PARTS = (
-    *("rollout: environment", "rollout: labels", "rollout: forward", "rollout"),
-    *("update: forward and backward", "update: optimiser", "update"),
-)
-"""Of a training loop; the last of a rollout, and of an update, is what remains of it, such as buffers and mini-batches."""
+PARTS = ("rollout: environment", "rollout: labels", "rollout: the rest", "update")
 NAMES = {"batch": "batch", "dummy": "PyBullet, DummyVecEnv", "subproc": "PyBullet, SubprocVecEnv"}
 PACKAGES = ("stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 
@@ -65,17 +58,17 @@ def single(seconds: float) -> list[Measurement]:
         return _measure({"PyBullet, one environment": env}, 1, (4,), seconds)
 
 
-def vectorised(kind: str, n_envs: int, seconds: float, worlds: Any = None) -> list[Measurement]:
+def vectorised(kind: str, n_envs: int, seconds: float, randomize: Any = None) -> list[Measurement]:
     """``VecEnv.step`` of ``batch``, ``dummy`` or ``subproc``: physics, noise, reward, resets, infos; random actions.
 
-    :param worlds: ``randomize``, worlds to fly in as well, in turns with still air: on a shared machine the speed changes
-        from second to second.
+    :param randomize: worlds to fly in as well, in turns with still air: on a shared machine the speed changes from second to
+        second.
     """
     envs: dict[str, Any] = {}
     with ExitStack() as stack:
-        for name, randomize in ((NAMES[kind], {}), (f"{NAMES[kind]}, random worlds", worlds)):
-            if randomize is not None:
-                settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": {"randomize": randomize}}
+        for name, randomized in ((NAMES[kind], {}), (f"{NAMES[kind]}, random worlds", randomize)):
+            if randomized is not None:
+                settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": {"randomize": randomized}}
                 env = stack.enter_context(closing(make_environments(build_config("ppo", ENV_ID, settings), n_envs, 0)))
                 env.reset()
                 envs[name] = env
@@ -112,7 +105,10 @@ def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[
     with closing(make_environments(config, config.n_envs, 0)) as env:
         model, clock = build_model(TrainingJob(config=config), env), _Clock()
         steps = config.rollout_steps * config.n_envs
-        with clock.parts_of(model):
+        vec_env: Any = model.get_env()
+        with ExitStack() as stack:
+            for owner, name, part in ((vec_env, "step", "environment"), (Controller, "labels", "labels")):
+                stack.enter_context(patch.object(owner, name, clock.timed(getattr(owner, name), f"rollout: {part}")))
             model.learn(steps * (rollouts + 1), callback=clock)
     rollout, update = np.diff(clock.times).reshape(-1, 2)[1:].T
     whole = {"whole loop": rollout + update, "rollout": rollout, "update": update}
@@ -120,64 +116,41 @@ def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[
         Measurement(f"{config.algo}, {part}", config.n_envs, float(np.median(steps / seconds)), (steps / seconds).tolist())
         for part, seconds in whole.items()
     ]
-    return rates, {part: clock.seconds[part] / rollouts for part in PARTS}
+    rest = rollout.sum() - sum(clock.seconds.values())
+    seconds = {**clock.seconds, "rollout: the rest": float(rest), "update": float(update.sum())}
+    return rates, {part: seconds[part] / rollouts for part in PARTS}
 
 
 class _Clock(BaseCallback):
-    """When rollouts begin and end; an update is what lies between two of them. And how long the parts of both take."""
+    """When rollouts begin and end (an update lies between two of them), and how long what rollouts call takes."""
 
     def __init__(self) -> None:
         super().__init__()
         self.times: list[float] = []
         self.seconds: dict[str, float] = {}
-        self._phase = "rollout"
-        self._within = 0.0  # seconds of the parts that the part under way has called
 
     def _note(self) -> None:
         self.times.append(time.perf_counter())
         if len(self.times) == 3:  # the second rollout
-            self.seconds = dict.fromkeys(PARTS, 0.0)
+            self.seconds = dict.fromkeys(self.seconds, 0.0)
 
     _on_rollout_start = _on_rollout_end = _on_training_end = _note
 
     def _on_step(self) -> bool:
         return True
 
-    def _timed(self, part: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
+        """The function, whose time is added to that of a part."""
+        self.seconds[part] = 0.0
+
         def call(*args: Any, **kwargs: Any) -> Any:
-            outer, self._within = self._within, 0.0
-            if part in ("rollout", "update"):
-                self._phase = part
-            name = next((each for each in PARTS if each.startswith(f"{self._phase}: {part}")), part)
             start = time.perf_counter()
             try:
                 return function(*args, **kwargs)
             finally:
-                took = time.perf_counter() - start
-                self.seconds[name] = self.seconds.get(name, 0.0) + took - self._within
-                self._within = outer + took
+                self.seconds[part] += time.perf_counter() - start
 
         return call
-
-    @contextmanager
-    def parts_of(self, model: BaseAlgorithm) -> Iterator[None]:
-        """Within the block, time what the model calls."""
-        env, optimizer = model.get_env(), model.policy.optimizer
-        forward = ("outputs", "act", "actor_mean", "critic_values", "evaluate_actions")
-        places = [
-            *((model, "collect_rollouts", "rollout"), (model, "train", "update")),
-            *((env, "step_async", "environment"), (env, "step_wait", "environment")),
-            *((Controller, "labels", "labels"), (model.policy, "forward", "forward")),
-            *((common, name, "forward") for name in forward),
-            *((torch.Tensor, "backward", "forward"), (Perceptron, "gradient", "forward")),
-            (torch.nn.utils, "clip_grad_norm_", "optimiser"),
-            *((optimizer, "step", "optimiser"), (optimizer, "zero_grad", "optimiser")),
-        ]
-        with ExitStack() as stack:
-            for owner, name, part in places:
-                function = getattr(owner, name)
-                stack.enter_context(patch.object(owner, name, self._timed(part, function)))
-            yield
 
 
 def machine() -> dict[str, Any]:
