@@ -47,11 +47,3 @@ def test_the_page_lists_every_callback_and_its_settings_are_read():
     assert config.callback
     for path, keywords in config.callback:
         import_class(path, "callback")(**keywords)
-
-
-@pytest.mark.parametrize("name", sorted(path.stem for path in (ROOT / "callbacks").glob("*.py")))
-def test_no_callback_needs_the_imitation_package(name):
-    module = "sb3_quad.callbacks" if name == "__init__" else f"sb3_quad.callbacks.{name}"
-    importlib.import_module(module)
-    text = (ROOT / "callbacks" / f"{name}.py").read_text(encoding="utf-8")
-    assert not re.search(r"^\s*(import|from) imitation", text, flags=re.MULTILINE)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.yaml_files import YamlFolder, parse_mapping_file, parse_yaml
+from sb3_quad.base.yaml_files import YamlFolder
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 SETTINGS = YamlFolder("settings", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("thesis",))
@@ -82,13 +82,3 @@ def test_what_is_wrong_is_one_line(here, source, content, message):
     with pytest.raises(ConfigError) as caught:
         VEHICLES.read(source)
     assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
-
-
-def test_files_of_any_place(here):
-    (here / "a.yml").write_text("x: 1\ny: [2]")
-    assert parse_mapping_file(here / "a.yml") == {"x": 1, "y": [2]}
-    (here / "a.yml").write_text("text")
-    with pytest.raises(ConfigError, match="must hold keys and values"):
-        parse_mapping_file(here / "a.yml")
-    with pytest.raises(ConfigError, match=r"^here: not valid YAML"):
-        parse_yaml("a: [", "here")

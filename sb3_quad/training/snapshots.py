@@ -24,9 +24,7 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
-# Before the names of the arrays of the environments, of the dataset, and of what the algorithm keeps beside its zip.
-ENVIRONMENT, DATASET, MEMORY = "environment.", "dataset.", "memory."
-BUFFER_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")  # of a replay buffer
+ENVIRONMENT, DATASET, EXPERT_STATE = "environment.", "dataset.", "expert_state."  # before the names of their arrays
 SHARE = 0.03  # of the run's time that snapshots may take
 
 
@@ -79,7 +77,7 @@ class SnapshotFile(LastGoodModel):
         batch: Any = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
         state = random_state()
         state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
-        state |= _with_prefix(MEMORY, model.memory() if hasattr(model, "memory") else {})
+        state |= _with_prefix(EXPERT_STATE, model.memory() if hasattr(model, "memory") else {})
         if self._run.episodes.is_file():
             state["episodes"] = np.array(self._run.episodes.stat().st_size)
         if self._run.best_model.is_file():
@@ -138,7 +136,7 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
     if environment:
         batch.restore(environment)
         if hasattr(model, "restore_memory"):
-            model.restore_memory(_part(state, MEMORY))
+            model.restore_memory(_part(state, EXPERT_STATE))
     _take_back(run, state, model.num_timesteps)
     set_random_state(state)
     return cast(BaseAlgorithm, model)
@@ -163,11 +161,10 @@ def _filled(buffer: ReplayBuffer) -> Arrays:
 
     :raises ConfigError: observations that are a Dict.
     """
-    arrays: dict[str, Any] = {name: getattr(buffer, name) for name in BUFFER_ARRAYS if hasattr(buffer, name)}
-    if isinstance(arrays["observations"], dict):
+    if isinstance(buffer.observations, dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
     rows = buffer.size() + 1  # the memory-efficient variant keeps the last next observation there
-    return {name: array[:rows] for name, array in arrays.items()}
+    return {name: array[:rows] for name, array in vars(buffer).items() if isinstance(array, np.ndarray)}
 
 
 def _fill(buffer: ReplayBuffer, arrays: Arrays, path: Path) -> None:

@@ -39,7 +39,7 @@ TEXTS = [  # as arguments; values that are only large are those of the corpus
 ]
 VALUES: list[Any] = [  # in YAML
     *(None, True, "", "x", "nan", -1, 0, 0.5, float("nan"), float("inf"), 10**30, [], [[]], [None], {}, {"a": "b"}, {1: 2}),
-    *("os.system", {"os.system": {}}, "lin_x", "../escaped", "/dev/zero", "__import__('os').system('touch escaped')"),
+    *("os.system", {"os.system": {}}, "lin_x", "../escaped", "__import__('os').system('touch escaped')"),
     *("x" * 5000, "\x00", [1, 2], [1, 2, 3], ["a"] * 4, [float("nan")] * 3, {"name": {"name": {}}}),
 ]
 SUITE = {"name": "one", "scenarios": [{"name": "near", "target": {"distance": 1.0}, "duration": 2.0, "episodes": 2}]}
