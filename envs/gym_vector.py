@@ -12,16 +12,11 @@ from gymnasium.vector.utils import batch_space
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.validate import validate
-from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
-_INFOS = {"is_success": "success", "survival": "truncated"} | {key: key for key in ("distance", "collision", "out_of_range")}
 
-
-class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
+class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
     """The batched environment for users outside Stable-Baselines3.
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8, vectorization_mode="vector_entry_point")`` makes one. The
@@ -60,9 +55,7 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}  # type: ignore[misc]
-        own = {"task": task, "task_kwargs": task_kwargs}
-        settings = validate(FlightSettings, {**own, **keywords}, type(self).__name__)
-        self.batch = QuadcopterBatch(num_envs, settings, seed, n_threads, autoreset=False)
+        self._make_batch(num_envs, seed, n_threads, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords)
         self.num_envs = self.batch.n
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step, or by the user
         self.single_observation_space, self.single_action_space = quadcopter_spaces(self.batch.observation.size)
@@ -124,5 +117,5 @@ class QuadcopterVectorEnv(InFlight, VectorEnv[Float32Array, Float32Array, npt.ND
     def _infos(self, rows: BoolArray | None = None) -> dict[str, Any]:
         """What the last step of some rows, (n,), was; None: of all. Elsewhere zeros."""
         mask = np.ones(self.num_envs, dtype=np.bool_) if rows is None else rows.copy()
-        infos = {key: self.batch.outcome[field] * mask for key, field in _INFOS.items()}
+        infos = {key: self.batch.outcome[field] * mask for key, field in INFOS.items()}
         return infos | {f"_{key}": mask for key in infos}

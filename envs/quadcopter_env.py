@@ -9,19 +9,17 @@ import numpy.typing as npt
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.validate import validate
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
-from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
 from sb3_quad.envs.reset_options import fixed_rows
-from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
-from sb3_quad.simulation.settings import ENDLESS, FlightSettings
+from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD
 from sb3_quad.simulation.tasks import TaskSpec
 
 
-class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
+class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     """
     ## Description
 
@@ -169,10 +167,9 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
-        own = {"task": task, "task_kwargs": task_kwargs, "max_episode_steps": ENDLESS}  # Gymnasium's TimeLimit truncates
-        settings = validate(FlightSettings, {**own, **keywords}, type(self).__name__)
-        # One row of the batched environment, whose body PyBullet moves.
-        self.batch = QuadcopterBatch(1, settings, seed, n_threads=1, autoreset=False)
+        # One row of the batched environment, whose body PyBullet moves; Gymnasium's TimeLimit truncates.
+        keywords = {"task": task, "task_kwargs": task_kwargs, "max_episode_steps": ENDLESS, **keywords}
+        self._make_batch(1, seed, n_threads=1, autoreset=False, **keywords)
         self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
@@ -243,14 +240,7 @@ class QuadcopterEnv(InFlight, gymnasium.Env[Float32Array, Float32Array]):
         return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
     def _info(self) -> dict[str, Any]:
-        ended = self.batch.outcome[0]
-        return {
-            "is_success": bool(ended["success"]),
-            "survival": bool(ended["truncated"]),
-            "distance": float(ended["distance"]),
-            "collision": bool(ended["collision"]),
-            "out_of_range": bool(ended["out_of_range"]),
-        }
+        return {key: self.batch.outcome[field][0].item() for key, field in INFOS.items()}
 
     def render(self) -> Image | None:
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""

@@ -15,16 +15,15 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvO
 from sb3_quad.base.arrays import Image
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.base.validate import validate
-from sb3_quad.envs.in_flight import InFlight, quadcopter_spaces
-from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.simulation.checks import check_size
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.kernel import OUTCOME
 from sb3_quad.simulation.tasks import TaskSpec
 
 if TYPE_CHECKING:
     from sb3_quad.envs.bullet import Renderer
 
+_OUTCOME = OUTCOME.names or ()
 _SETTABLE = ("target", "noise", "observation_mean", "observation_std", "task")
 _OF_ROWS = ("target", "noise", "additive_noise", "observation_mean", "observation_std", "wrench")
 _METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
@@ -43,7 +42,7 @@ class RowSeeds(VecEnv):
         return [*self._seeds]
 
 
-class QuadcopterVecEnv(InFlight, RowSeeds):
+class QuadcopterVecEnv(BatchEnv, RowSeeds):
     """n quadcopters stepped together by compiled code; the flight is PyBullet's to 1e-9.
 
     The learning problem, the arguments and the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`;
@@ -79,9 +78,7 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
         n_threads: int | None = None,
         **keywords: Any,
     ) -> None:
-        own = {"task": task, "task_kwargs": task_kwargs}
-        settings = validate(FlightSettings, {**own, **keywords}, type(self).__name__)
-        self.batch = QuadcopterBatch(n_envs, settings, seed, n_threads)
+        self._make_batch(n_envs, seed, n_threads, autoreset=True, task=task, task_kwargs=task_kwargs, **keywords)
         self.render_mode, self._staggered = render_mode, staggered
         self._renderers = self._make_renderers(render_rows, render_width, render_height)
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
@@ -132,17 +129,13 @@ class QuadcopterVecEnv(InFlight, RowSeeds):
             self._follow(ended)
             elapsed = round(time.time() - self._start, 6)
             outcomes, last = self.batch.outcome[rows].tolist(), self.batch.last_observations[rows]  # copies
-            for row, outcome, observation in zip(ended, outcomes, last, strict=True):
-                total, _, length, distance, collision, out_of_range, truncated, success = outcome
+            for row, values, observation in zip(ended, outcomes, last, strict=True):
+                outcome = dict(zip(_OUTCOME, values, strict=True))
                 self._infos[row] = {
                     "terminal_observation": observation,
-                    "TimeLimit.truncated": truncated,
-                    "episode": {"r": round(total, 6), "l": length, "t": elapsed},
-                    "is_success": success,
-                    "survival": truncated,
-                    "distance": distance,
-                    "collision": collision,
-                    "out_of_range": out_of_range,
+                    "TimeLimit.truncated": outcome["truncated"],
+                    "episode": {"r": round(outcome["total"], 6), "l": outcome["length"], "t": elapsed},
+                    **{key: outcome[field] for key, field in INFOS.items()},
                 }
         return observations, rewards, dones, self._infos
 

@@ -10,7 +10,7 @@ from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.controllers.controller import Controller
-from sb3_quad.envs.in_flight import quadcopter_spaces
+from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import ACTIONS, fly_settings
 from sb3_quad.simulation import MAX_EPISODE_STEPS

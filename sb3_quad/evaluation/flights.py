@@ -16,7 +16,7 @@ from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.base.errors import ConfigError, ControllerError, unknown
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.controllers.controller import Controller
-from sb3_quad.envs.in_flight import quadcopter_spaces
+from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS

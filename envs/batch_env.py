@@ -9,21 +9,25 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import TARGET
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
 P = ParamSpec("P")
 T = TypeVar("T")
+INFOS = {"is_success": "success", "survival": "truncated"} | {key: key for key in ("distance", "collision", "out_of_range")}
+"""Keys of an info, and the fields of ``batch.outcome`` that they show."""
 
 
-def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[Concatenate["InFlight", P], T]:
+def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[Concatenate["BatchEnv", P], T]:
     """The method of an environment that is this one of its batch."""
 
     @functools.wraps(method)
-    def call(self: "InFlight", /, *args: P.args, **kwargs: P.kwargs) -> T:
+    def call(self: "BatchEnv", /, *args: P.args, **kwargs: P.kwargs) -> T:
         return method(self.batch, *args, **kwargs)
 
     return call
@@ -35,7 +39,7 @@ def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], s
     return observations, spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
-class InFlight:
+class BatchEnv:
     """An environment whose rows are those of ``batch``; ``QuadcopterEnv`` has one, and its values are without a row axis.
 
     ``indices`` says which rows are set: a number, several, a slice, or None for all. What is set holds until it is set anew,
@@ -43,6 +47,11 @@ class InFlight:
     """
 
     batch: QuadcopterBatch
+
+    def _make_batch(self, n: int, seed: int | None, n_threads: int | None, autoreset: bool, **keywords: Any) -> None:
+        """Make the batch of n rows that fly as the keywords say; errors name the environment's class."""
+        settings = validate(FlightSettings, keywords, type(self).__name__)
+        self.batch = QuadcopterBatch(n, settings, seed, n_threads, autoreset)
 
     def __copy__(self) -> Any:
         return copy.deepcopy(self)  # two environments that share a batch would fly each other's rows
@@ -60,7 +69,7 @@ class InFlight:
 
     @property
     def vehicle(self) -> Vehicle:
-        """The vehicle of row 0 (of all rows, unless a sequence was given)."""
+        """The vehicle of row 0."""
         return self.batch.vehicle_list[0]
 
     @property
@@ -75,7 +84,7 @@ class InFlight:
 
     @property
     def task(self) -> TaskSpec:
-        """The task of the episodes that begin from now on, as it was given; ``task_kwargs`` are fields put over it."""
+        """The task of the episodes that begin from now on, as it was given; ``task_kwargs`` replace fields of it."""
         return self.batch.task
 
     @property
@@ -90,7 +99,7 @@ class InFlight:
 
     @property
     def additive_noise(self) -> Any:
-        """Standard deviations of the noise that is added, in σ, (n,)."""
+        """Standard deviations of the additive noise, in σ, (n,)."""
         return self._by_row(self.batch.additive_level)
 
     @property
