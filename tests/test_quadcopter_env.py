@@ -1,5 +1,6 @@
 """The PyBullet environment: Gymnasium's and SB3's contracts, its physics against written-out equations, bad input."""
 
+import re
 import subprocess
 import sys
 import warnings
@@ -11,12 +12,10 @@ import numpy.typing as npt
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-import sb3_quad
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 IDS = ["QuadTargetTracking-v0", "QuadStateRecovery-v0"]
@@ -103,35 +102,6 @@ def test_flight_is_the_specified_integrator(wrench: dict[str, str], delay: int) 
     env.close()
 
 
-@pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
-def test_row_of_the_batched_environment_flies_the_same(task: str) -> None:
-    """Observation (with noise), reward and end of row i are those of this environment after reset(seed=its own)."""
-    from sb3_quad.envs.vec_env import QuadcopterVecEnv
-
-    batched = QuadcopterVecEnv(2, task=task, seed=5)
-    envs = [QuadcopterEnv(task=task) for _ in range(2)]
-    rows = batched.reset()
-    for row, env in enumerate(envs):
-        np.testing.assert_allclose(env.reset(seed=row_seeds(5, 2)[row])[0], rows[row], atol=1e-6)
-    rng = np.random.default_rng(0)
-    for _ in range(150):
-        actions = rng.uniform(-1.2, 1.2, (2, 4)).astype(np.float32)
-        rows, rewards, done, infos = batched.step(actions)
-        for row, env in enumerate(envs):
-            observation, reward, terminated, _, info = env.step(actions[row])
-            assert terminated == done[row]
-            np.testing.assert_allclose(reward, rewards[row], atol=1e-6)
-            if terminated:
-                np.testing.assert_allclose(observation, infos[row]["terminal_observation"], atol=1e-6)
-                assert {key: infos[row][key] for key in ("collision", "out_of_range", "is_success", "survival")} == {
-                    key: info[key] for key in ("collision", "out_of_range", "is_success", "survival")
-                }
-                observation, _ = env.reset()
-            np.testing.assert_allclose(observation, rows[row], atol=1e-6)
-    for env in envs:
-        env.close()
-
-
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
 def test_both_checkers_pass(env_id: str, render_mode: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,15 +139,6 @@ def test_same_seed_same_episode(env_id: str) -> None:
     first.close(), second.close()
 
 
-def test_each_observation_is_a_fresh_array(env: QuadcopterEnv) -> None:
-    observation, _ = env.reset(seed=0)
-    kept = observation.copy()
-    later, *_ = env.step(np.ones(4, dtype=np.float32))
-    assert observation.dtype == later.dtype == np.float32
-    assert later is not observation
-    np.testing.assert_array_equal(observation, kept)
-
-
 def test_hovers_on_zero_action(env: QuadcopterEnv) -> None:
     env.reset(seed=0, options={"target": (1.0, 2.0, 15.0)})
     for _ in range(100):
@@ -205,15 +166,6 @@ def test_ends_out_of_range(env: QuadcopterEnv) -> None:
     env.set_target((0, 0, 45.5))
     _, reward, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
     assert terminated and not truncated and info["out_of_range"] and not info["survival"] and reward < -15
-
-
-def test_truncated_after_1500_steps() -> None:
-    env = gymnasium.make("QuadTargetTracking-v0")
-    env.reset(seed=0)
-    for step in range(1, 1501):
-        _, _, terminated, truncated, info = env.step(np.zeros(4, dtype=np.float32))
-        assert not terminated and truncated == (step == 1500) and info["survival"]
-    env.close()
 
 
 def test_setters_act_while_flying(env: QuadcopterEnv) -> None:
@@ -264,10 +216,8 @@ def test_fixed_start(env: QuadcopterEnv) -> None:
     ("action", "message"),
     [
         (np.full(4, np.nan), "finite"),
-        (np.array([0, 0, np.inf, 0]), "finite"),
         (np.zeros(3), r"\(3,\).*\(4,\)"),
         (np.zeros((1, 4)), r"\(1, 4\).*\(4,\)"),
-        (0.0, r"\(\).*\(4,\)"),
     ],
 )
 def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) -> None:
@@ -288,15 +238,12 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: env.reset(options={"state": 3}), "state"),
         (lambda env: env.reset(options={"target": (0, 0)}), "options: target"),
         (lambda env: env.set_target((0, 0, np.nan)), "target .*finite"),
-        (lambda env: env.set_target("up"), "target"),
         (lambda env: env.set_wrench(force=(1, 2)), r"force of shape \(2,\): must be \(3,\)"),
-        (lambda env: env.set_wrench(torque=(1, 2, np.inf)), "torque .*finite"),
         (lambda env: env.set_wrench(force=(1, 2, 3), force_frame="wrld"), "force_frame 'wrld'"),
         (lambda env: env.set_noise(-1), "noise"),
         (lambda env: env.set_observation_scaling(std=np.zeros(18)), "observation_std"),
-        (lambda env: env.set_observation_scaling(mean=np.zeros(17)), r"observation_mean of shape \(17,\)"),
         (lambda env: env.set_task("target_trackin"), "did you mean 'target_tracking'"),
-        (lambda env: QuadcopterEnv(task_kwargs={"target_distnce": 3}), "did you mean 'target_distance'"),
+        (lambda env: QuadcopterEnv(noize=0), "QuadcopterEnv: unknown key 'noize': did you mean 'noise'"),
         (lambda env: QuadcopterEnv(vehicle="itn"), "did you mean 'itm'"),
         (lambda env: QuadcopterEnv(render_mode="rgb_aray"), "did you mean 'rgb_array'"),
     ],
@@ -331,27 +278,7 @@ def test_close_twice_and_neighbours_live_on() -> None:
     first.close()
 
 
-def _make() -> gymnasium.Env[Any, Any]:
-    return gymnasium.make("QuadStateRecovery-v0")
-
-
-@pytest.mark.parametrize("kind", [DummyVecEnv, SubprocVecEnv])
-def test_side_by_side_as_alone(kind: Any) -> None:
-    """Instances in one process and in several do not disturb each other."""
-    actions = np.random.default_rng(0).uniform(-1, 1, (20, 4)).astype(np.float32)
-    # Forked workers need not import torch again; the default start method takes seconds for that.
-    options = {"start_method": "fork"} if kind is SubprocVecEnv and sys.platform == "linux" else {}
-    together = kind([_make] * 2, **options)
-    together.seed(11)
-    rows = [together.reset()] + [together.step(np.stack([action, -action]))[0] for action in actions]
-    together.close()
-    for row, sign in ((0, 1), (1, -1)):
-        alone = _make()
-        seen = [alone.reset(seed=11 + row)[0]] + [alone.step(sign * action)[0] for action in actions]
-        np.testing.assert_array_equal(np.array(rows)[:, row], seen)
-        alone.close()
-
-
+@pytest.mark.slow
 def test_import_is_light() -> None:
     """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for gymnasium.make.
 
@@ -368,10 +295,9 @@ def test_import_is_light() -> None:
     assert result.stderr.splitlines() == ["told"]
 
 
-def test_package_names() -> None:
-    from sb3_quad import envs
-
-    assert envs.QuadcopterEnv is QuadcopterEnv
-    assert set(IDS) <= set(gymnasium.registry) and sb3_quad.__version__
-    with pytest.raises(AttributeError):
-        _ = envs.Quadcopter
+def test_the_manual_lists_every_argument() -> None:
+    table = (QuadcopterEnv.__doc__ or "").split("## Arguments")[1].split("## While")[0]
+    cells = [line.split("|")[1] for line in table.splitlines() if line.strip().startswith("| `")]
+    listed = {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
+    drawn = {"render_mode", "render_width", "render_height"}
+    assert listed == {*FlightSettings.model_fields, *drawn} - {"max_episode_steps"}  # an argument of gymnasium.make

@@ -87,10 +87,6 @@ def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -
     )
 
 
-def test_zero_action_is_hover_for_the_default_vehicle() -> None:
-    np.testing.assert_allclose(ITM.action_to_thrust(np.zeros(4)), ITM.hover_thrust, rtol=1e-15)
-
-
 @given(vehicles())
 def test_kernel_parameters_are_in_their_order(vehicle: Vehicle) -> None:
     values = dict(zip(PARAMETER_NAMES, vehicle.parameters(), strict=True))
@@ -120,14 +116,6 @@ def test_gains_stay_with_the_vehicle_they_were_found_for() -> None:
     assert ITM.model_copy(update=given).geometric_gains == ITM.geometric_gains
 
 
-def test_copy_of_a_used_vehicle_has_its_own_mixer() -> None:
-    """Cached derived values do not follow into a copy with other parameters."""
-    assert ITM.mixer[3, 0] == 0.016
-    other = ITM.model_copy(update={"moment_thrust_ratio": 0.03})
-    assert other.mixer[3, 0] == 0.03
-    np.testing.assert_allclose(other.mixer @ other.mixer_inverse, np.eye(4), atol=1e-12)
-
-
 def test_file_round_trip(tmp_path: Path) -> None:
     assert load_vehicle(write(tmp_path / "same.yaml")) == ITM
     assert load_vehicle(str(write(tmp_path / "other.yml", mass=2.5))).mass == 2.5
@@ -149,12 +137,6 @@ def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
     assert float(vehicle.action_to_thrust(np.array(vehicle.hover_action))) == pytest.approx(vehicle.hover_thrust)
 
 
-def test_published_limits_are_kept() -> None:
-    crazyflie, hummingbird = load_vehicle("crazyflie"), load_vehicle("hummingbird")
-    np.testing.assert_allclose(crazyflie.thrust_range, (0.02, 0.1125))
-    np.testing.assert_allclose(hummingbird.rotor_speed_range, (157.08, 785.40))
-
-
 @given(vehicles())
 def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle: Vehicle) -> None:
     data = vehicle.model_dump(exclude={"thrust_limits"})
@@ -173,45 +155,29 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
     assert not isinstance(caught.value, CannotHover)
 
 
-def test_files_are_told_from_names() -> None:
-    assert VEHICLES.is_path("my.yaml") and VEHICLES.is_path("here/my") and VEHICLES.is_path(Path("my"))
-    assert not VEHICLES.is_path("itm")
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give only one"),
         ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise.* N"),
         ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits: must be two numbers .*rad/s"),
-        ({"rotor_thrust_limits": "15", "thrust_limits": ...}, "rotor_thrust_limits: must be two numbers .* N"),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: is missing"),
-        ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "thrust_coefficient": "x"}, "thrust_coefficient: "),
         ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),
         ({"mas": 1.0}, "'mas': did you mean 'mass'"),
-        ({"thrust_limit": [0.5, 1.5]}, "did you mean 'thrust_limits'"),
         ({"mass": ...}, "mass: is missing"),
         ({"mass": -1}, "mass: .*greater than 0.*kg"),
-        ({"mass": float("nan")}, "mass: "),
         ({"mass": float("inf")}, "mass: .*finite"),
-        ({"mass": "heavy"}, "mass: .*number"),
-        ({"inertia": [0.1, 0.2]}, "inertia"),
         ({"inertia": [0.1, 0.1, 0.5]}, "inertia .*no rigid body"),
         ({"rotor_positions": [[1, 1], [1, -1], [-1, -1], [-1, 0.5]]}, "rotor_positions: equal thrusts"),
         ({"rotor_positions": [[1, 0], [1, 0], [-1, 0], [-1, 0]]}, "rotor_positions: these rotors cannot"),
         ({"rotor_directions": [1, 1, 1, -1]}, "rotor_directions .*two of 1"),
         ({"thrust_limits": [1.1, 1.5]}, "thrust_limits .*hover"),
-        ({"thrust_limits": [1.5, 0.5]}, "thrust_limits .*hover"),
         ({"control_step": 0.011}, "control_step .*whole multiple"),
         ({"motor_gain": 500}, "motor_gain"),
-        ({"delay": -1}, "delay"),
         ({"delay": 1.5}, "delay"),
-        ({"collision_radius": 0}, "collision_radius"),
         ({"name": ""}, "name"),
-        ({"geometric_gains": {"postion": 1.0}}, "geometric_gains: unknown key 'postion': did you mean 'position'"),
         ({"geometric_gains": {**GAINS, "velocity": -1}}, "geometric_gains.velocity: .*greater than 0.*1/s"),
         ({"geometric_gains": {**GAINS, "measured": {"sucess": 1}}}, "measured: unknown key 'sucess'"),
-        ({"geometric_gains": 3}, "geometric_gains: "),
     ],
 )
 def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -221,7 +187,7 @@ def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("content", ["", "- 1\n- 2\n", "just text", "mass: [1, 2", "\t- :", "mass: 1.0\nmass: *nothing"])
+@pytest.mark.parametrize("content", ["", "- 1\n- 2\n", "mass: [1, 2"])
 def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(content)
@@ -230,25 +196,9 @@ def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_unreadable_files(tmp_path: Path) -> None:
-    binary = tmp_path / "binary.yaml"
-    binary.write_bytes(b"\xff\xfe\x00\x01")
-    for path in (tmp_path / "missing.yaml", tmp_path / "folder.yaml", binary):
-        if path.stem == "folder":
-            path.mkdir()
-        with pytest.raises(ConfigError, match=path.name):
-            load_vehicle(path)
-
-
 def test_unknown_name_gives_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"'imt': did you mean 'itm'.*path of a .yaml"):
         load_vehicle("imt")
-
-
-@pytest.mark.parametrize("source", [None, 3, ["itm"]])
-def test_what_is_no_vehicle_at_all(source: Any) -> None:
-    with pytest.raises(ConfigError, match="vehicle"):
-        load_vehicle(source)
 
 
 def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:

@@ -63,8 +63,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         else:
             text = _message(item) + (f" ({meaning})" if meaning else "")
         found.setdefault(key, text if text.startswith(key) else f"{key}: {text}")  # of a union only the first alternative
-    # Of a union whose other alternative has keys, what is wrong inside says more.
-    return "; ".join(text for key, text in found.items() if not any(other.startswith(f"{key}.") for other in found))
+    return "; ".join(found.values())
 
 
 def _message(item: Mapping[str, Any]) -> str:

@@ -1,0 +1,305 @@
+"""Randomization and vehicle distributions: the same in both environments, of the row's own stream, within their ranges."""
+
+import copy
+
+import gymnasium
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sb3_quad import sample_vehicles
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.seeds import row_seeds
+from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts import geometric
+from sb3_quad.experts.geometric import GeometricExpert, told_cautious, told_geometric
+from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import QUATERNION, VELOCITY, P, W
+from sb3_quad.vehicles.vehicle import load_vehicle
+
+RANDOMIZE = {
+    "mass": [0.8, 1.25],
+    "inertia": [0.7, 1.4],
+    "motor_gain": [0.6, 1.6],
+    "thrust": [0.9, 1.0],
+    "arm": [0.9, 1.1],
+    "center_of_mass": [-0.01, 0.01],
+    "delay": [0, 3],
+    "force": {"magnitude": [0, 5]},
+    "torque": {"magnitude": [0, 0.1], "axes": [1, 1, 0.33]},
+    "gusts": {"std": [0, 1], "time_constant": 0.5},
+}
+IN_WEIGHTS = {
+    "mass": [0.8, 1.2],
+    "force": {"magnitude": [0, 0.2], "unit": "weight"},
+    "gusts": {"std": 0.1, "unit": "weight"},
+}
+FRAMES = {"last_action": True, "history": [0, 1, 3], "position_integral": {}}
+RAPTOR = {"distribution": "raptor"}
+
+
+def batch_of(n, seed=0, autoreset=True, **keywords):
+    """A batch at the start of its first episodes."""
+    batch = QuadcopterBatch(n, FlightSettings(**keywords), seed, autoreset=autoreset)
+    batch.reset()
+    return batch
+
+
+@st.composite
+def randomized(draw):
+    """Keywords of environments: some of what can be random, in either frame; or a distribution, with or without more."""
+    keywords = {"task": draw(st.sampled_from(["target_tracking", "state_recovery"]))}
+    if draw(st.booleans()):
+        return keywords | {"vehicles": RAPTOR} | draw(st.sampled_from([{}, {"randomize": IN_WEIGHTS}]))
+    names, frame = draw(st.sets(st.sampled_from(sorted(RANDOMIZE)), min_size=1)), draw(st.sampled_from(["world", "body"]))
+    randomize = {name: RANDOMIZE[name] for name in names}
+    for name in {"force", "torque"} & names:
+        randomize[name] = {**RANDOMIZE[name], "frame": frame}
+    return keywords | {"randomize": randomize} | draw(st.sampled_from([{}, FRAMES]))
+
+
+@settings(max_examples=20)
+@given(st.integers(0, 2**32), randomized())
+def test_a_row_and_pybullet_fly_the_same(seed, keywords):
+    n, steps = 3, 80
+    actions = np.random.default_rng(seed).uniform(-0.6, 0.9, (steps, n, 4)).astype(np.float32)
+    batch = QuadcopterBatch(n, FlightSettings(**keywords), seed, autoreset=False)
+    seen, states, rewards = [batch.reset()], [batch.state.copy()], []
+    for action in actions:
+        observation, reward, _ = batch.step(action)
+        seen.append(observation)
+        states.append(batch.state.copy())
+        rewards.append(reward)
+    single = QuadcopterEnv(**keywords)
+    for row, own in enumerate(row_seeds(seed, n)):
+        observations, flown, returns = [single.reset(seed=own)[0]], [single.true_state().array[:, 0].copy()], []
+        for action in actions[:, row]:
+            observation, reward, terminated, _, _ = single.step(action)
+            observations.append(observation)
+            flown.append(single.true_state().array[:, 0].copy())
+            returns.append(reward)
+            if terminated:
+                break
+        length, flown = len(flown), np.array(flown)
+        ours = np.array(states)[:length, :, row]
+        ours[:, QUATERNION] *= np.sign((ours[:, QUATERNION] * flown[:, QUATERNION]).sum(axis=1))[:, None]  # q is -q
+        np.testing.assert_allclose(ours, flown, rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(np.array(rewards)[: length - 1, row], returns, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(np.array(seen)[:length, row], observations, atol=5e-5)
+    single.close()
+
+
+def test_an_episode_is_random_within_the_ranges():
+    batch = batch_of(2000, randomize={**RANDOMIZE, "share": 0.7, "wrench_share": 0.6})
+    base, first = load_vehicle("itm").parameters(), batch.vehicles.copy()
+    batch.reset()
+    assert (batch.vehicles[P.mass] != first[P.mass]).mean() > 0.8
+    factors = batch.vehicles / base[:, None]
+    changed = factors[P.mass] != 1.0
+    assert changed.mean() == pytest.approx(0.7, abs=0.05)
+    assert (batch.vehicles[:, ~changed] == base[:, None]).all()
+    for row, (low, high) in {P.mass: (0.8, 1.25), P.motor_gain: (0.6, 1.6), P.thrust_middle: (0.9, 1.0)}.items():
+        values = factors[row, changed]
+        assert values.min() >= low and values.max() <= high
+        assert np.median(np.log(values)) == pytest.approx(np.log(low * high) / 2, abs=0.05 * np.log(high / low))
+    inertia = batch.vehicles[[P.ixx, P.iyy, P.izz]]
+    assert (2 * inertia.max(axis=0) <= inertia.sum(axis=0) * (1 + 1e-12)).all()
+    assert [*np.unique(batch.vehicles[P.delay, changed])] == [0, 1, 2, 3]
+    force = np.linalg.norm(batch.wrench[W.force_world : W.force_world + 3], axis=0)
+    assert (force > 0).mean() == pytest.approx(0.6, abs=0.05)
+    assert force.max() <= 5 and np.median(force[force > 0]) == pytest.approx(2.5, abs=0.3)
+    torque = np.abs(batch.wrench[W.torque_body : W.torque_body + 3]).max(axis=1)
+    assert torque[:2] == pytest.approx(0.1, abs=0.01) and torque[2] == pytest.approx(0.033, abs=0.003)
+
+
+def test_a_copy_on_pybullet_flies_on_with_its_vehicle():
+    env = QuadcopterEnv(randomize={"mass": [0.5, 0.6], "inertia": [0.5, 0.6]}, noise=0.0)
+    env.reset(seed=1)
+    env.step(np.full(4, 0.3, np.float32))
+    other = copy.deepcopy(env)
+    for _ in range(20):
+        np.testing.assert_array_equal(*(each.step(np.full(4, 0.3, np.float32))[0] for each in (env, other)))
+    env.close()
+    other.close()
+
+
+def test_a_share_of_zero_changes_no_flight():
+    envs = [
+        QuadcopterVecEnv(64, task="state_recovery", seed=4, **keywords)
+        for keywords in ({}, {"randomize": {"mass": [0.5, 1.2], "share": 0.0}})
+    ]
+    actions = np.random.default_rng(0).uniform(-1, 1, (200, 64, 4)).astype(np.float32)
+    np.testing.assert_array_equal(*(env.reset() for env in envs))
+    for action in actions:
+        for ours, theirs in zip(*(env.step(action)[:3] for env in envs), strict=True):
+            np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize(("std", "unit", "newtons"), [(2.0, "SI", 2.0), (0.1, "weight", 0.1 * 1.727 * 9.81)])
+def test_gusts_have_their_spread_and_time_constant(std, unit, newtons):
+    batch = batch_of(4000, randomize={"gusts": {"std": std, "unit": unit, "time_constant": 0.2}}, max_episode_steps=10**6)
+    gusts = [batch.gust[:3].copy()]
+    for _ in range(40):
+        batch.step(np.zeros((4000, 4), np.float32))
+        gusts.append(batch.gust[:3].copy())
+    assert np.std(gusts[0], axis=1) == pytest.approx(newtons, rel=0.05)
+    assert np.std(gusts[-1], axis=1) == pytest.approx(newtons, rel=0.05)
+    assert np.mean((gusts[-1] / newtons) ** 4) == pytest.approx(3.0, abs=0.25)  # as of a normal distribution
+    for steps in (10, 20):
+        kept = [np.corrcoef(gusts[0][axis], gusts[steps][axis])[0, 1] for axis in range(3)]
+        assert kept == pytest.approx([np.exp(-steps * 0.01 / 0.2)] * 3, abs=0.05)
+
+
+def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
+    batch = batch_of(2, randomize={"force": [1.0, 1.0]})
+    batch.set_wrench([3.0, 0.0, 0.0])
+    batch.step(np.zeros((2, 4), np.float32))
+    assert batch.wrench[W.force_world].tolist() == [3.0, 3.0]
+    batch.reset(0)
+    assert np.linalg.norm(batch.wrench[:, 0]) == pytest.approx(1.0) and batch.wrench[W.force_world, 1] == 3.0
+
+
+def test_vehicles_repeat_over_the_rows_and_are_randomised():
+    names = ["itm", "crazyflie", "hummingbird"]
+    env = QuadcopterVecEnv(7, vehicle=names, seed=0, randomize={"mass": [0.9, 1.1]})
+    env.reset()
+    assert [each.name for each in env.get_attr("vehicle")] == [names[row % 3] for row in range(7)]
+    factors = env.batch.vehicles[P.mass] / env.batch.base_vehicles[P.mass]
+    assert (factors >= 0.9).all() and (factors <= 1.1).all()
+
+
+# --- distributions of vehicles
+
+
+def test_sampled_vehicles_are_valid_and_fill_the_ranges():
+    vehicles = sample_vehicles("raptor", 2000, seed=1)
+    inertia = np.array([each.inertia for each in vehicles])
+    metrics = {  # with the ranges of the file
+        "size": (np.cbrt([each.mass for each in vehicles]), np.cbrt([0.02, 5.0])),
+        "thrust_to_weight": ([each.thrust_limits[1] for each in vehicles], (1.5, 5.0)),
+        "torque_to_inertia": ([each.arm_length * each.thrust_range[1] / each.inertia[0] for each in vehicles], (40, 1200)),
+        "motor_time_constant": ([1.0 / each.motor_gain for each in vehicles], (0.03, 0.1)),
+        "moment_thrust_ratio": ([each.moment_thrust_ratio for each in vehicles], (0.005, 0.05)),
+    }
+    for name, (values, (low, high)) in metrics.items():
+        share = (np.array(values) - low) / (high - low)
+        assert share.min() > -1e-9 and share.max() < 1 + 1e-9, name
+        np.testing.assert_allclose(np.quantile(share, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.05, err_msg=name)
+    np.testing.assert_allclose(inertia / inertia[:, :1], np.tile([1.0, 1.024, 1.854], (2000, 1)))
+    np.testing.assert_allclose([each.thrust_limits[0] for each in vehicles], 0.05)
+    assert np.std(np.log([each.arm_length / np.cbrt(each.mass) for each in vehicles])) == pytest.approx(0.09, abs=0.02)
+
+
+def test_every_episode_has_another_vehicle_and_forces_in_its_weights():
+    force = {"magnitude": 0.2, "unit": "weight", "direction": [0, 0, -1]}
+    first, again = (batch_of(16, 3, vehicles=RAPTOR, randomize={"force": force}) for _ in range(2))
+    ours = np.stack([each.parameters() for each in sample_vehicles("raptor", 16, seed=3)], axis=1)
+    np.testing.assert_allclose(ours, first.vehicles, rtol=1e-12)
+    masses = []
+    for _ in range(3):
+        np.testing.assert_array_equal(first.vehicles, again.vehicles)
+        np.testing.assert_allclose(-first.wrench[W.force_world + 2], 0.2 * 9.81 * first.vehicles[P.mass], rtol=1e-12)
+        masses.append(first.vehicles[P.mass].copy())
+        first.reset(), again.reset()
+    assert np.unique(masses).size == 48
+
+
+def test_the_base_vehicle_says_what_a_distribution_does_not():
+    ranges = {"mass": 1.0, "thrust_to_weight": 2.0, "torque_to_inertia": 300.0, "motor_time_constant": 0.05}
+    base = load_vehicle("hummingbird").model_copy(update={"delay": 3})
+    (one,) = sample_vehicles({**ranges, "moment_thrust_ratio": 0.02}, 1, vehicle=base)
+    assert one.rotor_directions == base.rotor_directions and one.delay == 3
+    np.testing.assert_allclose(np.array(one.inertia) / one.inertia[0], np.array(base.inertia) / base.inertia[0])
+    np.testing.assert_allclose(one.rotor_positions, np.cbrt(2.0) * np.array(base.rotor_positions))
+    np.testing.assert_allclose(one.hover_rotor_speed, base.hover_rotor_speed)
+
+
+def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():
+    own = FlightSettings().with_changes(vehicles={**RAPTOR, "mass": [0.1, 0.2]})
+    assert own.vehicles.mass.high == 0.2 and own.vehicles.thrust_to_weight.high == 5.0
+    again = FlightSettings.model_validate(own.model_dump(mode="json"))
+    assert again.vehicles == own.vehicles and again.in_any_task()["vehicles"] == own.vehicles
+    assert own.with_changes(vehicle="itm").vehicles is None
+    env = gymnasium.make("QuadTargetTracking-v0", vehicles="raptor")
+    masses = {float(env.unwrapped.true_state().vehicles[P.mass, 0]) for _ in range(2) if env.reset()}
+    assert len(masses) == 2
+    env.close()
+
+
+# --- experts that know the vehicle and what pushes it
+
+
+@pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
+def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
+    torque = {"magnitude": [0.0, 0.1], "axes": [1, 1, 0.33]}
+    randomize = {"mass": [0.8, 1.2], "motor_gain": [0.7, 1.5], "force": [1.0, 4.0], "torque": torque}
+    errors = {}
+    for expert in (GeometricExpert(), told_geometric()):
+        batch = batch_of(240, task=task, randomize=randomize, autoreset=False)
+        for _ in range(1000):
+            batch.step(expert.actions(batch.true_state()))
+        errors[expert._told is not None] = np.median(batch.outcome["distance"])
+    assert errors[True] < 0.01 < 0.1 < errors[False]
+
+
+@pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
+def test_the_told_expert_flies_every_vehicle_of_a_distribution(task):
+    flights = fly(told_geometric(), task, 240, seed=11, max_steps=900, vehicles=RAPTOR)
+    assert flights.survival.all() and np.median(flights.final_error) < 1e-3
+
+
+def test_the_told_expert_flies_as_the_others_where_nothing_is_random():
+    batch, gains, told = batch_of(240, task="state_recovery"), GeometricExpert().gains, told_geometric()
+    plain = GeometricExpert(gains=gains.model_copy(update={"yaw_rate": geometric._TOLD_YAW * gains.yaw_rate}))
+    for _ in range(100):
+        state = batch.true_state()
+        np.testing.assert_allclose(told.actions(state), plain.actions(state), atol=1e-5)
+        batch.step(plain.actions(state))
+
+
+def test_the_cautious_expert_falls_less_fast_where_the_rotors_lift_hardly_more_than_weight_and_push():
+    randomize = {"mass": [1.2, 1.25], "force": {"magnitude": [2, 4], "direction": [0, 0, -1]}}
+    descent, survival = {}, {}
+    for expert in (told_geometric(), told_cautious()):
+        batch = batch_of(480, randomize=randomize, autoreset=False)
+        lowest, lost = np.zeros(480), np.zeros(480, bool)
+        for _ in range(600):
+            lost |= batch.step(expert.actions(batch.true_state()))[2]
+            lowest = np.minimum(lowest, batch.state[VELOCITY][2])
+        descent[expert.reserve > 0], survival[expert.reserve > 0] = -lowest.min(), 1.0 - lost.mean()
+    assert survival[False] < survival[True] and descent[False] > 1.5 * descent[True]
+
+
+@pytest.mark.parametrize(("told", "reserve"), [(True, -0.1), (False, 0.1)])
+def test_a_reserve_is_for_a_told_expert_and_not_negative(told, reserve):
+    with pytest.raises(ConfigError, match="reserve"):
+        GeometricExpert(told=told, reserve=reserve)
+
+
+@pytest.mark.parametrize(
+    ("keywords", "says"),
+    [
+        ({"weight": [1, 2]}, "unknown key 'weight'"),
+        ({"mass": [1.25, 0.8]}, "exceeds"),
+        ({"mass": [1.0, 1.6]}, "cannot hover"),
+        ({"mass": [1, 2, 3]}, "must be [low, high]"),
+        ({"delay": [0, 0.5]}, "whole control steps"),
+        ({"force": {"magnitude": [-1, 1]}}, "greater than or equal to 0"),
+        ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "must not be zero"),
+        ({"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}}, "greater than 0"),
+        ("mass", "randomize"),
+        ({"vehicles": {"distribution": "rapter"}}, "vehicle distribution 'rapter'"),
+        ({"vehicles": {**RAPTOR, "mass": [0, 2]}}, "greater than 0"),
+        ({"vehicles": {**RAPTOR, "thrust_to_weight": [0.9, 2]}}, "cannot hover"),
+        ({"vehicles": {**RAPTOR, "motor_time_constant": 0.001}}, "motor_gain"),
+        ({"vehicles": {**RAPTOR, "inertia_ratios": [1, 1, 5]}}, "rigid body"),
+        ({"vehicles": {"mass": 1.0}}, "thrust_to_weight"),
+    ],
+)
+def test_what_cannot_be_flown_is_refused_in_one_line(keywords, says):
+    with pytest.raises(ConfigError) as error:
+        QuadcopterVecEnv(2, **(keywords if "vehicles" in keywords else {"randomize": keywords}))
+    assert says in str(error.value) and "\n" not in str(error.value)
