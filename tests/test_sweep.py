@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from concurrent.futures import Future
 from pathlib import Path
 
 import numpy as np
@@ -16,15 +17,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import WorkerDied
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
-from sb3_quad.executors import as_completed, start_executor
+from sb3_quad.executors import start_executor
+from sb3_quad.sweep.compare import Comparison, over_seeds
 from sb3_quad.sweep.expand import expand
-from sb3_quad.sweep.folder import SweepFolder
+from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.run import digest
 from sb3_quad.sweep.spec import SWEEPS, SweepSpec, load_sweep
-from sb3_quad.sweep.statistics import compare, over_seeds
 
 ROOT = Path(__file__).resolve().parent.parent
 NET = {"n_steps": 20, "batch_size": 80, "gradient_steps": 2, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
@@ -38,21 +39,25 @@ TINY = {
 }
 
 
+STAGE = {"name": "one", "algo": "dagger", "env": "QuadStateRecovery-v0", "settings": {**NET, "n_timesteps": 160, "n_envs": 4}}
+
+
 class Fails(BaseCallback):
     """Ends the training of noisy environments."""
 
+    limit = 0.4
+
     def _on_step(self):
-        if self.training_env.unwrapped.batch.noise_level.max() > 0.4:
+        if self.training_env.unwrapped.batch.noise_level.max() > self.limit:
             raise ValueError("too noisy")
         return True
 
 
 class Slow(BaseCallback):
-    """Takes its time, and tells that it has begun."""
+    """Takes its time where the environment says so."""
 
     def _on_rollout_start(self):
-        Path(f"{os.getpid()}.begun").touch()
-        time.sleep(0.5)
+        time.sleep(float(os.environ.get("SLOW", "0")))
 
     def _on_step(self):
         return True
@@ -74,65 +79,48 @@ def write(path, **keys):
 )
 def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
     runs = expand(spec(seed=seeds, grid={"env_kwargs.noise": noise, "hyperparams.learning_rate": rate}))
-    found = [(run.settings["env_kwargs"]["noise"], run.settings["learning_rate"], run.seed) for run in runs]
+    settings = [(run.stages[0].settings, run.seed) for run in runs]
+    found = [(each["env_kwargs"]["noise"], each["learning_rate"], seed) for each, seed in settings]
     assert found == list(itertools.product(noise, rate, seeds))
     assert len({run.name for run in runs}) == len(runs)
     assert all(re.fullmatch(r"[\w.=,+-]+/seed_\d+", run.name) for run in runs)
 
 
 def test_entries_of_a_list_have_their_names_and_inherit():
-    own = [{"name": "calm", "env_kwargs": {"noise": 0}}, {"hyperparams": {"n_epochs": 2}}]
+    own = [{"name": "calm", "env_kwargs": {"noise": 0}}, {"hyperparams": {"n_epochs": 2}, "eval_freq": "1e3"}]
     calm, other = expand(spec(configurations=own))
-    assert calm.name == "calm/seed_0" and calm.settings["env_kwargs"]["noise"] == 0 and calm.settings["n_epochs"] == 1
-    assert other.settings["n_epochs"] == 2 and other.settings["n_steps"] == NET["n_steps"]
+    settings, others = calm.stages[0].settings, other.stages[0].settings
+    assert calm.name == "calm/seed_0" and settings["env_kwargs"]["noise"] == 0 and settings["n_epochs"] == 1
+    assert others["n_epochs"] == 2 and others["n_steps"] == NET["n_steps"] and other.job["eval_freq"] == 1000
 
 
 @pytest.mark.parametrize(
-    ("keys", "words"),
+    ("keys", "flags", "words"),
     [
-        ({"gird": {}}, "did you mean 'grid'"),
-        ({"grid": {"algo": []}}, "grid: algo: must be a list of at least one"),
-        ({"grid": {"env_kwargs.noise": 0.1}}, "must be a list"),
-        ({"grid": {"env_kwarg.noise": [0]}}, "did you mean 'env_kwargs'"),
-        ({"grid": {"algo": ["dagger", "ppo"]}}, "'ppo': "),
-        ({"grid": {"vehicle": ["itm", "no-such"]}}, "no-such"),
-        ({"seed": []}, "seed"),
-        ({"seed": -1}, "seed -1"),
-        ({"configurations": [{"name": "a"}, {"name": "a"}]}, "two configurations are called 'a'"),
-        ({"evaluation": {"suite": "no-such"}}, "no-such"),
-        ({"resources": {"num_cpus": -1}}, "num_cpus"),
-        ({"algo": None}, "algo is missing"),
+        ({"gird": {}}, [], "did you mean 'grid'"),
+        ({"grid": {"algo": []}}, [], "grid: algo: must be a list of at least one"),
+        ({"grid": {"env_kwargs.noise": 0.1}}, [], "must be a list"),
+        ({"grid": {"env_kwarg.noise": [0]}}, [], "did you mean 'env_kwargs'"),
+        ({"grid": {"algo": ["dagger", "ppo"]}}, [], "'ppo': "),
+        ({"grid": {"vehicle": ["itm", "no-such"]}}, [], "no-such"),
+        ({"seed": []}, [], "seed"),
+        ({"seed": -1}, [], "seed -1"),
+        ({"configurations": [{"name": "a"}, {"name": "a"}]}, [], "two configurations are called 'a'"),
+        ({"eval_freq": "often"}, [], "eval_freq"),
+        ({"evaluation": {"suite": "no-such"}}, [], "no-such"),
+        ({"resources": {"num_cpus": -1}}, [], "num_cpus"),
+        ({}, ["--executor", "rya"], "did you mean 'ray'"),
+        ({}, ["--address", "auto"], "goes with --executor ray"),
+        ({}, ["--executor", "ray"], "pip install '.[ray]'"),
     ],
 )
-def test_bad_input_is_one_line_before_anything_is_trained(tmp_path, monkeypatch, capsys, keys, words):
+def test_bad_input_is_one_line_before_anything_is_trained(tmp_path, monkeypatch, capsys, keys, flags, words):
     monkeypatch.chdir(tmp_path)
-    file = write(tmp_path / "s.yaml", **keys)
-    if keys == {"algo": None}:
-        with pytest.raises(ConfigError, match=words):
-            expand(load_sweep(file))
-        return
-    assert main(["sweep", file]) == 2
+    monkeypatch.setitem(sys.modules, "ray", None)
+    assert main(["sweep", write(tmp_path / "s.yaml", **keys), *flags]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert words in line
     assert not (tmp_path / "logs").exists()
-
-
-def test_executors_that_cannot_be_are_one_line(tmp_path, capsys):
-    file = write(tmp_path / "s.yaml")
-    for flags, words in {
-        ("--executor", "rya"): "did you mean 'ray'",
-        ("--address", "auto"): "goes with --executor ray",
-    }.items():
-        assert main(["sweep", file, *flags]) == 2
-        (line,) = capsys.readouterr().err.splitlines()
-        assert words in line
-
-
-def test_a_missing_ray_is_one_line(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "ray", None)
-    assert main(["sweep", write(tmp_path / "s.yaml"), "--executor", "ray"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "pip install '.[ray]'" in line
 
 
 def test_dry_run_lists_the_runs(tmp_path, capsys, monkeypatch):
@@ -148,88 +136,126 @@ def test_sweeps_of_the_package_expand(name):
     assert {run.seed for run in expand(load_sweep(name))} == {0, 1, 2}
 
 
-def test_the_slurm_script_is_bash():
-    (script,) = re.findall(r"```bash\n(#!/bin/bash\n.*?)```", (ROOT / "docs/sweeps.md").read_text(), flags=re.DOTALL)
-    subprocess.run(["bash", "-n"], input=script, text=True, check=True)
-    assert "ray symmetric-run" in script
-
-
 def test_who_is_better_is_known_where_it_is_clear():
     random = np.random.default_rng(0)
     common = random.normal(size=(1, 60))  # some episodes are harder, for all
     low, high = (common + random.normal(shift, 0.3, (3, 60)) for shift in (0.0, 1.0))
-    assert (compare(high, low).verdict, compare(low, high).verdict, compare(low, low).verdict) == (
-        "better",
-        "worse",
-        "cannot tell",
-    )
-    interval = over_seeds(low, "reward")
+    verdicts = [Comparison(over_seeds(difference)).verdict for difference in (high - low, low - high, low - low)]
+    assert verdicts == ["better", "worse", "cannot tell"]
+    interval = over_seeds(low)
     assert interval.low < low.mean() < interval.high and interval.value == pytest.approx(low.mean())
     some = np.where(random.random((3, 60)) < 0.5, np.nan, low)
-    assert over_seeds(some, "time").value == pytest.approx(np.nanmean(some, axis=1).mean())
-    assert over_seeds(some, "final_error").value == pytest.approx(np.nanmedian(some, axis=1).mean())
-    assert over_seeds(np.full((2, 5), np.nan), "time") is None
+    assert over_seeds(some).value == pytest.approx(np.nanmean(some, axis=1).mean())
+    assert over_seeds(some, np.nanmedian).value == pytest.approx(np.nanmedian(some, axis=1).mean())
+    assert over_seeds(np.full((2, 5), np.nan)) is None
 
 
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
     random = np.random.default_rng(1)
     held = 0
     for _ in range(60):
-        interval = over_seeds(random.normal(0, 0.5, (10, 1)) + random.normal(size=(10, 40)), "reward")
+        interval = over_seeds(random.normal(0, 0.5, (10, 1)) + random.normal(size=(10, 40)))
         held += interval.low < 0 < interval.high
     assert held >= 48
 
 
-def square(number):
-    return number * number, os.getpid()
+class Inline:
+    """An executor that calls at once, in this process."""
+
+    workers = 1
+
+    def __init__(self, *arguments):
+        self.stop = lambda: None
+
+    def submit(self, function, *arguments):
+        future = Future()
+        future.set_result(function(*arguments))
+        return future
+
+    __enter__ = lambda self: self  # noqa: E731
+    __exit__ = lambda self, *error: None  # noqa: E731
 
 
-def test_as_completed_hands_out_every_task_once():
+def test_a_sweep_trains_compares_and_goes_on_with_what_failed(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sb3_quad.executors.start_executor", Inline)
+    own = [{"name": "one"}, {"name": "noisy", "env_kwargs": {"noise": 0.5}}]
+    keys = {"hyperparams": {**NET, "callback": "test_sweep.Fails"}, "configurations": own}
+    assert main(["sweep", write(tmp_path / "s.yaml", **keys), "--no-progress"]) == 1
+    output = capsys.readouterr()
+    assert "failed: noisy/seed_0: ValueError: too noisy" in output.err and "1 of 2 runs finished, 1 failed" in output.out
+    place = SweepFolder("logs/sweep/s_1")
+    before = {path: path.read_bytes() for path in place.path.rglob("records/one/*")}
+    monkeypatch.setattr(Fails, "limit", 1.0)
+    assert main(["sweep", "--resume", str(place.path), "--no-progress"]) == 0
+    assert all(path.read_bytes() == content for path, content in before.items())
+    output = capsys.readouterr().out
+    assert "noisy/seed_0: failed before (ValueError: too noisy)" in output and "one than noisy" in output
+    found = json.loads((place.path / "results.json").read_text())
+    assert list(found["configurations"]) == ["one", "noisy"] and found["finished"] == 2 and not found["failed"]
+    assert {each["measure"] for each in found["comparisons"]} == {"success", "reward"}
+    assert len((place.path / "results.csv").read_text().splitlines()) == 5  # two scenarios each
+    assert (place.path / "report.html").is_file() and "one (1 seed)" in (place.path / "report.md").read_text()
+
+
+def test_resuming_rereads_no_settings_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sb3_quad.executors.start_executor", Inline)
+    (tmp_path / "two.yml").write_text(json.dumps({"stages": [STAGE, {**STAGE, "name": "two", "seed_offset": 1}]}))
+    keys = {"algo": None, "env": None, "n_timesteps": None, "conf_file": "two.yml"}
+    plan = Plan(spec=spec(**keys), runs=tuple(expand(spec(**keys))))
+    place = SweepFolder("logs/s_1")
+    place.write(plan)
+    (tmp_path / "two.yml").unlink()
+    assert main(["sweep", "--resume", "logs/s_1", "--no-progress"]) == 0
+    (record,) = place.records(plan.runs).values()
+    assert record.state == "finished" and record.timesteps == 320
+
+
+def kill_seven(number):
+    if number == 7:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_fails_its_own_call_alone():
     with start_executor("local", 2) as executor:
-        tasks = {executor.submit(square, number): number for number in range(5)}
-        found = [(tasks[task], task.result()[0]) for task in as_completed(executor)]
-        assert sorted(found) == [(number, number * number) for number in range(5)]
+        futures = {number: executor.submit(kill_seven, number) for number in (1, 7, 2, 3)}
+        assert [futures[number].result() for number in (1, 2, 3)] == [1, 4, 9]
+        with pytest.raises(WorkerDied):
+            futures[7].result()
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_sweep_gives_what_train_gives_and_names_the_run_that_fails(tmp_path, monkeypatch, capsys):
+def test_a_sweep_gives_what_train_gives(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(Path(__file__).parent)]))
-    keys = {"hyperparams": {**NET, "callback": "test_sweep.Fails"}, "grid": {"env_kwargs.noise": [0.05, 0.5]}}
-    assert main(["sweep", write(tmp_path / "s.yaml", seed=[0, 1], **keys), "--workers", "2", "--no-progress"]) == 1
-    output = capsys.readouterr()
-    failed = [line for line in output.err.splitlines() if line.startswith("failed: ")]
-    assert len(failed) == 2 and all("noise=0.5/seed_" in line and "too noisy" in line for line in failed)
+    keys = {"env_kwargs": {"noise": 0.05}, "seed": [0, 1]}
+    assert main(["sweep", write(tmp_path / "s.yaml", **keys), "--workers", "2", "--no-progress"]) == 0
     place = SweepFolder("logs/sweep/s_1")
-    plan = place.read()
-    records = place.records(plan.runs)
-    assert [record.state for record in records.values()] == ["finished"] * 2 + ["failed"] * 2
-    results = json.loads((place.path / "results.json").read_text())
-    assert list(results["configurations"]) == ["noise=0.05"] and len(results["failed"]) == 2
-    assert (place.path / "report.html").is_file()
-
+    records = place.records(place.read().runs)
     hyperparams = ["n_steps:20", "batch_size:80", "gradient_steps:2", "n_epochs:1", "policy_kwargs:dict(net_arch=[4])"]
     single = ["--algo", "dagger", "--env", "QuadStateRecovery-v0", "-n", "160", "--n-envs", "4", "--eval-episodes", "0"]
-    for seed in (0, 1):
-        command = ["train", *single, "--hyperparams", *hyperparams, "--env-kwargs", "noise:0.05", "--seed", str(seed)]
-        assert main([*command, "--num-threads", "1", "-f", "alone", "--no-progress"]) == 0
-        alone = Path(f"alone/dagger/QuadStateRecovery-v0_{1 + seed}/QuadStateRecovery-v0.zip")
-        assert digest(alone) == records[f"noise=0.05/seed_{seed}"].weights
-    assert records["noise=0.05/seed_0"].weights != records["noise=0.05/seed_1"].weights
+    command = ["train", *single, "--hyperparams", *hyperparams, "--env-kwargs", "noise:0.05", "--seed", "1"]
+    assert main([*command, "--num-threads", "1", "-f", "alone", "--no-progress"]) == 0
+    alone = digest(Path("alone/dagger/QuadStateRecovery-v0_1/QuadStateRecovery-v0.zip"))
+    assert alone == records["dagger/seed_1"].weights != records["dagger/seed_0"].weights
 
 
 def start(folder, *arguments):
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]), "SLOW": "0.5"}
     command = [sys.executable, "-m", "sb3_quad.cli", "sweep", *arguments, "--no-progress"]
     return subprocess.Popen(command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
-def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatch, capsys):
+def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT), str(Path(__file__).parent)]))
+    monkeypatch.setattr(
+        "sb3_quad.executors.start_executor", Inline
+    )  # one thread, as workers have: equal bits
     keys = {"seed": [0, 1, 2], "n_timesteps": 400, "hyperparams": {**NET, "callback": "test_sweep.Slow"}}
     file = write(tmp_path / "s.yaml", **keys)
     tables = []
@@ -246,8 +272,8 @@ def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatc
         assert 0 < len(kept) < 3, output
         if number == signal.SIGTERM:
             assert f"{len(kept)} of 3 runs finished" in output and (tmp_path / f"logs/sweep/s_{k}/results.csv").is_file()
-        assert main(["sweep", "--resume", f"logs/sweep/s_{k}", "--workers", "1", "--no-progress"]) == 0
+        assert main(["sweep", "--resume", f"logs/sweep/s_{k}", "--no-progress"]) == 0
         assert {path: path.read_bytes() for path in kept} == kept
         tables.append((tmp_path / f"logs/sweep/s_{k}/results.json").read_text())
-    assert main(["sweep", file, "--workers", "1", "--no-progress"]) == 0
+    assert main(["sweep", file, "--no-progress"]) == 0
     assert tables == [(tmp_path / "logs/sweep/s_3/results.json").read_text()] * 2

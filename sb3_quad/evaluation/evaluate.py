@@ -4,10 +4,10 @@ import hashlib
 import itertools
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import as_completed
 from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from sb3_quad.base.arrays import Arrays
@@ -35,7 +35,7 @@ from sb3_quad.evaluation.results import (
 )
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
-from sb3_quad.executors import Executor, as_completed, start_executor
+from sb3_quad.executors import Executor, start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
@@ -140,16 +140,8 @@ def evaluate(
     return results
 
 
-def fly_job(job: Job, zip_content: bytes | None = None) -> Outcome | Failure:
-    """Fly and sum up; of a controller that fails, its :class:`Failure`.
-
-    :param zip_content: of the controller, for a machine that does not see its file.
-    """
-    if zip_content is not None:
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / job.record.spec
-            path.write_bytes(zip_content)
-            return fly_job(replace(job, spec=replace(job.spec, spec=str(path), settings=job.spec.own)))
+def fly_job(job: Job) -> Outcome | Failure:
+    """Fly and sum up; of a controller that fails, its :class:`Failure`."""
     start = time.perf_counter()
     try:
         scenario, seen = job.scenario.flown_by(job.spec.own and job.spec.own.vehicle), job.spec.observed
@@ -180,14 +172,11 @@ def _fly_jobs(jobs: Sequence[Job], executor: Executor | None) -> Iterator[tuple[
     if executor is None:
         yield from ((job, fly_job(job)) for job in jobs)
         return
-    submitted = {}
-    for job in jobs:
-        travels = executor.remote and job.record.kind == "model"
-        submitted[executor.submit(fly_job, job, Path(job.spec.spec).read_bytes() if travels else None)] = job
-    for task in as_completed(executor):
-        job = submitted[task]
+    submitted = {executor.submit(fly_job, job): job for job in jobs}
+    for future in as_completed(submitted):
+        job = submitted[future]
         try:
-            yield job, task.result()
+            yield job, future.result()
         except WorkerDied as ended:
             yield job, _failure(job.record.label, job.scenario.name, ended)
 

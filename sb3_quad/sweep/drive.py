@@ -1,30 +1,30 @@
 """Doing the runs of a sweep by an executor: what is left of them, in order, whatever ends on the way."""
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 
 from sb3_quad.base.errors import WorkerDied
 from sb3_quad.base.signals import StopSignals
-from sb3_quad.executors.protocol import Executor, Task
-from sb3_quad.executors.travel import files_of, pack, unpack
+from sb3_quad.executors import Executor
 from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.run import EPISODES, Flying, fetch, standing, work, work_elsewhere
+from sb3_quad.sweep.run import standing, work
 
 Show = Callable[[int, int, str], None]  # runs that ended, runs in all, what is under way
 TICK = 1.0  # s between two looks for a signal
 TRIES = 2  # of a run whose worker process dies
 
 
-def what_is_left(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], report: Callable[[str], None]) -> list[Run]:
-    """The runs of a sweep that are not finished; told of each in one line that is there in part."""
+def runs_left(place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], report: Callable[[str], None]) -> list[Run]:
+    """The runs of a sweep that are not finished. Reports each that has already started, in one line."""
     left = []
     for run in plan.runs:
         record = records.get(run.name)
         if record is not None and record.state == "finished":
             continue
         left.append(run)
-        words = standing(run, place.run(run))
+        words = standing(place.run(run))
         if record is not None:
             report(f"{run.name}: failed before ({record.message}); {words or 'begins again'}")
         elif words:
@@ -45,40 +45,40 @@ def execute(
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     records = place.records(plan.runs)
-    left = what_is_left(place, plan, records, report)
+    left = runs_left(place, plan, records, report)
     records = {name: record for name, record in records.items() if record.state == "finished"}
-    flying = Flying(plan.suite, plan.spec.evaluation.episodes or EPISODES, plan.spec.evaluation.seed or 0)
-    tasks = {_submit(place, plan, run, flying, executor): run for run in left}
-    tries = dict.fromkeys((run.name for run in left), 1)
-    stopped = False
+
+    def submit(run: Run) -> None:
+        runs[executor.submit(work, run, str(place.run(run)), plan.suite, plan.spec.evaluation)] = run
+        tries[run.name] = tries.get(run.name, 0) + 1
 
     def progress() -> None:
         failed = sum(record.state == "failed" for record in records.values())
-        waiting = executor.pending
-        words = f"{min(waiting, executor.workers)} running" + (f", {failed} failed" if failed else "")
+        words = f"{min(len(runs), executor.workers)} running" + (f", {failed} failed" if failed else "")
         show(len(records), len(plan.runs), words)
 
+    runs, tries, stopped = dict["Future[RunRecord]", Run](), dict[str, int](), False
+    for run in left:
+        submit(run)
     progress()
-    while executor.pending:
-        done = executor.wait(TICK)
-        for task in done:
-            run = tasks.pop(task)
+    while runs:
+        done = wait(runs, TICK, FIRST_COMPLETED).done
+        for future in done:
+            run = runs.pop(future)
+            if future.cancelled():
+                continue
             try:
-                record = _collect(place, run, task)
+                record = future.result()
             except WorkerDied as died:
                 if stopped or signals.received is not None:
                     continue
-                if not executor.remote and tries[run.name] < TRIES:
-                    tries[run.name] += 1
-                    words = standing(run, place.run(run)) or "begins again"
-                    report(f"{run.name}: {died}; {words}")
-                    tasks[_submit(place, plan, run, flying, executor)] = run
+                if tries[run.name] < TRIES:
+                    report(f"{run.name}: {died}; {standing(place.run(run)) or 'begins again'}")
+                    submit(run)
                     continue
-                record = RunRecord(
-                    name=run.name, configuration=run.configuration, seed=run.seed, state="failed", message=str(died)
-                )
+                record = RunRecord(**run.identity, state="failed", message=str(died))
             if record.state == "interrupted":
-                report(f"{run.name}: interrupted; {standing(run, place.run(run)) or 'not begun'} with --resume")
+                report(f"{run.name}: interrupted; {standing(place.run(run)) or 'not begun'} with --resume")
                 continue
             place.add(record)
             records[run.name] = record
@@ -88,34 +88,8 @@ def execute(
         if signals.received is not None and not stopped:
             stopped = True
             report(f"{signals.name}: the runs under way save and end")
-            executor.cancel()
+            executor.stop()
     return records
-
-
-def _submit(place: SweepFolder, plan: Plan, run: Run, flying: Flying, executor: Executor) -> Task:
-    folder = place.run(run)
-    if not executor.remote:
-        return executor.submit(work, run, str(folder), flying)
-    begun = pack(folder)
-    home, storage = str(folder), _storage(place, plan)
-    return executor.submit(work_elsewhere, run, flying, files_of(run.model_dump(mode="json")), begun, home, storage)
-
-
-def _storage(place: SweepFolder, plan: Plan) -> str | None:
-    """Where the runs of this sweep travel through, apart from those of others."""
-    if plan.spec.storage is None:
-        return None
-    return f"{plan.spec.storage.rstrip('/')}/{place.path.resolve().name}"
-
-
-def _collect(place: SweepFolder, run: Run, task: Task) -> RunRecord:
-    outcome = task.result()
-    if isinstance(outcome, RunRecord):
-        return outcome
-    record, stored = outcome
-    unpack(fetch(stored), place.run(run))
-    assert isinstance(record, RunRecord)
-    return record
 
 
 def _in_words(record: RunRecord) -> str:

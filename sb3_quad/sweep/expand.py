@@ -16,13 +16,11 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
-from sb3_quad.training.config import load_config
-from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.pipeline import Pipeline, is_pipeline, load_pipeline, stage_jobs, with_settings
+from sb3_quad.training.options import RunOptions, SettingsOptions
+from sb3_quad.training.pipeline import Pipeline, Stage, is_pipeline, load_pipeline, stage_jobs, with_settings
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value says enough
-SETTINGS = ("n_timesteps", "n_envs", "vec_env", "expert", "env_kwargs")  # as commands/train puts them over a file's
 LONGEST = 80  # characters of a name
 
 
@@ -33,12 +31,13 @@ class Run(Frozen):
     configuration: str
     seed: int
     job: dict[str, Any] = Field(description="arguments of TrainingJob, less config, seed and log_folder")
-    algo: str = ""
-    env: str = ""
-    settings: dict[str, Any] = Field(default={}, description="of a single run")
-    pipeline: Pipeline | None = None
-    stem: str = Field(default="", description="of a pipeline's settings file, which names its folder")
+    stages: tuple[Stage, ...] = Field(description="of its pipeline, with all their settings; a single run is one of one stage")
     gym_packages: tuple[str, ...] = ()
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """Which run it is: what its record begins with."""
+        return self.model_dump(include={"name", "configuration", "seed"})
 
 
 def expand(spec: SweepSpec) -> list[Run]:
@@ -50,29 +49,28 @@ def expand(spec: SweepSpec) -> list[Run]:
     cells = _cells(spec)
     if len(cells) * len(spec.seed) > MAX_RUNS:
         raise ConfigError(f"the sweep has {len(cells) * len(spec.seed):,} runs, at most {MAX_RUNS:,} are allowed")
-    runs: list[Run] = []
-    names: dict[str, Configuration] = {}
+    runs: dict[str, list[Run]] = {}
     for varied, data in cells:
         configuration = validate(Configuration, data, f"configuration {_name(varied)!r}" if varied else "sweep")
         name = _file_name(configuration.name or _name(varied) or _plain_name(configuration))
-        if name in names:
+        if name in runs:
             raise ConfigError(f"two configurations are called {name!r}; give them names, or values that differ")
-        names[name] = configuration
         try:
-            runs += [_run(configuration, name, seed, spec.gym_packages) for seed in spec.seed]
+            run = _run(configuration, name, spec.gym_packages)
         except ConfigError as error:
             raise ConfigError(f"configuration {name!r}: {error}") from None
-    return runs
+        runs[name] = [run.model_copy(update={"name": f"{name}/seed_{seed}", "seed": seed}) for seed in spec.seed]
+    return [*itertools.chain.from_iterable(runs.values())]
 
 
 def suite_of(spec: SweepSpec) -> Suite | None:
     """The scenarios that the agents of a sweep fly; None: fresh episodes of both tasks."""
     asked = spec.evaluation
-    if asked.suite is None:
-        if asked.scenario:
-            raise ConfigError("evaluation: scenario goes with a suite")
-        return None
-    return load_suite(asked.suite).with_changes(asked.scenario, asked.episodes, asked.seed)
+    if asked.suite is not None:
+        return load_suite(asked.suite).with_changes(asked.scenario, asked.episodes, asked.seed)
+    if asked.scenario:
+        raise ConfigError("evaluation: scenario goes with a suite")
+    return None
 
 
 def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:
@@ -89,11 +87,12 @@ def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     for own in spec.configurations or ({},):
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
-            data = _merged(spec.shared, own)
+            data = _merged(spec.given, own)
+            data.pop("name", None)
             for key, value in cell.items():
                 data = _put(data, key, value)
-            if own.get("name") and cell:
-                data["name"] = f"{own['name']},{_name(cell)}"
+            if own.get("name"):
+                data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))
             found.append(({**own, **cell}, data))
     return found
 
@@ -116,40 +115,35 @@ def _put(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     return {**data, first: _put(inner, rest, value)}
 
 
-def _run(configuration: Configuration, name: str, seed: int, gym_packages: tuple[str, ...]) -> Run:
-    given = configuration.model_dump(exclude_none=True)
+def _run(configuration: Configuration, name: str, gym_packages: tuple[str, ...]) -> Run:
+    """The run of a configuration, with no seed of its own yet."""
+    given = configuration.given
     if configuration.vehicle is not None:
-        given["env_kwargs"] = {**configuration.env_kwargs, "vehicle": configuration.vehicle}
-    if not given["env_kwargs"]:
-        del given["env_kwargs"]
-    changes = {**configuration.hyperparams, **{key: given[key] for key in SETTINGS if key in given}}
-    if configuration.trained_agent is not None:
-        given["trained_agent"] = agent_path(configuration.trained_agent)
+        given["env_kwargs"] = {**(configuration.env_kwargs or {}), "vehicle": configuration.vehicle}
+    changes = {**configuration.hyperparams, **{key: given[key] for key in SettingsOptions.model_fields if key in given}}
+    if "trained_agent" in given:
+        named, given["trained_agent"] = given["trained_agent"], agent_path(given["trained_agent"])
         if not Path(given["trained_agent"]).is_file():
-            raise ConfigError(f"trained_agent {configuration.trained_agent}: no such file")
-    job = {key: given[key] for key in TrainingJob.model_fields if key in given}
-    common: dict[str, Any] = {"name": f"{name}/seed_{seed}", "configuration": name, "seed": seed, "gym_packages": gym_packages}
+            raise ConfigError(f"trained_agent {named}: no such file")
+    job = {key: given[key] for key in RunOptions.model_fields if key in given}
     file = configuration.conf_file
     if file is not None and is_pipeline(file):
         for key in ("algo", "env", "n_timesteps", "trained_agent"):
             if key in given:
                 raise ConfigError(f"{key} goes with a single run; the stages of a pipeline have their own in {file}")
         pipeline = with_settings(load_pipeline(file), changes)
-        for stage in stage_jobs(pipeline, {**job, "seed": seed}):
-            _check_vehicle(stage)
-        return Run(**common, job=job, pipeline=pipeline, stem=Path(file).stem)
-    if configuration.algo is None or configuration.env is None:
-        missing = "algo" if configuration.algo is None else "env"
-        raise ConfigError(f"{missing} is missing; give algo and env, or a conf_file with the stages of a pipeline")
-    config = load_config(configuration.algo, configuration.env, file, changes)
-    _check_vehicle(validate(TrainingJob, {**job, "seed": seed, "config": config}, "its settings"))
-    return Run(**common, job=job, algo=config.algo, env=config.env_id, settings=config.settings)
-
-
-def _check_vehicle(job: TrainingJob) -> None:
-    """:raises ConfigError: keywords of the environment that do not fit, a vehicle that cannot be loaded."""
-    if job.config.task is not None:
-        first_vehicle(job.flight_settings.vehicle)
+    else:
+        algo, env = configuration.algo, configuration.env
+        if algo is None or env is None:
+            missing = "algo" if algo is None else "env"
+            raise ConfigError(f"{missing} is missing; give algo and env, or a conf_file with the stages of a pipeline")
+        pipeline = Pipeline(stages=(Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes),))
+    stages = []
+    for stage, planned in zip(pipeline.stages, stage_jobs(pipeline, job), strict=True):
+        if planned.config.task is not None:
+            first_vehicle(planned.flight_settings.vehicle)
+        stages.append(stage.model_copy(update={"conf_file": None, "settings": planned.config.settings}))
+    return Run(name=name, configuration=name, seed=0, job=job, stages=tuple(stages), gym_packages=gym_packages)
 
 
 def _plain_name(configuration: Configuration) -> str:
@@ -158,19 +152,16 @@ def _plain_name(configuration: Configuration) -> str:
 
 
 def _name(varied: Mapping[str, Any]) -> str:
+    """What tells a configuration apart, in words: ``pid,learning_rate=0.001``."""
     parts = []
     for key, value in varied.items():
-        text = _word(value)
+        text = (
+            f"{value:g}" if isinstance(value, float) else value if isinstance(value, str) else json.dumps(value, default=str)
+        )
         parts.append(Path(text).with_suffix("").as_posix() if key == "conf_file" else text)
         if key not in NAMED_ALONE:
             parts[-1] = f"{key.rpartition('.')[2]}={parts[-1]}"
     return ",".join(parts)
-
-
-def _word(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:g}"
-    return value if isinstance(value, str) else json.dumps(value, default=str)
 
 
 def _file_name(text: str) -> str:

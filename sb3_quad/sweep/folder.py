@@ -22,18 +22,15 @@ from sb3_quad.sweep.expand import Run
 from sb3_quad.sweep.records import RunRecord
 from sb3_quad.sweep.spec import SweepSpec
 
+PLAN = "plan.json"
+
 
 class Plan(Frozen):
-    """A sweep with all that files say of it, so that it can go on when they have changed."""
+    """A resolved sweep; resuming does not reread the settings files."""
 
     spec: SweepSpec
     runs: tuple[Run, ...] = Field(min_length=1)
     suite: Suite | None = None
-
-    @property
-    def configurations(self) -> list[str]:
-        """Their names, in order."""
-        return [*dict.fromkeys(run.configuration for run in self.runs)]
 
 
 class SweepFolder:
@@ -44,7 +41,7 @@ class SweepFolder:
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self.plan = self.path / "plan.json"
+        self.plan = self.path / PLAN
 
     def write(self, plan: Plan) -> None:
         """Write what the sweep is to do."""
@@ -60,7 +57,7 @@ class SweepFolder:
         if not self.path.is_dir():
             raise ConfigError(f"sweep folder {self.path}: no such folder")
         if not self.plan.is_file():
-            raise ConfigError(f"sweep folder {self.path}: holds no sweep (plan.json is missing)")
+            raise ConfigError(f"sweep folder {self.path}: holds no sweep ({PLAN} is missing)")
         return read_record(self.plan, Plan)
 
     def run(self, run: Run) -> Path:

@@ -9,30 +9,18 @@ from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.sweep.folder import Plan, SweepFolder
-from sb3_quad.sweep.records import RunRecord
-from sb3_quad.sweep.results import Found
+from sb3_quad.sweep.folder import SweepFolder
+from sb3_quad.sweep.results import SweepResults
 
 
-def write_report(
-    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, shown: Mapping[str, Sequence[Table]]
-) -> Path:
-    """Write the report of a sweep's finished runs; a later one replaces it.
+def write_report(place: SweepFolder, found: SweepResults, shown: Mapping[str, Sequence[Table]]) -> Path:
+    """Write the report of a sweep's finished runs: a section for each scenario, the learning curves, the runs.
 
-    :param found: what :func:`~sb3_quad.sweep.results.evaluate` says of them.
-    :param shown: its tables, by scenario.
+    :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`, by scenario.
     :return: the page.
     :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
         not be written.
     """
-    parts = sections(place, plan, records, found, shown)
-    return write_page(place.path, f"Sweep: {plan.spec.name}", _facts(plan, found), parts)
-
-
-def sections(
-    place: SweepFolder, plan: Plan, records: Mapping[str, RunRecord], found: Found, shown: Mapping[str, Sequence[Table]]
-) -> list[Section]:
-    """A section for each scenario, the learning curves, the runs."""
     parts = [
         Section(f"scenario-{number}", scenario, "", flown, facts=flown[0].caption)
         for number, (scenario, flown) in enumerate(shown.items())
@@ -40,11 +28,13 @@ def sections(
     plots = _curves(place, found)
     if plots:
         parts.append(Section("curves", "Learning curves", "Mean over seeds, with their range.", [], plots))
-    parts.append(Section("runs", "Runs", "", [_runs(plan, records)]))
-    return parts
+    parts.append(Section("runs", "Runs", "", [_runs(found)]))
+    configurations = len({run.configuration for run in found.plan.runs})
+    facts = f"{found.finished} of {len(found.plan.runs)} runs of {configurations} configurations are finished."
+    return write_page(place.path, f"Sweep: {found.plan.spec.name}", facts, parts)
 
 
-def _curves(place: SweepFolder, found: Found) -> list[Plot]:
+def _curves(place: SweepFolder, found: SweepResults) -> list[Plot]:
     """A plot of the evaluations along the way; of pipelines, one for each algorithm and environment of a stage."""
     curves: dict[str, dict[str, list[Curve]]] = {}
     for name, group in found.groups.items():
@@ -62,17 +52,13 @@ def _curves(place: SweepFolder, found: Found) -> list[Plot]:
     return plots
 
 
-def _runs(plan: Plan, records: Mapping[str, RunRecord]) -> Table:
+def _runs(found: SweepResults) -> Table:
     rows: list[Sequence[str]] = []
-    for run in plan.runs:
-        record = records.get(run.name)
+    for run in found.plan.runs:
+        record = found.records.get(run.name)
         if record is None:
             rows.append((run.name, "not finished", "", ""))
         else:
-            state = record.state if not record.message else f"{record.state}: {record.message}"
+            state = f"{record.state}: {record.message}" if record.message else record.state
             rows.append((run.name, state, f"{record.timesteps:,}", f"runs/{run.name}/{record.agent}" if record.agent else ""))
     return text_table("", ("run", "state", "timesteps", "agent"), rows, align="left")
-
-
-def _facts(plan: Plan, found: Found) -> str:
-    return f"{found.n_finished} of {len(plan.runs)} runs of {len(plan.configurations)} configurations are finished."

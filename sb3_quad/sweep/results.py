@@ -5,20 +5,20 @@ import io
 import itertools
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.files import write_text
 from sb3_quad.base.version import __version__
+from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.sweep.aggregates import aggregates
+from sb3_quad.sweep.compare import Comparison, aggregates, over_seeds
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.records import ERROR, MEASURES, REWARD, SUCCESS, SURVIVAL, TIME, RunRecord
-from sb3_quad.sweep.statistics import Comparison, Interval, compare, over_seeds
 
-CSV, JSON = "results.csv", "results.json"
 ROWS = {  # by measure: its row, factor and decimals
     SUCCESS: (Row("success", "%"), 100.0, 2),
     SURVIVAL: (Row("survival", "%"), 100.0, 2),
@@ -26,89 +26,109 @@ ROWS = {  # by measure: its row, factor and decimals
     ERROR: (Row("final error, median", "m"), 1.0, 3),
     TIME: (Row("mean time until there, or stable", "s"), 1.0, 2),
 }
+STATISTICS = {measure: np.nanmedian if measure == ERROR else np.nanmean for measure in MEASURES}
 COMPARED = (SUCCESS, REWARD)
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
-MOST_COMPARED = 8  # configurations of which every pair is compared
-
-Records = Mapping[str, RunRecord]
+MOST_COMPARED = 8  # configurations of which every pair is compared; of more, each with the first alone
 
 
-class Found(NamedTuple):
-    """What a sweep found.
+@dataclass(frozen=True)
+class SweepResults:
+    """What the finished runs of a sweep reached.
 
     :param groups: by configuration, its finished runs, in the order of the seeds; only configurations that have any.
-    :param intervals: by configuration, scenario and measure; None: not measured.
+    :param estimates: by configuration, scenario and measure; None: not measured.
     :param comparisons: by scenario, measure and pair of configurations.
     """
 
+    plan: Plan
+    records: Mapping[str, RunRecord]
     groups: dict[str, list[RunRecord]]
-    intervals: dict[tuple[str, str, str], Interval | None]
+    estimates: dict[tuple[str, str, str], Estimate | None]
     comparisons: dict[tuple[str, str, str, str], Comparison]
 
     @property
-    def n_finished(self) -> int:
+    def finished(self) -> int:
         """How many runs are finished."""
         return sum(len(group) for group in self.groups.values())
 
 
-def evaluate(plan: Plan, records: Records) -> Found:
+def evaluate(plan: Plan, records: Mapping[str, RunRecord]) -> SweepResults:
     """Means, intervals and comparisons of all runs that are finished."""
-    groups: dict[str, list[RunRecord]] = {name: [] for name in plan.configurations}
+    groups: dict[str, list[RunRecord]] = {}
     for run in plan.runs:
-        record = records.get(run.name)
-        if record is not None and record.state == "finished":
-            groups[run.configuration].append(record)
-    groups = {name: group for name, group in groups.items() if group}
-    keys = itertools.product(groups, scenarios_of(groups), MEASURES)
-    intervals = {key: _over_seeds(matrix(groups[key[0]], *key[1:]), key[2]) for key in keys}
-    return Found(groups, intervals, comparisons(groups))
+        if run.name in records and records[run.name].state == "finished":
+            groups.setdefault(run.configuration, []).append(records[run.name])
+    estimates = {
+        (name, scenario, measure): over_seeds(_matrix(groups[name], scenario, measure), STATISTICS[measure])
+        for name, scenario, measure in itertools.product(groups, _scenarios(groups), MEASURES)
+    }
+    return SweepResults(plan, records, groups, estimates, _compare(groups))
 
 
-def write_results(place: SweepFolder, plan: Plan, records: Records, found: Found) -> None:
+def _compare(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Comparison]:
+    names, found = list(groups), {}
+    pairs = [pair for pair in itertools.combinations(names, 2) if len(names) <= MOST_COMPARED or pair[0] == names[0]]
+    for scenario, measure, pair in itertools.product(_scenarios(groups), COMPARED, pairs):
+        first, second = ({record.seed: record for record in groups[name]} for name in pair)
+        common = [seed for seed in first if seed in second]
+        one, two = (_matrix([each[seed] for seed in common], scenario, measure) for each in (first, second))
+        difference = over_seeds(one - two) if common and one.shape == two.shape else None
+        if difference is not None:
+            found[scenario, measure, pair[0], pair[1]] = Comparison(difference)
+    return found
+
+
+def write_results(place: SweepFolder, found: SweepResults) -> None:
     """Write ``results.csv``, a line for each run and scenario, and ``results.json``.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    text, rows = io.StringIO(), [row for run in plan.runs if run.name in records for row in _rows(records[run.name])]
+    text, records = io.StringIO(), [found.records[run.name] for run in found.plan.runs if run.name in found.records]
     columns = ["run", "configuration", "seed", "state", "scenario", "episodes", *MEASURES, "timesteps", "agent", "weights"]
     writer = csv.DictWriter(text, [*columns, "message"], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(rows)
-    write_text(place.path / CSV, text.getvalue())
+    writer.writerows(row for record in records for row in _rows(record))
+    write_text(place.path / "results.csv", text.getvalue())
+    rates = {
+        name: np.column_stack([_matrix(group, each, SUCCESS).mean(axis=1) for each in _scenarios({name: group})])
+        for name, group in found.groups.items()
+        if all(SUCCESS in measures for record in group for measures in record.flights.values())
+    }
     content = {
-        "sweep": plan.spec.name,
+        "sweep": found.plan.spec.name,
         "package_version": __version__,
-        "runs": len(plan.runs),
-        "finished": found.n_finished,
-        "failed": {name: record.message for name, record in records.items() if record.state == "failed"},
+        "runs": len(found.plan.runs),
+        "finished": found.finished,
+        "failed": {name: record.message for name, record in found.records.items() if record.state == "failed"},
         "configurations": {
             name: {"seeds": [record.seed for record in group], "scenarios": _summary(found, name)}
             for name, group in found.groups.items()
         },
         "comparisons": [
             {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": pair.verdict}
-            | pair.difference._asdict()
+            | pair.difference.model_dump()
             for (scenario, measure, first, second), pair in found.comparisons.items()
         ],
-        "aggregates": aggregates(found.groups),
+        "aggregates": aggregates(rates),
     }
-    write_text(place.path / JSON, json.dumps(content, indent=1) + "\n")
+    write_text(place.path / "results.json", json.dumps(content, indent=1) + "\n")
 
 
-def tables(found: Found) -> dict[str, list[Table]]:
+def tables(found: SweepResults) -> dict[str, list[Table]]:
     """By scenario, a column for each configuration; and who is better than whom."""
+    columns = [Column(f"{name} ({len(group)} seed{'s' * (len(group) > 1)})") for name, group in found.groups.items()]
     made: dict[str, list[Table]] = {}
-    for scenario in scenarios_of(found.groups):
+    for scenario in _scenarios(found.groups):
         rows = []
-        for measure, (row, factor, decimals) in ROWS.items():
-            cells = [_cell(found.intervals[name, scenario, measure], factor, decimals) for name in found.groups]
+        for measure, (row, _, _) in ROWS.items():
+            cells = [_cell(found.estimates[name, scenario, measure], measure) for name in found.groups]
             if any(cell != Cell() for cell in cells):
                 rows.append(Row(row.name, row.unit, cells))
-        columns = [Column(f"{name} ({_count(group)})") for name, group in found.groups.items()]
         made[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
         lines = [
-            Row(f"{first} than {second}", ROWS[measure][0].heading, [Cell(words=pair.verdict), _difference(pair, measure)])
-            for (where, measure, first, second), pair in found.comparisons.items()
+            Row(f"{one} than {two}", ROWS[measure][0].heading, [Cell(words=pair.verdict), _cell(pair.difference, measure)])
+            for (where, measure, one, two), pair in found.comparisons.items()
             if where == scenario
         ]
         if lines:
@@ -118,73 +138,38 @@ def tables(found: Found) -> dict[str, list[Table]]:
     return made
 
 
-def comparisons(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Comparison]:
-    """By scenario, measure and pair of configurations; of very many configurations, each against the first alone."""
-    names = list(groups)
-    pairs = list(itertools.combinations(names, 2))
-    if len(names) > MOST_COMPARED:
-        pairs = [(names[0], name) for name in names[1:]]
-    found = {}
-    for scenario, measure, (first, second) in itertools.product(scenarios_of(groups), COMPARED, pairs):
-        one, two = ({record.seed: record for record in groups[name]} for name in (first, second))
-        common = [seed for seed in one if seed in two]
-        values = [matrix([each[seed] for seed in common], scenario, measure) for each in (one, two)]
-        if common and all(each is not None and np.isfinite(each).all() for each in values):
-            found[scenario, measure, first, second] = compare(*values)  # type: ignore[arg-type]
-    return found
-
-
-def scenarios_of(groups: Mapping[str, Sequence[RunRecord]]) -> list[str]:
+def _scenarios(groups: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     """All scenarios that were flown, in order."""
     return [*dict.fromkeys(name for group in groups.values() for record in group for name in record.flights)]
 
 
-def matrix(records: Sequence[RunRecord], scenario: str, measure: str) -> FloatArray | None:
-    """A measure of some runs, (runs, episodes), NaN where there is no number; None: it was not measured."""
-    rows = [record.flights.get(scenario, {}).get(measure) for record in records]
-    if any(row is None for row in rows) or len({len(row or ()) for row in rows}) != 1:
-        return None
-    return np.array(rows, dtype=np.float64)
+def _matrix(records: Sequence[RunRecord], scenario: str, measure: str) -> FloatArray:
+    """A measure of some runs, (runs, episodes), NaN where there is no number; (runs, 0) if it was not measured."""
+    return np.array([record.flights.get(scenario, {}).get(measure, ()) for record in records], dtype=np.float64)
 
 
-def _over_seeds(values: FloatArray | None, measure: str) -> Interval | None:
-    return None if values is None else over_seeds(values, measure)
-
-
-def _summary(found: Found, configuration: str) -> dict[str, Any]:
-    def entry(interval: Interval | None) -> dict[str, float] | None:
-        return None if interval is None else interval._asdict()
-
-    names = scenarios_of({"": found.groups[configuration]})
-    return {name: {measure: entry(found.intervals[configuration, name, measure]) for measure in MEASURES} for name in names}
+def _summary(found: SweepResults, configuration: str) -> dict[str, Any]:
+    names = _scenarios({configuration: found.groups[configuration]})
+    estimates = {name: {measure: found.estimates[configuration, name, measure] for measure in MEASURES} for name in names}
+    return {name: {key: each and each.model_dump() for key, each in group.items()} for name, group in estimates.items()}
 
 
 def _rows(record: RunRecord) -> list[dict[str, Any]]:
     common = record.model_dump(include={"configuration", "seed", "state", "timesteps", "agent", "weights", "message"})
     common["run"] = record.name
-    if not record.flights:
-        return [common]
     lines = []
     for scenario, measures in record.flights.items():
         line = {**common, "scenario": scenario, "episodes": len(next(iter(measures.values())))}
         for measure in measures:
-            values = matrix([record], scenario, measure)
-            if values is not None and np.isfinite(values).any():
-                line[measure] = f"{np.nanmedian(values) if measure == ERROR else np.nanmean(values):.9g}"
+            values = _matrix([record], scenario, measure)
+            if np.isfinite(values).any():
+                line[measure] = f"{STATISTICS[measure](values):.9g}"
         lines.append(line)
-    return lines
+    return lines or [common]
 
 
-def _cell(interval: Interval | None, factor: float, decimals: int) -> Cell:
-    if interval is None:
-        return Cell()
-    return Cell(factor * interval.value, (factor * interval.low, factor * interval.high), decimals)
-
-
-def _difference(pair: Comparison, measure: str) -> Cell:
+def _cell(estimate: Estimate | None, measure: str) -> Cell:
     _, factor, decimals = ROWS[measure]
-    return _cell(pair.difference, factor, decimals)
-
-
-def _count(group: Sequence[RunRecord]) -> str:
-    return f"{len(group)} seed" + ("s" if len(group) > 1 else "")
+    if estimate is None:
+        return Cell()
+    return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)

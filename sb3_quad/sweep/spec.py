@@ -11,45 +11,47 @@ lists of values, of which every combination is a configuration; ``configurations
       env_kwargs.noise: [0, 0.05]
 """
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, TypeAlias
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, PositiveInt
+from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_number
 from sb3_quad.base.seeds import check_seed
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.training.values import as_list
 
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 MAX_RUNS = 10_000
-Whole: TypeAlias = Annotated[int, BeforeValidator(parse_number)]
 
 
-class Configuration(Frozen):
+class Configuration(SettingsOptions, RunOptions):
     """What one training is given, less its seed; what is left out is as for ``train``."""
 
     name: str | None = Field(default=None, min_length=1, description="in tables and folders; made of what differs without it")
     algo: str | None = Field(default=None, description="algorithm of a single run")
     env: str | None = Field(default=None, description="environment id of a single run")
     conf_file: str | None = Field(default=None, description="settings file, of a single run or of a pipeline")
-    n_timesteps: Whole | None = Field(default=None, description="timesteps")
-    n_envs: Whole | None = Field(default=None, description="environments side by side")
-    vec_env: str | None = Field(default=None, description="batch, dummy or subproc")
-    expert: str | None = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory")
     hyperparams: dict[str, Any] = Field(default={}, description="settings to change, such as n_steps: 500")
-    env_kwargs: dict[str, Any] = Field(default={}, description="keywords of the environment")
-    eval_env_kwargs: dict[str, Any] | None = Field(default=None, description="the same, for evaluations only")
     vehicle: str | None = Field(default=None, description="env_kwargs' vehicle, by name or YAML file")
-    trained_agent: str | None = Field(default=None, description="agent to start from")
-    eval_freq: Whole | None = Field(default=None, description="timesteps between evaluations along the way")
-    eval_episodes: Whole | None = Field(default=None, description="episodes of each")
-    n_eval_envs: Whole | None = Field(default=None, description="environments of an evaluation along the way")
-    save_freq: Whole | None = Field(default=None, description="timesteps between checkpoints")
-    snapshot_every: NonNegativeFloat | None = Field(default=None, description="seconds between snapshots")
-    device: str | None = Field(default=None, description="cpu, cuda or auto")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _parse_numbers(cls, data: Any) -> Any:
+        """``1e6`` is a text to YAML."""
+        if not isinstance(data, Mapping):
+            return data
+        options = {*SettingsOptions.model_fields, *RunOptions.model_fields}
+        return {key: parse_number(value) if key in options else value for key, value in data.items()}
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The keys that have another value than their default."""
+        return self.model_dump(include={*Configuration.model_fields}, exclude_defaults=True)
 
 
 class Resources(Frozen):
@@ -78,13 +80,7 @@ class SweepSpec(Configuration):
     configurations: tuple[dict[str, Any], ...] = Field(default=(), description="a list of keys and values each")
     evaluation: Evaluation = Field(default=Evaluation(), description="what the agents fly in the end")
     resources: Resources = Field(default=Resources(), description="what a run takes")
-    storage: str | None = Field(default=None, description="folder or URL through which run folders travel from Ray's workers")
     gym_packages: tuple[str, ...] = Field(default=(), description="modules that register further environments")
-
-    @property
-    def shared(self) -> dict[str, Any]:
-        """The keys that all configurations share."""
-        return self.model_dump(include={*Configuration.model_fields} - {"name"}, exclude_defaults=True)
 
 
 def load_sweep(source: str | Path) -> SweepSpec:

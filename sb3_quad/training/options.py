@@ -38,8 +38,8 @@ class SettingsOptions(Frozen):
     env_kwargs: dict[str, Any] | None = option(None, "environment keywords, such as noise:0", metavar="K:V")
 
 
-class JobOptions(Frozen):
-    """What a training is told beyond its settings. All its random numbers follow from ``seed``."""
+class RunOptions(Frozen):
+    """What a training is told beyond its settings, which the configurations of a sweep may differ in."""
 
     eval_env_kwargs: dict[str, Any] | None = option(None, "environment keywords for evaluations only", metavar="K:V")
     trained_agent: str | None = option(
@@ -50,14 +50,19 @@ class JobOptions(Frozen):
     )
     n_eval_envs: PositiveInt | None = option(None, "environments of an evaluation (batch: one per episode; else 1)")
     device: Annotated[str, AfterValidator(_check_device)] = option("cpu", "cpu, cuda or auto", metavar=None)
-    log_folder: str = option("logs", "folder for the run folders", "-f", metavar="DIR")
-    seed: Annotated[int, AfterValidator(check_seed)] = option(0, "seed of policy, environments and exploration")
     eval_freq: int = option(250_000, "timesteps between evaluations; below 1: one at the end")
     eval_episodes: int = option(48, "episodes per evaluation; 0: no evaluations")
     save_freq: int = option(-1, "timesteps between checkpoints; below 1: none")
     snapshot_every: NonNegativeFloat = option(
         60.0, "seconds between snapshots, from which --resume goes on after a crash; 0: none", metavar="SECONDS"
     )
+
+
+class JobOptions(RunOptions):
+    """All that a training is told beyond its settings. All its random numbers follow from ``seed``."""
+
+    log_folder: str = option("logs", "folder for the run folders", "-f", metavar="DIR")
+    seed: Annotated[int, AfterValidator(check_seed)] = option(0, "seed of policy, environments and exploration")
     log_interval: PositiveInt = option(1, "rollouts between two tables of --verbose 1")
     tensorboard_log: str | None = option(None, "folder for TensorBoard", "-tb", metavar="DIR")
     verbose: Literal[0, 1, 2] = option(0, "1: SB3's tables, 2: debugging")

@@ -23,18 +23,7 @@ from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
 from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.training.options import JobOptions, SettingsOptions
-
-JOB = (
-    "eval_env_kwargs",
-    "trained_agent",
-    "n_eval_envs",
-    "device",
-    "eval_freq",
-    "eval_episodes",
-    "save_freq",
-    "snapshot_every",
-)
+from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
 
 def add_arguments(parser: Parser) -> None:
@@ -46,12 +35,11 @@ def add_arguments(parser: Parser) -> None:
     add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
     add_fields(parser, SettingsOptions)
     add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
-    add_fields(parser, JobOptions, *JOB, "log_folder", trained_agent={"type": agent_path})
+    add_fields(parser, JobOptions, *RunOptions.model_fields, "log_folder", trained_agent={"type": agent_path})
     add("--suite", metavar="SUITE", help="what the agents fly in the end (fresh episodes of both tasks, 240 each)")
     add("--episodes", type=positive, metavar="N", help="episodes of each scenario in the end")
     add("--gym-packages", nargs="+", metavar="MODULE", help="modules that register further environments")
     add("--workers", type=positive, metavar="N", help="runs side by side (the cores)")
-    add("--storage", metavar="WHERE", help="folder or URL through which run folders travel from Ray's workers")
     add("--dry-run", action="store_true", help="list the runs, train nothing")
     add("--resume", metavar="FOLDER", help="go on with a sweep: what is not finished in its folder")
     add_common(parser, "executor", "trust", "progress")
@@ -75,10 +63,10 @@ def run(options: argparse.Namespace) -> int:
     if not options.dry_run:
         return _go_on(options, plan, None)
     for each in plan.runs:
-        stages = [] if each.pipeline is None else [f"{stage.algo} on {stage.env}" for stage in each.pipeline.stages]
-        single = f"{each.algo} on {each.env}, {each.settings.get('n_timesteps', 0):,} timesteps"
-        print(f"{each.name}: " + (f"pipeline {each.stem}: {', '.join(stages)}" if stages else single))
-    print(f"{_count(len(plan.runs), 'run')} of {_count(len(plan.configurations), 'configuration')}")
+        stages = (f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps" for stage in each.stages)
+        print(f"{each.name}: {', then '.join(stages)}")
+    configurations = len({each.configuration for each in plan.runs})
+    print(f"{_count(len(plan.runs), 'run')} of {_count(configurations, 'configuration')}")
     return 0
 
 
@@ -146,19 +134,18 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
         with locked(place.path, "sweep folder"), StopSignals() as signals, progress_bar(options.progress) as show:
             records = execute(place, plan, executor, signals, show, print)
             signals.hold()
-            executor.close()
             found = evaluate(plan, records)
-            write_results(place, plan, records, found)
+            write_results(place, found)
             if found.groups:
                 shown = tables(found)
                 for table in (table for each in shown.values() for table in each):
                     console().print(table)
                 try:
-                    write_report(place, plan, records, found, shown)
+                    write_report(place, found, shown)
                 except MissingExtra as error:
                     print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
     failures = [record for record in records.values() if record.state == "failed"]
-    finished = f"{found.n_finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
+    finished = f"{found.finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
     print(f"{finished}; {time.perf_counter() - start:.1f} s")
     print(f"saved in {place.path}: results.csv, results.json, runs/" + (", report.md, report.html" if found.groups else ""))
     for record in failures:

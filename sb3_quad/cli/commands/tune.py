@@ -16,6 +16,7 @@ The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. N
 import argparse
 import sys
 from collections.abc import Callable
+from concurrent.futures import FIRST_COMPLETED, wait
 from contextlib import suppress
 from itertools import count
 from pathlib import Path
@@ -96,12 +97,13 @@ def _share(options: argparse.Namespace, search: Any, signals: StopSignals, after
     shared = search.job.model_copy(update={"log_folder": str(Path(search.job.log_folder).absolute())})
     ended, failures, stopped = 0, 0, False
     with start_executor(options.executor, options.workers, options.address) as executor:
-        for _ in range(options.n_trials):
-            executor.submit(train_trial, shared, search.space, search.name, storage, study, options.max_total_trials)
-        while executor.pending:
-            for task in executor.wait(1.0):
+        arguments = shared, search.space, search.name, storage, study, options.max_total_trials
+        futures = {executor.submit(train_trial, *arguments) for _ in range(options.n_trials)}
+        while futures:
+            done, futures = wait(futures, 1.0, FIRST_COMPLETED)
+            for future in done:
                 try:
-                    number = task.result()
+                    number = None if future.cancelled() else future.result()
                 except WorkerDied as error:
                     print(f"a trial is lost, and tried again by whoever goes on: {error}", file=sys.stderr)
                     continue
@@ -114,7 +116,7 @@ def _share(options: argparse.Namespace, search: Any, signals: StopSignals, after
                     raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {trial.user_attrs[ERROR]}")
             if signals.received is not None and not stopped:
                 stopped = True
-                executor.cancel()
+                executor.stop()
 
 
 def _make_search(options: argparse.Namespace) -> Any:
