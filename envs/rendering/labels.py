@@ -11,19 +11,11 @@ from PIL import ImageDraw, ImageFont
 
 from sb3_quad.base.arrays import Image
 
-# Okabe and Ito's palette, which the colour-blind can read, less its black and its yellow, which drown on dark and on light
-# paper, and less its green, which is the targets'; a few moved.
-COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
 INK = (24, 32, 44)
 PLATE = (255, 255, 255, 205)
 STEP = 1.3  # between lines of text, in font sizes
 SMALLER = 0.88  # font size of what stands below a heading
 GAP = 4  # between pictures side by side, pixels
-
-
-def colours_of(names: Sequence[str]) -> dict[str, str]:
-    """A colour, as ``#rrggbb``, for each name, by its place: the same in every picture; after eight they repeat."""
-    return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(names)}
 
 
 @cache

@@ -7,8 +7,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.evaluation.learning_curves import Curve
 from sb3_quad.report.plots import POINTS, band, legend, styled
 

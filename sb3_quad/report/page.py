@@ -12,7 +12,7 @@ from typing import Any
 from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.base.imports import require
 from sb3_quad.evaluation.tables import Table
-from sb3_quad.report.plots import Plot
+from sb3_quad.report.plots import Plot, Space
 
 PAGE, MARKDOWN, PICTURES = "report.html", "report.md", "figures"
 
@@ -29,12 +29,12 @@ class Section:
     heading: str
     description: str = ""
     tables: Sequence[Table] = ()
-    plots: Sequence[Plot] = ()
+    plots: Sequence[Plot | Space] = ()
     facts: str = ""
 
 
 def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section], with_pictures: bool = True) -> Path:
-    """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG and SVG, and ``report.html`` with everything.
+    """Write ``report.md`` with the tables, ``figures/`` with each flat plot as PNG and SVG, and the page, ``report.html``.
 
     The page needs no other file and no network. Files that are there are replaced.
 
@@ -46,9 +46,9 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
     """
     folder = Path(folder)
     write_text(folder / MARKDOWN, _markdown(title, sections))
-    for plot in (plot for section in sections for plot in section.plots) if with_pictures else ():
-        write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
-        write_bytes(folder / PICTURES / f"{plot.name}.svg", plot.svg)
+    for plot in (plot for section in sections for plot in section.plots if isinstance(plot, Plot) and with_pictures):
+        write_bytes(folder / PICTURES / f"{plot.name}.png", plot.file("png"))
+        write_bytes(folder / PICTURES / f"{plot.name}.svg", plot.file("svg"))
     write_text(folder / PAGE, render(title, facts, sections, PICTURES if with_pictures else ""))
     return folder / PAGE
 
@@ -57,12 +57,12 @@ def render(title: str, facts: str, sections: Sequence[Section], pictures: str = 
     """The page as text.
 
     :param pictures: the folder beside the page that holds its plots as files; empty: there is none.
-    :raises MissingExtra: Jinja2 is not installed, or Plotly, where there are plots.
+    :raises MissingExtra: Jinja2 is not installed, or Plotly, where there are flights in space.
     """
     jinja2 = require("jinja2", "report", PAGE)
     loader = jinja2.PackageLoader("sb3_quad.report", "templates")
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    spaces = {plot.name: plot.space for section in sections for plot in section.plots if plot.space is not None}
+    spaces = {plot.name: plot.drawing for section in sections for plot in section.plots if isinstance(plot, Space)}
     text: str = (
         jinja2.Environment(loader=loader, **options)
         .get_template("page.html.j2")

@@ -1,73 +1,67 @@
-"""Flights in space: a picture by matplotlib, and the same for Plotly, to be turned in the page."""
+"""Flights in space, to be turned in the page."""
 
-import math
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.report.plots import FORCE, GRID, Flown, Plot, legend, styled
+from sb3_quad.report.plots import Space
+from sb3_quad.report.scenario_plots import FORCE, ControllerFlights
 
 TARGET, START = "#1a9a45", "#8a8f98"
-MARKS: dict[str, Any] = {"diamond": {"marker": "D"}, "circle-open": {"marker": "o", "markerfacecolor": "none"}}
 SHOWN_FLIGHTS = 4  # of a controller, of random episodes
 PATH_POINTS = 150  # that a flight is drawn with, at most
-ARROW, CROSS = 0.16, 0.012  # longest force arrow, half a cross: of the longest side of all flights
+ARROW = 0.16  # longest force arrow, of the longest side of all flights
 ARROWS = 5  # along a path on which a force lasts throughout
 BRIEF = 10  # samples; a shorter push has one arrow
+CAMERA = {"eye": {"x": 1.45, "y": -1.95, "z": 0.68}, "center": {"x": 0, "y": 0, "z": -0.17}}
 
 
-class Trace(NamedTuple):
-    """A line through points, (n, 3), m, or marks at them; NaN leaves a gap.
+def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Space:
+    """Flights, their targets and the forces met, of controllers with recorded flights."""
+    count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
+    shown = [(each, track) for each in flights for track in each.tracks[:count]]
+    size = float(np.ptp(np.concatenate([track.position for _, track in shown]), axis=0).max())
+    data = []
+    for each, track in shown:
+        chosen = np.unique([*range(0, len(track.times), -(-len(track.times) // PATH_POINTS)), len(track.times) - 1])
+        data.append(_trace(each.label, each.colour, track.position[chosen], data))
+        if track.lost:
+            data.append(_trace(each.label, each.colour, track.position[-1:], data, "x", track.lost))
+    targets = np.unique(np.round(np.concatenate([track.targets for _, track in shown]), 6), axis=0)
+    data.append(_trace("target", TARGET, targets, data, "diamond"))
+    data.append(_trace("start", START, shown[0][1].position[:1], data, "circle-open"))
+    for points, text in _forces([each.tracks[0] for each in flights], ARROW * size):
+        data.append(_trace("force", FORCE, points, data, text=text))
+    what = "The first flight of each controller" if count == 1 else f"The first {count} flights of each controller"
+    caption = f"{what}; a cross marks where one is lost. Red arrows: the external force, if there is one."
+    return Space(f"{scenario.name}_paths", caption, {"data": data, "layout": _layout(data)})
 
-    :param mark: a symbol of Plotly; empty for a line.
+
+def _trace(
+    name: str, colour: str, points: FloatArray, others: Sequence[Mapping[str, Any]], symbol: str = "", text: str = ""
+) -> dict[str, Any]:
+    """A line through points, (n, 3), m, or marks at them; in the legend if none of the others has its name.
+
+    :param symbol: of the marks; empty: a line.
     :param text: shown where the mouse points.
     """
-
-    name: str
-    colour: str
-    points: FloatArray
-    mark: str = ""
-    text: str = ""
-
-
-@styled
-def paths_plot(scenario: Scenario, flown: Sequence[Flown]) -> Plot:
-    """Flights, their targets and the forces met, of controllers with sampled flights."""
-    count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
-    shown = [(each, track) for each in flown for track in each.tracks[:count]]
-    size = float(np.ptp(np.concatenate([track.position for _, track in shown]), axis=0).max())
-    traces = [trace for each, track in shown for trace in _flight(each, track, CROSS * size)]
-    forces = _forces([each.tracks[0] for each in flown], ARROW * size)
-    targets = np.unique(np.round(np.concatenate([track.targets for _, track in shown]), 6), axis=0)
-    traces.append(Trace("target", TARGET, targets, "diamond"))
-    traces.append(Trace("start", START, shown[0][1].position[:1], "circle-open"))
-    traces += forces
-    box = _box(np.concatenate([trace.points for trace in traces]))
-    what = "The first flight of each controller" if count == 1 else f"The first {count} flights of each controller"
-    caption = f"{what}; a cross marks where one is lost." + (" Arrows: the external force." if forces else "")
-    return Plot(f"{scenario.name}_paths", caption, _picture(traces, box), _space(traces, box))
+    look = {"marker": {"color": colour, "size": 5, "symbol": symbol}} if symbol else {"line": {"color": colour, "width": 4}}
+    names = {"name": escape(name), "legendgroup": name, "showlegend": escape(name) not in {each["name"] for each in others}}
+    hover = {"hovertext": text, "hoverinfo": "text+name"} if text else {}
+    axes = dict(zip("xyz", points.round(3).T.tolist(), strict=True))
+    return {"type": "scatter3d", "mode": "markers" if symbol else "lines", **look, **names, **hover, **axes}
 
 
-def _flight(each: Flown, track: Track, cross: float) -> list[Trace]:
-    """The path, and a cross of that size (m) where it ends too soon; of lines, since not every font has a cross."""
-    chosen = np.unique([*range(0, len(track.times), -(-len(track.times) // PATH_POINTS)), len(track.times) - 1])
-    traces = [Trace(each.label, each.colour, track.position[chosen])]
-    if track.lost:
-        strokes = [[end * x, end * y, end] for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1)) for end in (-1.0, 1.0, math.nan)]
-        traces.append(Trace(each.label, each.colour, track.position[-1] + cross * np.array(strokes), text=track.lost))
-    return traces
-
-
-def _forces(tracks: Sequence[Track], length: float) -> list[Trace]:
-    """Arrows of the forces met, the greatest of that length (m)."""
+def _forces(tracks: Sequence[Track], length: float) -> list[tuple[FloatArray, str]]:
+    """Arrows of the forces met, (5, 3), the greatest of that length (m), each with what it stands for."""
     found = [(track, k, track.wrench[k, :3]) for track in tracks for k in _pushed(track)]
     greatest = max((float(np.linalg.norm(force)) for _, _, force in found), default=1.0)
-    traces = []
+    arrows = []
     for track, k, force in found:
         arrow, at = force * length / greatest, track.position[k]
         axis = np.eye(3)[np.argmin(np.abs(arrow))]
@@ -75,8 +69,8 @@ def _forces(tracks: Sequence[Track], length: float) -> list[Trace]:
         across *= 0.1 * np.linalg.norm(arrow) / np.linalg.norm(across)
         tip, barb = at + arrow, at + 0.7 * arrow
         text = f"{np.linalg.norm(force):.3g} N at {track.times[k]:.2f} s"
-        traces.append(Trace("force", FORCE, np.stack([at, tip, barb + across, tip, barb - across]), text=text))
-    return traces
+        arrows.append((np.stack([at, tip, barb + across, tip, barb - across]), text))
+    return arrows
 
 
 def _pushed(track: Track) -> list[int]:
@@ -93,59 +87,17 @@ def _pushed(track: Track) -> list[int]:
     return chosen
 
 
-def _box(points: FloatArray) -> FloatArray:
-    """Lower and upper corner, (2, 3), of a box around some points: with some room, no side much shorter than the longest."""
-    low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-    middle, half = 0.5 * (low + high), 0.53 * (high - low)
+def _layout(data: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Plotly's layout, with equal scales, and with no side of the space much shorter than the longest."""
+    points = np.concatenate([np.array([trace[name] for name in "xyz"], dtype=np.float64) for trace in data], axis=1)
+    low, high = points.min(axis=1), points.max(axis=1)
+    half = 0.53 * (high - low)
     half = np.maximum(half, max(0.3 * float(half.max()), 0.5))
-    corner = middle - half
-    if low[2] >= 0.0 and corner[2] < 0.0:
-        corner[2] = -0.2
-    return np.stack([corner, middle + half])
-
-
-def _picture(traces: Sequence[Trace], box: FloatArray) -> Figure:
-    figure = Figure(figsize=(6.4, 4.8), layout="constrained")
-    axes: Any = figure.add_subplot(projection="3d")
-    for trace in traces:
-        style = {"linestyle": "none", "markersize": 5, **MARKS[trace.mark]} if trace.mark else {"linewidth": 1.3}
-        axes.plot(*trace.points.T, color=trace.colour, label=trace.name, **style)
-    size = np.ptp(box, axis=0)
-    for name, low, high, side in zip("xyz", *box, size / size.max(), strict=True):
-        axes.set(**{f"{name}label": f"{name} (m)", f"{name}lim": (low, high)})
-        axes.locator_params(axis=name, nbins=max(3, round(8 * side)))
-        axis = getattr(axes, f"{name}axis")
-        axis.set_pane_color("none")
-        axis.line.set_color(GRID)
-    axes.set_box_aspect(size, zoom=0.9)
-    axes.view_init(elev=18, azim=-55)
-    legend(figure, axes)
-    return figure
-
-
-def _space(traces: Sequence[Trace], box: FloatArray) -> dict[str, Any]:
-    """``data`` and ``layout`` of Plotly; the page adds the colours of text and grid, which may be light or dark."""
-    data, seen = [], set()
-    for trace in traces:
-        points = {axis: [_number(x) for x in trace.points[:, k]] for k, axis in enumerate("xyz")}
-        mode, style = ("markers", "marker") if trace.mark else ("lines", "line")
-        shown = {"size": 6, "symbol": trace.mark} if trace.mark else {"width": 4}
-        names = {"name": trace.name, "legendgroup": trace.name, "showlegend": trace.name not in seen}
-        hover = {"hovertext": trace.text, "hoverinfo": "text+name"} if trace.text else {}
-        data.append({"type": "scatter3d", "mode": mode, style: {"color": trace.colour, **shown}, **points, **names, **hover})
-        seen.add(trace.name)
     axes: dict[str, Any] = {
-        f"{name}axis": {"title": {"text": f"{name} (m)"}, "range": [low, high], "showbackground": False, "zeroline": False}
-        for name, low, high in zip("xyz", *box.tolist(), strict=True)
+        f"{name}axis": {"title": {"text": f"{name} (m)"}, "range": ends, "showbackground": False, "zeroline": False}
+        for name, *ends in zip("xyz", (0.5 * (low + high) - half).tolist(), (0.5 * (low + high) + half).tolist(), strict=True)
     }
-    size = np.ptp(box, axis=0)
-    camera = {"eye": {"x": 1.45, "y": -1.95, "z": 0.68}, "center": {"x": 0, "y": 0, "z": -0.17}}
-    ratio = dict(zip("xyz", (1.3 * size / size.max()).tolist(), strict=True))
-    scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": camera, "dragmode": "turntable"}
-    below = {"orientation": "h", "x": 0, "y": 0, "xanchor": "left", "yanchor": "top"}  # above are Plotly's buttons
-    return {"data": data, "layout": {"scene": scene, "margin": {"l": 0, "r": 0, "t": 30, "b": 0}, "legend": below}}
-
-
-def _number(value: float) -> float | None:
-    """Four digits of a number; None for NaN, for which JSON has none."""
-    return float(f"{value:.4g}") if math.isfinite(value) else None
+    ratio = dict(zip("xyz", (1.3 * half / half.max()).tolist(), strict=True))
+    scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": CAMERA, "dragmode": "turntable"}
+    legend = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"}  # Plotly's buttons are at the top
+    return {"scene": scene, "margin": {"l": 0, "r": 0, "t": 30, "b": 0}, "legend": legend}

@@ -3,9 +3,9 @@
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing
-from sb3_quad.envs.rendering.labels import colours_of
 from sb3_quad.evaluation.flightlog import read_tracks
 from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
@@ -22,7 +22,8 @@ from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, Section, write_page
 from sb3_quad.report.paths import paths_plot
-from sb3_quad.report.plots import Flown, Plot, arrivals_plot, errors_plot, hits_plot
+from sb3_quad.report.plots import Plot, Space
+from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, hits_plot
 from sb3_quad.report.varied import families_plot, group_plots
 from sb3_quad.simulation.noise import in_words
 
@@ -58,8 +59,9 @@ def facts(results: Results) -> str:
     flights = sum(entry.metrics.n for entry in results.entries)
     backends = " and ".join(sorted({entry.backend for entry in results.entries}))
     dates = sorted({entry.date for entry in results.entries} - {""})
+    about = f"{results.description.rstrip('.')}. " if results.description else ""
     return (
-        f"{results.description} {flights:,} flights of {len(results.controllers)} controllers in {len(results.scenarios)}"
+        f"{about}{flights:,} flights of {len(results.controllers)} controllers in {len(results.scenarios)}"
         f" scenarios, {backends} backend, flown {' to '.join(dict.fromkeys([*dates[:1], *dates[-1:]]))} by sb3_quad"
         f" {results.package_version}. {SMALL_PRINT}"
     )
@@ -74,10 +76,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     groups = scenario_groups(results)
     shares = [_share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)]
     tables, families = [table for table in shares if table.rows], families_plot(results, groups, colours)
-    parts = [
-        Section("overview", "Success and survival", OVERVIEW, tables, families),
-        Section("controllers", "Controllers", tables=[_controller_table(results.controllers)]),
-    ]
+    parts = [Section("overview", "Success and survival", OVERVIEW, tables, families)]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:
@@ -97,6 +96,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             f"observation noise {in_words(first.noise)}; seed {first.seed}."
         )
         parts.append(Section(first.group or first.name, heading, first.description, tables, plots, how))
+    parts.append(Section("controllers", "Controllers", tables=[_controller_table(results.controllers)]))
     if results.failures:
         rows = [(each.controller, each.scenario or "", each.message) for each in results.failures]
         table = text_table("", ("controller", "scenario", "what happened"), rows, align="left")
@@ -114,21 +114,23 @@ def _controller_table(records: Sequence[ControllerRecord]) -> Table:
     return text_table("", ("name", "controller", "algorithm", "SHA-256", "observation scaled by"), rows, align="left")
 
 
-def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
+def _scenario_plots(
+    results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path
+) -> list[Plot | Space]:
     entries = {label: results.entry(label, scenario.name) for label in colours}
-    flown = [
-        Flown(label, colours[label], entry, read_tracks(Path(folder) / entry.flights))
+    flights = [
+        ControllerFlights(label, colours[label], entry, read_tracks(Path(folder) / entry.flights))
         for label, entry in entries.items()
         if entry is not None
     ]
-    tracked = [each for each in flown if each.tracks]
-    plots = [paths_plot(scenario, tracked)] if tracked else []
-    if flown and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
-        plots.append(arrivals_plot(scenario, flown, results.source))
-    if tracked:
-        plots.append(errors_plot(scenario, tracked))
-    if any(each.entry.hit_limit is not None for each in flown):
-        plots.append(hits_plot(scenario, flown))
+    recorded = [each for each in flights if each.tracks]
+    plots: list[Plot | Space] = [paths_plot(scenario, recorded)] if recorded else []
+    if flights and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
+        plots.append(arrivals_plot(scenario, flights, results.source))
+    if recorded:
+        plots.append(errors_plot(scenario, recorded))
+    if any(each.entry.hit_limit is not None for each in flights):
+        plots.append(hits_plot(scenario, flights))
     return plots
 
 

@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
+from sb3_quad.base.colours import COLOURS
 from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.validate import validate
-from sb3_quad.envs.rendering.labels import COLOURS
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Hook, fly_settings
