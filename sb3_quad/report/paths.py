@@ -26,7 +26,7 @@ def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Spac
     count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
     shown = [(each, track) for each in flights for track in each.tracks[:count]]
     size = float(np.ptp(np.concatenate([track.position for _, track in shown]), axis=0).max())
-    data = []
+    data: list[dict[str, Any]] = []
     for each, track in shown:
         chosen = np.unique([*range(0, len(track.times), -(-len(track.times) // PATH_POINTS)), len(track.times) - 1])
         data.append(_trace(each.label, each.colour, track.position[chosen], data))

@@ -83,7 +83,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             measured = [measured_cells(results, label, first) for label in colours]
             rows = metric_rows(first, measured, first.reference.values(), brief=True)
             tables = [Table(_columns(colours, first.reference, results.source), rows)]
-            plots = _scenario_plots(results, first, colours, folder)
+            plots: Sequence[Plot | Space] = _scenario_plots(results, first, colours, folder)
         else:
             each_of = f" in each of {len(scenarios)} cells"
             tables, plots = [], group_plots(results, scenarios, colours)
@@ -98,8 +98,8 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
         parts.append(Section(first.group or first.name, heading, first.description, tables, plots, how))
     parts.append(Section("controllers", "Controllers", tables=[_controller_table(results.controllers)]))
     if results.failures:
-        rows = [(each.controller, each.scenario or "", each.message) for each in results.failures]
-        table = text_table("", ("controller", "scenario", "what happened"), rows, align="left")
+        failures = [(each.controller, each.scenario or "", each.message) for each in results.failures]
+        table = text_table("", ("controller", "scenario", "what happened"), failures, align="left")
         parts.append(Section("failures", "Failures", tables=[table]))
     return parts
 
