@@ -75,7 +75,9 @@ class BestModel(EveryTimesteps):
         should_continue: Callable[[float, float], bool] = lambda success, reward: True,
         verbose: int = 0,
     ) -> None:
-        super().__init__(every, verbose, n_episodes=n_episodes)
+        super().__init__(every, verbose)
+        if n_episodes < 1:
+            raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
         self._n_episodes, self._seed, self._expert = n_episodes, seed, expert
         self._best_model, self._report, self._should_continue = best_model, report, should_continue
         path, others = Path(evaluations), others or {}

@@ -15,15 +15,13 @@ class EveryTimesteps(EventCallback):
     SB3's EveryNTimesteps counts from its last call instead, so its events drift away from the multiples.
 
     :param every: timesteps, over all environments together.
-    :param counts: further arguments that must be at least 1, by name.
-    :raises ConfigError: one of these numbers is below 1.
+    :raises ConfigError: it is below 1.
     """
 
-    def __init__(self, every: int, verbose: int = 0, **counts: int) -> None:
+    def __init__(self, every: int, verbose: int = 0) -> None:
         super().__init__(verbose=verbose)
-        for name, value in {"every": every, **counts}.items():
-            if value < 1:
-                raise ConfigError(f"{type(self).__name__}: {name} is {value}, must be at least 1")
+        if every < 1:
+            raise ConfigError(f"{type(self).__name__}: every is {every}, must be at least 1")
         self._every, self._passed = every, 0  # multiples that the training has passed
 
     def _on_training_start(self) -> None:

@@ -101,7 +101,7 @@ def one_line_of_error(capsys) -> str:
         (["train", "--algo", "dagger", "--env-kwargs", "noise:-1"], "noise -1"),
         (["train", "--algo", "dagger", "--env-kwargs", "vehicle:itn"], "did you mean 'itm'"),
         (["train", "--algo", "dagger", "--env-kwargs", "task_kwargs:{'target_distanse':3}"], "did you mean 'target_distance'"),
-        (["train", "--algo", "dagger", "--vec-env", "bath"], "did you mean 'batch'"),
+        (["train", "--algo", "dagger", "--vec-env", "bath"], "'batch', 'dummy' or 'subproc'"),
         (["train", "--algo", "dagger", "--expert", "pit"], "unknown expert"),
         (["train", "--algo", "dagger", "--conf-file", "thesis/dager.yml"], "did you mean 'thesis/dagger.yml'"),
         (["train", "--algo", "dagger", "-i", "missing.zip"], "missing.zip: no such file"),

@@ -31,14 +31,6 @@ def build(algo="dagger", env_id=ENV, **settings):
     return build_config(algo, env_id, {**MINIMAL, **settings})
 
 
-@given(st.floats(allow_nan=False, allow_infinity=False, min_value=1e-12, max_value=1e12))
-def test_numbers_may_be_strings(number):
-    text = f"{number:e}"
-    assert parse_number(text) == float(text)
-    assert parse_value(text) == float(text)
-    assert parse_number(number) == number
-
-
 @given(st.floats(min_value=1e-9, max_value=1.0))
 def test_linear_schedules_are_sb3s_own(start):
     schedule = build(learning_rate=f"lin_{start:e}").hyperparams["learning_rate"]
@@ -81,16 +73,18 @@ def test_nothing_is_evaluated(text):
         parse_mapping(text, "policy_kwargs")
 
 
+@given(st.floats(allow_nan=False, allow_infinity=False, min_value=1e-12, max_value=1e12))
+def test_numbers_may_be_strings(number):
+    text = f"{number:e}"
+    assert parse_number(text) == parse_value(text) == float(text)
+    assert parse_number(number) == number
+
+
 @given(st.text(max_size=30))
 @example("0_")
 def test_any_text_on_the_command_line_is_a_value(text):
     value = parse_value(text)
     assert value is None or isinstance(value, (bool, int, float, str, list, tuple, dict))
-
-
-@given(st.dictionaries(st.text(st.characters(categories=["Ll"]), min_size=1, max_size=8), st.integers() | st.booleans()))
-def test_mappings_survive(mapping):
-    assert parse_mapping(repr(mapping), "x") == mapping
 
 
 @pytest.mark.parametrize(
@@ -105,11 +99,9 @@ def test_mappings_survive(mapping):
         ({"learning_rate": "lin_fast"}, "must be lin_ and a number"),
         ({"learning_rate": float("nan")}, "must be finite"),
         ({"n_steps": True}, "n_steps is True, must be a whole number"),
-        ({"gamma": False}, "gamma is False, must be a number"),
-        ({"n_steps": None}, "must be a whole number"),
         ({"bc_loss": "mae"}, "'mse', 'nll'"),
         ({"policy": "MlpPolciy"}, "did you mean 'MlpPolicy'"),
-        ({"vec_env": "bath"}, "did you mean 'batch'"),
+        ({"vec_env": "bath"}, "'batch', 'dummy' or 'subproc'"),
         ({"env_kwargs": {"nosie": 0}}, "did you mean 'noise'"),
         ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "did you mean 'nn.Tanh'"),
         ({"normalize": True}, "normalize is not supported"),
@@ -120,12 +112,6 @@ def test_bad_settings_are_named(settings, message):
     with pytest.raises(ConfigError, match=message) as error:
         build(**settings)
     assert "\n" not in str(error.value)
-
-
-@given(st.integers(max_value=0))
-def test_there_is_at_least_one_environment(n_envs):
-    with pytest.raises(ConfigError, match="at least 1"):
-        build(n_envs=n_envs)
 
 
 @pytest.mark.parametrize("algo", ["dagger", "ppo_bc", "ppo"])
@@ -167,22 +153,6 @@ def test_whole_numbers_may_be_written_as_powers():
     assert isinstance(config.hyperparams["n_steps"], int)
 
 
-@pytest.mark.parametrize("content", ["a: [1", "- 1\n- 2", "", "\x00", "QuadTargetTracking-v0: 3", "Other-v0: {}"])
-def test_unreadable_files_are_one_error(tmp_path, content):
-    path = tmp_path / "broken.yml"
-    path.write_text(content)
-    with pytest.raises(ConfigError, match=r"broken\.yml") as error:
-        load_config("dagger", ENV, path)
-    assert "\n" not in str(error.value)
-
-
-def test_yaml_cannot_make_objects(tmp_path):
-    path = tmp_path / "evil.yml"
-    path.write_text(f"{ENV}: !!python/object/apply:os.system ['true']\n")
-    with pytest.raises(ConfigError, match="not valid YAML"):
-        load_config("dagger", ENV, path)
-
-
 def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text(
@@ -212,20 +182,6 @@ def test_the_types_of_every_algorithm_are_resolved(algorithm):
     }
     assert not takes_whole(parameters["gamma"]) and not takes_whole(parameters["learning_rate"])
     assert takes_whole(parameters["n_steps" if "n_steps" in parameters else "batch_size"])
-
-
-class Foreign:
-    """A constructor whose annotations are strings, one of them of a name that is not there."""
-
-    def __init__(self, steps: int, rate: "float | Missing", plain=1):  # noqa: F821
-        pass
-
-
-def test_a_type_that_cannot_be_resolved_takes_any_value():
-    parameters = constructor_parameters(Foreign)
-    assert [parameter.annotation for parameter in parameters.values()] == [int, Any, Any]
-    assert convert("lin_2", parameters["rate"], "rate")(0.5) == 1.0
-    assert not takes_whole(parameters["rate"])
 
 
 @pytest.mark.parametrize(

@@ -50,7 +50,6 @@ def test_data_become_a_frozen_model():
         ({}, "x: mass: is missing (m, kg)"),
         ({"mass": -1}, "x: mass: Input should be greater than 0 (m, kg)"),
         ({"mass": float("nan")}, "x: mass: Input should be a finite number (m, kg)"),
-        ({"mass": float("inf")}, "x: mass: Input should be a finite number (m, kg)"),
         ({"mass": "1 kg"}, "x: mass: '1 kg' must be a number alone, its unit left out (m, kg)"),
         ({"mass": 1, "count": "four"}, "x: count: 'four' must be a number alone, its unit left out"),
         (
@@ -73,19 +72,11 @@ def test_what_is_wrong_is_one_line(data, message):
     assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
 
 
-def test_of_a_union_only_the_first_alternative_is_named():
-    with pytest.raises(ConfigError) as caught:
-        validate(Craft, {"mass": 1, "length": [1]}, "x")
-    assert str(caught.value).count("length") == 1
-
-
 @pytest.mark.parametrize(
     ("faults", "kind"),
     [
         ({"fault": "hover"}, CannotHover),
-        ({"fault": "hover", "second": "hover"}, CannotHover),
         ({"fault": "hover", "second": "other"}, ConfigError),
-        ({"fault": "hover", "cuont": 1}, ConfigError),
         ({"fault": "expert"}, ConfigError),
     ],
 )

@@ -6,7 +6,7 @@ falls linearly to 0 over the training; a learning rate to its n-th part, in the 
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 import gymnasium
 from pydantic import (
@@ -40,7 +40,8 @@ SETTINGS = YamlFolder(
     folders=("any_quadcopter", "nominal", "pid", "robust", "thesis", "value_based"),
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
-VEC_ENVS = ("batch", "dummy", "subproc")
+VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
+VEC_ENVS = get_args(VecEnvKind)
 MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as many in a process
 LIMITS = {"learning_rate": (0, 1)} | dict.fromkeys(
     ("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)
@@ -63,7 +64,6 @@ Keywords: TypeAlias = Annotated[dict[str, Any], BeforeValidator(lambda value, in
 Classes: TypeAlias = Annotated[
     list[tuple[str, dict[str, Any]]], BeforeValidator(lambda value, info: qualified_classes(value, info.field_name))
 ]
-VecEnvKind: TypeAlias = Annotated[str, BeforeValidator(lambda value, info: _one_of(VEC_ENVS, value, info))]
 Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
 
 
@@ -181,15 +181,11 @@ class TrainingConfig(Frozen):
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
         if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
-            raise ConfigError(
-                f"train_freq: {self.keyword('train_freq')} counts episodes, which only n_envs 1 can do; give steps"
-            )
+            raise ConfigError(f"train_freq {self.keyword('train_freq')}: episodes are counted with n_envs 1 only; give steps")
         if self.noise_type is not None and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
-        if not takes_expert(get_algorithm(self.algo)):
-            for key in ("expert", "eval_expert"):
-                if getattr(self, key):
-                    raise ConfigError(f"{key}: {self.algo} learns from no expert; leave it out")
+        if (self.expert or self.eval_expert) and not takes_expert(get_algorithm(self.algo)):
+            raise ConfigError(f"expert: {self.algo} learns from no expert; leave expert and eval_expert out")
         return self
 
 
@@ -247,17 +243,17 @@ def build_config(
     for key in settings:
         if key not in JOB_KEYS and key not in parameters:
             raise ConfigError(f"{source(key)}: {unknown(f'key of {algo}', key, [*JOB_KEYS, *parameters])}")
-    given = {key: value for key, value in settings.items() if key in JOB_KEYS and value is not None}
+    if settings.get("n_timesteps") is None:
+        raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
     hyperparams = {
         key: convert(value, parameters[key], f"{source(key)}: {key}", *LIMITS.get(key, ()))
         for key, value in settings.items()
         if key in parameters
     }
-    defaults: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
-    whole = {**defaults, **given, "algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": dict(settings)}
-    if "n_timesteps" not in whole:
-        raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
-    return validate(TrainingConfig, whole, source)
+    fields: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
+    fields |= {key: value for key, value in settings.items() if key in JOB_KEYS and value is not None}
+    fields |= {"algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": settings}
+    return validate(TrainingConfig, fields, source)
 
 
 def with_vehicle_path(value: Any) -> Any:
@@ -274,5 +270,5 @@ def check_environment(env_id: str) -> None:
     """:raises ConfigError: an environment that Gymnasium does not know; the message names the nearest."""
     if env_id in gymnasium.registry:
         return
-    nearest = unknown("environment", env_id, gymnasium.registry).split(" (valid:")[0]
+    nearest, _, _ = unknown("environment", env_id, gymnasium.registry).partition(" (valid:")
     raise ConfigError(f"{nearest} (of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)")

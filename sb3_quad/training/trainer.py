@@ -254,16 +254,10 @@ def _learn(
 
 
 def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None, model: BaseAlgorithm) -> None:
-    """Save the last good model; raise an error of this package's as it is with the place of the model, or from ``error``.
-
-    Returns where ``error`` is of another kind.
-    """
+    """Save the last good model; an error of this package's, or of one of its kinds, is raised anew and says where that is."""
     where = ""
     if snapshot is not None:
-        try:
-            write_bytes(run.model, snapshot.model)
-        except ConfigError as second:  # the disk is full for both; what failed first is what counts
-            raise type(error)(f"{error}; nor could the model be saved: {second}") from error
+        write_bytes(run.model, snapshot.model)
         where = f"; the model after {snapshot.timesteps:,} timesteps is in {run.model}"
     if isinstance(error, SB3QuadError):
         raise type(error)(f"{error}{where}") from error

@@ -51,24 +51,22 @@ def convert(value: Any, parameter: inspect.Parameter, where: str, least: float =
     :raises ConfigError: text where a number belongs, a fraction where a whole number does, another type; NaN or infinity; a
         number out of range.
     """
-    if not isinstance(value, str) or not value.startswith("lin_"):
+    falls = isinstance(value, str) and value.startswith("lin_")
+    if falls:
+        found = parse_number(value.removeprefix("lin_"))
+        if isinstance(found, str) or not math.isfinite(found):
+            raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
+    else:
         found = check(parameter.annotation, parse_value(value) if isinstance(value, str) else value, where)
-        return found if not isinstance(found, (int, float)) else within(found, value, where, least, most)
-    start = parse_number(value.removeprefix("lin_"))
-    if isinstance(start, str) or not math.isfinite(start):
-        raise ConfigError(f"{where} is {value!r}, must be lin_ and a number, such as lin_1e-3")
-    within(start, value, where, least, most)
-    schedule = LinearSchedule(float(start), 0.0, 1.0)
+    if isinstance(found, (int, float)) and not least <= found <= most:
+        limit = f"at least {least:g}" if found < least else f"at most {most:g}"
+        raise ConfigError(f"{where} is {value!r}, must be {limit}")
+    if not falls:
+        return found
+    schedule = LinearSchedule(float(found), 0.0, 1.0)
     if not _takes(parameter.annotation, schedule):
         raise ConfigError(f"{where} is {value!r}, but it takes no schedule")
     return schedule
-
-
-def within(number: float, given: Any, where: str, least: float, most: float) -> float:
-    """:raises ConfigError: the number is out of range; the message shows it as ``given``."""
-    if not least <= number <= most:
-        raise ConfigError(f"{where} is {given!r}, must be at {f'least {least:g}' if number < least else f'most {most:g}'}")
-    return number
 
 
 def takes_whole(parameter: inspect.Parameter) -> bool:

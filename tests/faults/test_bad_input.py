@@ -13,13 +13,9 @@ import pytest
 import yaml
 from stable_baselines3 import PPO
 
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.callbacks.interruption import Snapshot
 from sb3_quad.cli.app import main
 from sb3_quad.cli.commands import plot
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.training import trainer
-from sb3_quad.training.runs import RunFolder
 from sb3_quad.tuning.expert import ExpertSearch
 
 CORPUS = yaml.safe_load(Path(__file__).with_name("corpus.yaml").read_text(encoding="utf-8"))
@@ -112,17 +108,6 @@ def test_an_agent_whose_parameters_are_not_finite_is_refused(here, capsys):
     agent.save("agent.zip")
     assert main(["enjoy", "agent.zip", "--no-render"]) == 2
     assert "agent.zip: action_net.bias is not finite" in capsys.readouterr().err
-
-
-def test_a_full_disk_names_what_failed_first(here, monkeypatch):
-    def write_bytes(path, content):
-        raise ConfigError(f"{path}: cannot be written (No space left on device)")
-
-    monkeypatch.setattr(trainer, "write_bytes", write_bytes)
-    snapshot = Snapshot(5, b"")
-    first = ConfigError("evaluations.npz: cannot be written (No space left on device)")
-    with pytest.raises(ConfigError, match=r"^evaluations\.npz: .*; nor could the model be saved: .*Quad\.zip"):
-        trainer._save_after(first, RunFolder(here, "Quad"), snapshot, None)
 
 
 def test_a_full_disk_in_a_search_of_gains_names_the_journal(here, monkeypatch, capsys):
