@@ -84,7 +84,7 @@ class BestModel(EveryTimesteps):
         # By the group of the log: the environments, the file, its rows and the expert's mean reward; the first group decides.
         self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
         self._paths = {"eval": path} | {f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others}
-        self._rows: dict[str, dict[str, list[Any]]] = {group: {} for group in self._envs}
+        self._rows: dict[str, dict[str, Any]] = {group: {} for group in self._envs}
         self._expert_rewards: dict[str, float] = {}
         self._start = 0.0
         self.stopped = False  # by ``should_continue``
@@ -173,7 +173,7 @@ class BestModel(EveryTimesteps):
         return evaluate_policy(model, env, self._n_episodes, callback=callback, return_episode_rewards=True, warn=False)
 
 
-def _append(rows: dict[str, list[Any]], values: dict[str, Any]) -> None:
+def _append(rows: dict[str, Any], values: dict[str, Any]) -> None:
     """Add an evaluation to those before it; NaN stands for what one of them does not have, such as losses before the first."""
     before = len(rows.get("timesteps", []))
     for name in {**rows, **values}:
