@@ -1,6 +1,5 @@
 """Exported policies compute what the trained ones do, in physical units, and fly without this package."""
 
-import io
 import json
 import re
 import shutil
@@ -22,10 +21,11 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.export import c_header, policy
-from sb3_quad.export.check import FLAGS, Reference, load_header
-from sb3_quad.export.memory import RememberingNetwork
+from sb3_quad.export.check import Reference, physical_features
+from sb3_quad.export.load import FLAGS, load_header, load_onnx, load_torchscript
 from sb3_quad.export.network import build_network
 from sb3_quad.export.policy import FORMATS, export_policy
+from sb3_quad.export.stateful import StatefulNetwork
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -66,16 +66,7 @@ def zips(tmp_path_factory):
 def flight():
     """What an environment shows of random states, and the same in physical units, worked out from the true state."""
     env = QuadcopterVecEnv(300, "recovery_and_tracking", noise=0.0, seed=7)
-    return env.reset(), in_physical_units(env)
-
-
-def in_physical_units(env):
-    """The 18 features of the true state."""
-    state = env.true_state()
-    to_body = state.rotation.transpose(0, 2, 1)
-    velocity = np.einsum("nij,nj->ni", to_body, state.velocity)
-    parts = (state.position - env.target, to_body.reshape(-1, 9), velocity, state.body_rates)
-    return np.concatenate(parts, axis=1).astype(np.float32)
+    return env.reset(), physical_features(env.true_state())
 
 
 SEES = {
@@ -87,9 +78,9 @@ SEES = {
 
 
 @pytest.fixture(scope="module")
-def remembering(tmp_path_factory):
+def extended(tmp_path_factory):
     """Zips of policies that hover, by the weights of one that came with the package, and react to all that they remember."""
-    folder, old = tmp_path_factory.mktemp("remembering"), PPO.load(pretrained("itm-recovery"), device="cpu").policy
+    folder, old = tmp_path_factory.mktemp("extended"), PPO.load(pretrained("itm-recovery"), device="cpu").policy
     torch.manual_seed(0)
     for name, sees in SEES.items():
         model = PPO("MlpPolicy", QuadcopterVecEnv(1, seed=0, **sees), policy_kwargs={"net_arch": [64, 64]}, device="cpu")
@@ -104,56 +95,42 @@ def remembering(tmp_path_factory):
     return folder
 
 
-def held(file_format, content, name):
-    """The file as a function of observations and of which flights begin, by what its users run it with."""
-    if file_format == "c":
-        return load_header(content, name)[0]
-    states = []
-    if file_format == "torchscript":
-        extra = {"metadata.json": ""}
-        module = torch.jit.load(io.BytesIO(content), _extra_files=extra)
-        size = int(json.loads(extra["metadata.json"])["state_size"])
-    else:
-        session = pytest.importorskip("onnxruntime").InferenceSession(content, providers=["CPUExecutionProvider"])
-        size = session.get_inputs()[1].shape[1]
-
-    def call(observations, begins):
-        state = np.zeros((len(observations), size), np.float32) if begins.all() else states.pop()
-        state[begins] = 0.0
-        if file_format == "onnx":
-            result, following = session.run(None, {"observation": observations, "state": state})
-        else:
-            result, following = (each.numpy() for each in module(torch.from_numpy(observations), torch.from_numpy(state)))
-        states.append(following)
-        return result
-
-    return call
+def load(file_format, content, name):
+    """The file as a function of observations and states, by what its users run it with."""
+    if file_format == "onnx":
+        pytest.importorskip("onnxruntime")
+    return {"torchscript": load_torchscript, "onnx": load_onnx, "c": lambda it: load_header(it, name)}[file_format](content)[0]
 
 
-CASES = [(kind, "thrusts") for kind in SEES] + [("all", "speeds")]
+@pytest.fixture(autouse=True)
+def few_calls(monkeypatch):
+    monkeypatch.setattr("sb3_quad.export.load.CALLS", 20)
+
+
+compiled = [needs_compiler, pytest.mark.slow]
+CASES = [("torchscript", kind, "thrusts") for kind in SEES] + [("onnx", "all", "speeds")]
+CASES += [pytest.param("c", kind, "thrusts", marks=compiled) for kind in SEES] + [("onnx", "integral", "thrusts")]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize(("kind", "output"), CASES)
-@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
-def test_it_remembers_as_the_environment_does_in_whole_flights(remembering, file_format, kind, output):
-    path, sees = remembering / f"{kind}.zip", SEES[kind]
+@pytest.mark.parametrize(("file_format", "kind", "output"), CASES)
+def test_it_sees_the_frames_of_the_environment_in_whole_flights(extended, file_format, kind, output):
+    path, sees = extended / f"{kind}.zip", SEES[kind]
     exported = export_policy(path, file_format, output, n_observations=3000)
     assert 0 < exported.max_error < (1e-4 if output == "thrusts" else 1e-2)
-    assert "closed-loop flights of 1000 control steps, 3 side by side" in exported.metadata["check"]
-    file, policy = held(file_format, exported.content, kind), PPO.load(path, device="cpu")
+    assert "3000 observations of flights" in exported.metadata["check"]
+    file, policy = load(file_format, exported.content, kind), PPO.load(path, device="cpu")
     near = {"target_distance": 1.5, "nearest_target": 0.3}
     env = QuadcopterVecEnv(4, "target_tracking", near, noise=0.0, seed=5, max_episode_steps=1000, **sees)
-    seen, begins, flights, integrated = env.reset(), np.ones(4, bool), np.ones(4), 0
-    for step in range(1030):  # all fly 1,000 control steps, and begin anew
-        result, actions = file(in_physical_units(env), begins), policy.predict(seen, deterministic=True)[0]
+    seen, state, integrated = env.reset(), None, 0
+    for step in range(1000):  # the file flies
+        result, state = file(physical_features(env.true_state()), state)
+        actions = policy.predict(seen, deterministic=True)[0]
         thrusts = result if output == "thrusts" else ITM.thrust_coefficient * result**2
         np.testing.assert_allclose(thrusts, ITM.action_to_thrust(actions), atol=1e-4, err_msg=f"step {step}")
-        seen, _, begins, _ = env.step(ITM.thrust_to_action(thrusts.astype(float)))
-        flights += begins
+        seen, _, ends, _ = env.step(ITM.thrust_to_action(thrusts.astype(float)))
         integrated = max(integrated, np.abs(env.batch.integral).max(initial=0.0))
-        assert begins.all() == begins.any() == (step == 999)
-    assert (flights == 2).all()
+        assert not ends.any() or step == 999
     assert integrated > 0.05 if "position_integral" in sees else integrated == 0
 
 
@@ -171,37 +148,33 @@ def test_it_remembers_as_the_environment_does_in_whole_flights(remembering, file
     ],
     ids=["no action", "no integral", "begun at once", "another age", "gain", "distance", "speed"],
 )
-def test_a_file_that_remembers_something_else_is_refused(remembering, monkeypatch, wrong):
-    class Wrong(RememberingNetwork):
+def test_a_file_with_another_state_is_refused(extended, monkeypatch, wrong):
+    class Wrong(StatefulNetwork):
         def __init__(self, layers, reference):
             super().__init__(layers, wrong(reference, torch.zeros(1, 200))[0])
 
         def forward(self, observation, state):
             return super().forward(observation, wrong(Reference(None, ITM), state)[1])
 
-    monkeypatch.setattr(policy, "RememberingNetwork", Wrong)
+    monkeypatch.setattr(policy, "StatefulNetwork", Wrong)
     with pytest.raises(ExportError, match="differs from the trained one"):
-        export_policy(remembering / "all.zip", "torchscript")
+        export_policy(extended / "all.zip", "torchscript")
 
 
 def sees(reference, **changes):
-    return reference._replace(memory=type(reference.memory)(**{**dict(reference.memory), **changes}))
-
-
-def run(file_format, content, observations, name="tanh"):
-    """What a file gives, by what users run it with."""
-    if file_format == "onnx":
-        runtime = pytest.importorskip("onnxruntime")
-        session = runtime.InferenceSession(content, providers=["CPUExecutionProvider"])
-        return session.run(None, {"observation": observations})[0]
-    if file_format == "torchscript":
-        return torch.jit.load(io.BytesIO(content))(torch.from_numpy(observations)).numpy()
-    return load_header(content, name)[0](observations)
+    return reference._replace(observation=type(reference.observation)(**{**dict(reference.observation), **changes}))
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("kind", MODELS)
-@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
+@pytest.mark.parametrize(
+    ("file_format", "kind"),
+    [
+        *(("torchscript", kind) for kind in MODELS),
+        ("onnx", "squashed"),
+        pytest.param("c", "tanh", marks=needs_compiler),
+        *(pytest.param("c", kind, marks=compiled) for kind in MODELS if kind != "tanh"),
+    ],
+)
 def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
     path = zips / f"{kind}.zip"
     scaled, physical = flight
@@ -209,19 +182,19 @@ def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
     actions = MODELS[kind][0].load(path, device="cpu").predict(scaled, deterministic=True)[0]
     expected = ITM.hover_thrust * (1.0 + 0.5 * actions)  # Eq. 3.18
     assert expected.std(axis=0).min() > 0.3  # all rotors at work
-    np.testing.assert_allclose(run(file_format, exported.content, physical, kind), expected, atol=1e-4)
+    np.testing.assert_allclose(load(file_format, exported.content, kind)(physical, None)[0], expected, atol=1e-4)
     assert 0 <= exported.max_error < 1e-4 and exported.microseconds > 0
-    assert f"{exported.max_error:.2g} N in 200" in exported.metadata["check"]
+    assert f"{exported.max_error:.2g} N in " in exported.metadata["check"]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=needs_compiler)])
+@pytest.mark.parametrize("file_format", [*list(FORMATS)[:2], pytest.param("c", marks=compiled)])
 def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_format):
     vehicle = ITM.model_copy(update={"thrust_limits": (0.0, 1.9)})
     contents = [
         export_policy(zips / "tanh.zip", file_format, kind, vehicle, n_observations=200) for kind in ("thrusts", "speeds")
     ]
-    thrusts, speeds = (run(file_format, exported.content, flight[1]) for exported in contents)
+    thrusts, speeds = (load(file_format, exported.content, "tanh")(flight[1], None)[0] for exported in contents)
     assert contents[1].unit == "rad/s" and thrusts.min() == 0.0
     np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
 
@@ -252,6 +225,7 @@ def light():
     return {**kept, "name": "light", "mass": 1.0}
 
 
+@pytest.mark.slow
 def test_torchscript_loads_where_sb3_quad_cannot_be_imported(zips, tmp_path):
     assert main(["export", str(zips / "relu.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 0
     snippet = DOCS.split("## TorchScript")[1].split("```python")[1].split("```")[0]
@@ -301,9 +275,9 @@ def test_an_onnx_model_says_what_it_takes_and_gives(zips):
     assert {each.key: each.value for each in model.metadata_props} == exported.metadata
 
 
-def test_an_onnx_model_takes_a_state_and_gives_the_next(remembering):
+def test_an_onnx_model_takes_a_state_and_gives_the_next(extended):
     onnx = pytest.importorskip("onnx")
-    exported = export_policy(remembering / "all.zip", "onnx", n_observations=1000)
+    exported = export_policy(extended / "all.zip", "onnx", n_observations=1000)
     graph = onnx.load_from_string(exported.content).graph
     ports = [(each.name, *each.type.tensor_type.shape.dim) for each in (*graph.input, *graph.output)]
     size = 4 + 4 + 5 * 22  # the last action, the integral, five frames
@@ -387,20 +361,19 @@ def test_bad_input_is_one_line(zips, tmp_path, capsys, monkeypatch, arguments, m
 
 
 @needs_compiler
-@pytest.mark.parametrize("remembers", [False, True])
-def test_the_examples_of_the_docs_agree(zips, remembering, tmp_path, monkeypatch, capsys, remembers):
+@pytest.mark.slow
+@pytest.mark.parametrize("stateful", [False, True])
+def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, capsys, stateful):
     pytest.importorskip("onnxruntime")
     monkeypatch.chdir(tmp_path)
-    path = remembering / "all.zip" if remembers else zips / "tanh.zip"
+    path = extended / "all.zip" if stateful else zips / "tanh.zip"
     for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
         assert main(["export", str(path), "--format", file_format, "-o", file]) == 0
     printed = capsys.readouterr().out
-    assert "µs per call" in printed and ("state: zeros begin" in printed) == remembers
-    section, scope = DOCS.split("## A policy that remembers" if remembers else "## Python")[1], {}
+    assert "µs per call" in printed and ("state: zeros begin" in printed) == stateful
+    section, scope = DOCS.split("## A policy with a state" if stateful else "## Python")[1], {}
     exec(section.split("```python")[1].split("```")[0], scope)
     (tmp_path / "main.c").write_text(section.split("```c\n")[1].split("```")[0])
     subprocess.run([COMPILER, *FLAGS, "main.c", "-lm", "-o", "main"], check=True)
     done = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
     np.testing.assert_allclose([float(word) for word in done], np.ravel(scope["thrust"][:1]), atol=1e-5)
-    said = "closed-loop flights of 1000 control steps, 10" if remembers else "in 10000 observations"
-    assert said in printed + capsys.readouterr().out

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from sb3_quad.base.arrays import Float32Array
-from sb3_quad.export.memory import RememberingNetwork
 from sb3_quad.export.network import Network
+from sb3_quad.export.stateful import StatefulNetwork
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns
@@ -25,7 +25,7 @@ def c_name(text: str) -> str:
 def write_header(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
     """The header, with ``static inline void NAME_policy(const float observation[18], float thrust[4])``.
 
-    With a memory the function takes a ``NAME_state *`` before these, which ``NAME_reset`` lets begin a flight.
+    For a policy with a state the function takes a ``NAME_state *`` before these, which ``NAME_reset`` lets begin a flight.
 
     :param network: for speeds the second parameter is called ``rotor_speed``.
     :param metadata: becomes the comment at the top.
@@ -37,10 +37,10 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
         tables |= {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}
     arrays = [_table(f"{prefix}_{key}", value.numpy()) for key, value in tables.items()]
     parts = [_comment(metadata), f"#ifndef {guard}\n#define {guard}\n\n#include <math.h>\n", *arrays]
-    if isinstance(network, RememberingNetwork):
+    if isinstance(network, StatefulNetwork):
         parts.insert(2, _struct(network, name))
         keep = f"        state->frames[state->slot][{OBSERVATION_SIZE} + i] = a;\n" if network.actions else ""
-        parts.append(_function(network, prefix, f"{name}_state *state, ", _recall(network, prefix), keep))
+        parts.append(_function(network, prefix, f"{name}_state *state, ", _observe(network, prefix), keep))
     else:
         parts.append(_function(network, prefix))
     return "\n".join([*parts, f"#endif /* {guard} */\n"]).encode("ascii")
@@ -67,13 +67,14 @@ def _table(name: str, values: Float32Array) -> str:
     return f"static const float {name}{size} =\n{rows};\n"
 
 
-def _struct(network: RememberingNetwork, name: str) -> str:
+def _struct(network: StatefulNetwork, name: str) -> str:
+    seen = network.observation
     integral = "    float integral[3]; /* m */\n    int begun;\n" if network.integral else ""
     return f"""\
 #include <string.h>
 
 typedef struct {{
-    float frames[{network.memory.ages[-1] + 1}][{network.memory.frame_size}]; /* of the latest calls, round and round */
+    float frames[{seen.ages[-1] + 1}][{seen.frame_size}]; /* of the latest calls, round and round */
     int slot; /* of the present one */
 {integral}}} {name}_state;
 
@@ -84,9 +85,9 @@ static inline void {name}_reset({name}_state *state)
 """
 
 
-def _recall(network: RememberingNetwork, prefix: str) -> str:
+def _observe(network: StatefulNetwork, prefix: str) -> str:
     """What makes of the scaled features, the beginning of ``layer_0``, all that the policy sees."""
-    ages, depth, integral = network.memory.ages, network.memory.ages[-1] + 1, ""
+    ages, depth, integral = network.observation.ages, network.observation.ages[-1] + 1, ""
     if network.integral:
         gain, distance2, speed2, limit = map(_number, network.integral)
         integral = f"""\
@@ -112,13 +113,13 @@ def _recall(network: RememberingNetwork, prefix: str) -> str:
 {integral}    memcpy(state->frames[state->slot], layer_0, {OBSERVATION_SIZE} * sizeof(float));
     for (i = 0; i < {len(ages)}; ++i) {{
         j = (state->slot + {depth} - ages[i]) % {depth};
-        memcpy(layer_0 + {network.memory.frame_size} * i, state->frames[j], sizeof state->frames[j]);
+        memcpy(layer_0 + {network.observation.frame_size} * i, state->frames[j], sizeof state->frames[j]);
     }}
     state->slot = (state->slot + 1) % {depth};
 """
 
 
-def _function(network: Network, prefix: str, state: str = "", recall: str = "", keep: str = "") -> str:
+def _function(network: Network, prefix: str, state: str = "", frames: str = "", keep: str = "") -> str:
     layers = network.steps
     inputs, outputs = layers[0][0].in_features, layers[-1][0].out_features
     root = "a" if network.output == "thrusts" else "sqrtf(a < 0.0f ? 0.0f : a)"
@@ -145,7 +146,7 @@ static inline void {prefix}({state}const float observation[{OBSERVATION_SIZE}], 
     for (i = 0; i < {OBSERVATION_SIZE}; ++i) {{
         layer_0[i] = (observation[i] - {prefix}_mean[i]) * {prefix}_inverse_std[i];
     }}
-{recall}{"".join(loops)}    for (i = 0; i < {outputs}; ++i) {{
+{frames}{"".join(loops)}    for (i = 0; i < {outputs}; ++i) {{
         float a = layer_{len(layers)}[i];
 
         a = a < -1.0f ? -1.0f : (a > 1.0f ? 1.0f : a);

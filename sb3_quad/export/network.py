@@ -85,8 +85,8 @@ def build_network(reference: Reference, where: str = "model") -> Network:
     policy: Any = reference.model.policy
     layers = deterministic_layers(policy, where)
     seen, done = reference.model.observation_space, reference.model.action_space
-    if seen.shape != (reference.memory.size,):
-        raise ConfigError(f"{where}: its observations are {seen}, by its settings of shape ({reference.memory.size},)")
+    if seen.shape != (reference.observation.size,):
+        raise ConfigError(f"{where}: its observations are {seen}, by its settings of shape ({reference.observation.size},)")
     if done != ACTIONS:
         raise ConfigError(f"{where}: its actions are {done}, the quadcopter's are {ACTIONS}")
     for layer in layers:
@@ -135,7 +135,7 @@ def write_torchscript(network: Network, metadata: Mapping[str, str]) -> bytes:
 def write_onnx(network: Network, metadata: Mapping[str, str]) -> bytes:
     """The model: ``observation`` float32 (batch, 18) to ``thrust`` or ``rotor_speed``, float32 (batch, 4).
 
-    With a memory also ``state`` to ``next_state``, float32 (batch, state_size).
+    Of a policy with a state also ``state`` to ``next_state``, float32 (batch, state_size).
 
     :param metadata: stored as the model's ``metadata_props``.
     :raises ConfigError: onnx is not installed.

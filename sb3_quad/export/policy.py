@@ -17,10 +17,11 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.version import __version__
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
-from sb3_quad.export import check
+from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
-from sb3_quad.export.memory import RememberingNetwork
+from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, check_policy, write_onnx, write_torchscript
+from sb3_quad.export.stateful import StatefulNetwork
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -35,7 +36,7 @@ class Export(NamedTuple):
     metadata: dict[str, str]  # what it says about itself
     max_error: float  # the largest difference to the policy, in `unit`
     unit: str  # N or rad/s
-    microseconds: float | None  # per call with one observation, on one thread; None: it runs elsewhere
+    microseconds: float  # per call with one observation, on one thread
     settings: Path | None  # the file that vehicle and scaling came from, where they were not given
 
 
@@ -47,20 +48,20 @@ def export_policy(
     observation_mean: npt.ArrayLike | None = None,
     observation_std: npt.ArrayLike | None = None,
     name: str | None = None,
-    n_observations: int = check.N_OBSERVATIONS,
+    n_observations: int = N_OBSERVATIONS,
 ) -> Export:
     """The policy of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC; ``MlpPolicy``) as a file that flies by itself.
 
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
-    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. What else the policy sees, the file keeps in a state,
-    see ``metadata["state"]``. Vehicle and scaling that are not given are those
-    that :func:`agent_settings` finds in or beside the zip, or else ``itm`` and Table A.2.
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the policy sees are in a state, see
+    ``metadata["state"]``. Vehicle and scaling that are not given are those that :func:`agent_settings` finds in or beside
+    the zip, or else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
     :param observation_mean: μ of Eq. 3.16, (18,); ``observation_std`` σ, likewise.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
-    :param n_observations: of the check; even; of a policy with a memory, whole flights of ``check.FLIGHT_STEPS``.
+    :param n_observations: of the check, at most, see :func:`~sb3_quad.export.check.compare`.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are not the quadcopter's or
         whose policy is no ``MlpPolicy``; one that flies any vehicle, and none is given; a package or a C compiler that is
         not installed.
@@ -69,42 +70,38 @@ def export_policy(
     prefix = c_name(Path(path).stem) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", prefix):
         raise ConfigError(f"--name {name!r}: must be a C identifier: letters, digits and underscores, a letter first")
-    formats: dict[str, tuple[Callable[..., bytes], Callable[..., tuple[check.Call, str]]]] = {
-        "onnx": (write_onnx, check.load_onnx),
-        "torchscript": (write_torchscript, check.load_torchscript),
-        "c": (partial(write_header, name=prefix), partial(check.load_header, name=prefix)),
+    formats: dict[str, tuple[Callable[..., bytes], Callable[..., tuple[load.Call, str]]]] = {
+        "onnx": (write_onnx, load.load_onnx),
+        "torchscript": (write_torchscript, load.load_torchscript),
+        "c": (partial(write_header, name=prefix), partial(load.load_header, name=prefix)),
     }
     if file_format not in formats:
         raise ConfigError(unknown("format", file_format, formats))
-    write, load = formats[file_format]
+    write, read = formats[file_format]
     algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), agent_settings(path)
     changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
     settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
     if settings.vehicles is not None:
         raise ConfigError(f"model {path}: flies any vehicle; say with --vehicle which one's thrusts the file is to give")
     row = QuadcopterBatch(1, settings, n_threads=1)  # it checks them
-    reference = check.Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.observation)
+    reference = Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.observation)
     network = build_network(reference, f"model {path}")
-    if reference.memory.is_extended:
-        network = RememberingNetwork(network.layers, reference)
+    if reference.observation.is_extended:
+        network = StatefulNetwork(network.layers, reference)
     metadata = _describe(Path(path), algorithm, network, reference)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
-        call, by = load(write(network, metadata))
-        if reference.memory.is_extended:
-            observations, error, extent = reference.fly(call, n_observations, by)
-        else:
-            observations = reference.sample_observations(n_observations)
-            error = reference.largest_error(reference.actions(observations), call(observations), by)
-            extent = f"{len(observations)} observations"
-        metadata["check"] = f"largest error {error:.2g} {network.unit} in {extent} ({by})"
+        call, by = read(write(network, metadata))
+        checked = compare(reference, call, by, n_observations)
+        extent = f"{len(checked.observations)} observations of flights"
+        metadata["check"] = f"largest error {checked.error:.2g} {network.unit} in {extent} ({by})"
         content = write(network, metadata)
-    time = check.time_calls(call, observations, at_once=file_format == "c")
-    return Export(content, metadata, error, network.unit, time, source)
+    time = load.time_calls(call, checked.observations, at_once=file_format == "c")
+    return Export(content, metadata, checked.error, network.unit, time, source)
 
 
-def _describe(path: Path, algorithm: str, network: Network, reference: check.Reference) -> dict[str, str]:
+def _describe(path: Path, algorithm: str, network: Network, reference: Reference) -> dict[str, str]:
     """What users of the file must know; ASCII but for names."""
     vehicle = reference.vehicle
     low, high = reference.results([-1.0, 1.0])

@@ -61,7 +61,6 @@ def run(options: argparse.Namespace) -> int:
     for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check"):
         if key in exported.metadata:
             print(f"{key}: {exported.metadata[key]}")
-    if exported.microseconds is not None:
-        print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
+    print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
     print(f"saved {file} ({len(exported.content)} bytes)")
     return 0
