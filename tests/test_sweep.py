@@ -253,9 +253,7 @@ def start(folder, *arguments):
 @pytest.mark.timeout(900)
 def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(
-        "sb3_quad.executors.start_executor", Inline
-    )  # one thread, as workers have: equal bits
+    monkeypatch.setattr("sb3_quad.executors.start_executor", Inline)  # one thread, as workers have: equal bits
     keys = {"seed": [0, 1, 2], "n_timesteps": 400, "hyperparams": {**NET, "callback": "test_sweep.Slow"}}
     file = write(tmp_path / "s.yaml", **keys)
     tables = []

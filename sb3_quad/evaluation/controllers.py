@@ -4,10 +4,10 @@ import hashlib
 import importlib
 import typing
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.controllers.agent_settings import agent_settings
@@ -27,13 +27,11 @@ class ControllerSpec:
     :param label: heads its column.
     :param spec: ``pid``, ``geometric``, the path of an SB3 zip, or ``package.module:factory``.
     :param scaling: ``adaptive``: a policy sees its observation through the thesis's scaling (4.3.1); experts see none.
-    :param settings: :attr:`own`, where its file has been read elsewhere.
     """
 
     label: str
     spec: str
     scaling: Scaling = "none"
-    settings: FlightSettings | None = field(default=None, compare=False)
 
     @property
     def is_zip(self) -> bool:
@@ -46,9 +44,7 @@ class ControllerSpec:
 
         :raises ConfigError: see :func:`agent_settings`.
         """
-        if self.settings is not None or not self.is_zip:
-            return self.settings
-        settings, source = agent_settings(self.spec)
+        settings, source = agent_settings(self.spec) if self.is_zip else (None, None)
         return settings if source else None
 
     @property
@@ -98,15 +94,14 @@ def describe(spec: ControllerSpec, vehicle: str | Vehicle) -> ControllerRecord:
     :raises ConfigError: an unknown name, a missing file, a module that cannot be imported, a policy whose offset cannot be
         measured since it crashes on the way in more than half of the flights.
     """
-    path, is_expert = Path(spec.spec), spec.spec in EXPERTS
+    path = Path(spec.spec)
     if spec.is_zip:
         record = ControllerRecord(
             label=spec.label, spec=path.name, kind="model", algorithm=saved_algorithm(path), content=_digest(path.read_bytes())
         )
     else:
-        content = _digest(_source(EXPERTS.get(spec.spec, spec.spec)))
-        kind: Literal["expert", "factory"] = "expert" if is_expert else "factory"
-        record = ControllerRecord(label=spec.label, spec=spec.spec, kind=kind, content=content)
+        content, kind = _digest(_source(EXPERTS.get(spec.spec, spec.spec))), "expert" if spec.spec in EXPERTS else "factory"
+        record = ControllerRecord(label=spec.label, spec=spec.spec, kind=kind, content=content)  # type: ignore[arg-type]
     if spec.scaling == "adaptive":
         controller = build(spec, vehicle)
         if isinstance(controller, AdaptiveScaling):

@@ -53,7 +53,7 @@ def export_policy(
     """The policy of an SB3 zip (PPO, A2C, SAC, TD3, DAgger, PPOBC, SACBC; ``MlpPolicy``) as a file that flies by itself.
 
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
-    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the policy sees are in a state, see
+    thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the policy sees are in a state,
     ``metadata["state"]``. Vehicle and scaling that are not given are those that :func:`agent_settings` finds in or beside
     the zip, or else ``itm`` and Table A.2.
 
