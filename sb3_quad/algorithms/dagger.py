@@ -20,22 +20,28 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 from typing_extensions import Self
 
-from sb3_quad.algorithms import common
+from sb3_quad.algorithms.common import ExpertMixin, parameters_of_both
 from sb3_quad.algorithms.dataset import AggregatedDataset, sample_rows
-from sb3_quad.algorithms.networks import shared_out
-from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
+from sb3_quad.algorithms.networks import (
+    CLONING_LOSSES,
+    Batch,
+    CloningLoss,
+    Loss,
+    gradients,
+    mean_actions,
+    network_of,
+    one_torch_thread,
+    state_values,
+)
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
 _LEAST = {"n_steps": 1, "batch_size": 1, "n_epochs": 1, "gradient_steps": 1, "beta_decay": 0, "beta_final": 0}
-# Names of the critic's own parameters; the last two are those of recurrent policies.
-_CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.", "lstm_critic.", "critic.")
-Timeout = tuple[int, int, npt.NDArray[Any], Any]  # step, environment, last observation, what the critic remembered
 
 
-class DAgger(common.Taught, OnPolicyAlgorithm):
+class DAgger(ExpertMixin, OnPolicyAlgorithm):
     """Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
 
     In every control step and every environment, independently, the expert's action flies with probability β, else the agent's
@@ -109,7 +115,7 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
         beta: float = 0.5,
         beta_decay: float = 0.001,
         beta_final: float = 0.3,
-        bc_loss: common.CloningLoss = "mse",
+        bc_loss: CloningLoss = "mse",
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
         dataset_capacity: int = 1_500_000,
@@ -158,7 +164,7 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
         self.beta = beta
         self.beta_decay = beta_decay
         self.beta_final = beta_final
-        self.bc_loss: common.CloningLoss = bc_loss
+        self.bc_loss: CloningLoss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
         self.dataset_capacity = dataset_capacity
@@ -180,17 +186,12 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.rollout_buffer.observations.dtype
-        self.dataset = self._empty_dataset(
+        self.dataset = AggregatedDataset(
             self.dataset_capacity or self.n_steps * self.n_envs,
             self.rollout_buffer.obs_shape,
             self.rollout_buffer.action_dim,
             np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
-
-    def _empty_dataset(
-        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike
-    ) -> AggregatedDataset:
-        return AggregatedDataset(capacity, observation_shape, action_dim, dtype)
 
     def _check_arguments(self) -> None:
         """:raises ConfigError: an argument that does not fit; one line says which and what is allowed."""
@@ -204,8 +205,8 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
             raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
         if self.policy_kwargs.get("use_sde"):
             raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
-        if self.bc_loss not in common.CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, common.CLONING_LOSSES))
+        if self.bc_loss not in CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
@@ -246,15 +247,14 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
         whole rollout at the end, since it does not change before.
         """
         self.policy.set_training_mode(False)
-        self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)
-        rng, networks = self._generator(0), common.perceptrons(self.policy)
-        beta = self.current_beta
+        self._labeller = labeller = Controller.for_env(self.expert, env, self._labeller)  # +
+        network, rng, beta = network_of(self.policy), self._generator(0), self.current_beta  # +
         n_envs, action_dim = env.num_envs, rollout_buffer.action_dim
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
-        labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)
+        labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)  # +
         not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
-        timeouts: list[Timeout] = []
+        timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, last observation
         n_by_expert = 0
 
         rollout_buffer.reset()
@@ -262,10 +262,10 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
 
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
-            labels[step] = labeller.labels(observations, self._last_episode_starts)  # of the state before the step
-            means = self._means(networks, observations, step)
+            labels[step] = labeller.labels(observations, self._last_episode_starts)  # + of the state before the step
+            means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
-            by_expert = rng.random(n_envs) < beta
+            by_expert = rng.random(n_envs) < beta  # +
             actions = np.where(by_expert[:, None], labels[step], sampled)
             clipped_actions = np.clip(actions, low, high).reshape(n_envs, *self.action_space.shape)  # type: ignore[misc]
 
@@ -281,176 +281,97 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
             self._update_info_buffer([infos[row] for row in ended], dones[ended])
             for row in ended:
                 if infos[row].get("TimeLimit.truncated") and infos[row].get("terminal_observation") is not None:
-                    timeouts.append((step, int(row), infos[row]["terminal_observation"], self._critic_memory(int(row))))
+                    timeouts.append((step, int(row), infos[row]["terminal_observation"]))
 
             rollout_buffer.add(observations, actions, rewards, self._last_episode_starts, not_yet, not_yet)  # type: ignore[arg-type]
             self._last_obs = new_obs  # type: ignore[assignment]
             self._last_episode_starts = dones
 
-        values, last_values, terminal_values = self._rollout_values(timeouts)
-        rollout_buffer.values = values
+        flown = rollout_buffer.observations.reshape(-1, *rollout_buffer.obs_shape)
+        chunks = (flown[first : first + _VALUE_CHUNK] for first in range(0, len(flown), _VALUE_CHUNK))
+        values = np.concatenate([state_values(network, chunk) for chunk in chunks])
+        rollout_buffer.values = values.reshape(rollout_buffer.values.shape)
         if timeouts:  # a time limit is no failure: what would have followed is worth V of the last observation
-            steps, rows, *_ = zip(*timeouts, strict=True)
-            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * terminal_values
-        rollout_buffer.compute_returns_and_advantage(last_values=th.from_numpy(last_values), dones=dones)
+            steps, rows, last = zip(*timeouts, strict=True)
+            rollout_buffer.rewards[list(steps), list(rows)] += self.gamma * state_values(network, np.stack(last))
+        last_values = th.from_numpy(state_values(network, new_obs))  # type: ignore[arg-type]
+        rollout_buffer.compute_returns_and_advantage(last_values=last_values, dones=dones)
 
-        if self.dataset_capacity == 0:
+        if self.dataset_capacity == 0:  # +
             self.dataset.clear()
-        self._aggregate(labels)
+        self.dataset.add(flown, labels.reshape(len(flown), -1))  # +
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
-        self.logger.record("dagger/dataset_size", self.dataset.n_pairs)
+        self.logger.record("dagger/dataset_size", len(self.dataset))
         self.logger.record("rollout/expert_fraction", n_by_expert / (n_rollout_steps * n_envs))
         callback.update_locals(locals())
         callback.on_rollout_end()
         return True
 
-    def _means(self, networks: common.Perceptrons | None, observations: npt.NDArray[Any], step: int) -> Float32Array:
-        """The policy's mean actions (n_envs, action_dim) for the observations of a step of the rollout."""
-        return common.outputs(networks, self.policy, "actor", observations)
-
-    def _critic_memory(self, row: int) -> Any:
-        """What the critic remembers of environment ``row`` after the step."""
-        return None
-
-    def _rollout_values(self, timeouts: list[Timeout]) -> tuple[Float32Array, Float32Array, Float32Array]:
-        """V of the rollout's observations (n_steps, n_envs), of those after it (n_envs,), and where time limits struck."""
-        buffer = self.rollout_buffer
-        values = self._values(buffer.observations.reshape(-1, *buffer.obs_shape)).reshape(buffer.values.shape)
-        terminal = self._values(np.stack([last for _, _, last, _ in timeouts])) if timeouts else np.empty(0, np.float32)
-        return values, self._values(self._last_obs), terminal
-
-    def _aggregate(self, labels: Float32Array) -> None:
-        """Add the rollout to the dataset, with its labels (n_steps, n_envs, action_dim)."""
-        flown = self.rollout_buffer.observations.reshape(-1, *self.rollout_buffer.obs_shape)
-        self.dataset.add(flown, labels.reshape(len(flown), -1))
-
-    def _values(self, observations: Any) -> Float32Array:
-        """V of observations (n, ...), float32 (n,), in chunks that bound the memory."""
-        networks, chunks = common.perceptrons(self.policy), range(0, len(observations), _VALUE_CHUNK)
-        parts = (observations[first : first + _VALUE_CHUNK] for first in chunks)
-        return np.concatenate([common.outputs(networks, self.policy, "critic", part) for part in parts])
-
     def train(self) -> None:
         """Update the actor on the dataset and the critic on the rollout just flown.
+
+        It is PPO's loop over mini-batches, with two of them in a step, and what differs marked by ``+``.
 
         :raises TrainingError: a loss or gradient that is not finite; the parameters stay those of the last good step
         """
         self.policy.set_training_mode(True)
         self._update_learning_rate(self.policy.optimizer)
         clip_range_vf = self.clip_range_vf(self._current_progress_remaining) if callable(self.clip_range_vf) else None
-        # The actor, with whatever both share, and the critic.
-        groups: dict[bool, list[th.nn.Parameter]] = {False: [], True: []}
-        for name, parameter in self.policy.named_parameters():
-            groups[name.startswith(_CRITIC)].append(parameter)
-        rng = self._generator(1)
-        buffer = self.rollout_buffer
-        n_rows, batch_size = self._batch_rows()
-        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // batch_size)
-        n_batches = min(n_batches, self.n_epochs * n_rows)
-        actor_batches = sample_rows(len(self.dataset), n_batches * batch_size, rng, self.shuffle).reshape(n_batches, -1)
-        n_critic = min(self.n_epochs * -(-n_rows // batch_size), n_batches)  # steps in which the critic takes part
-        critic_batches = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle), n_critic))
-        flown, values = self._critic_data()
-        networks = common.perceptrons(self.policy)
-        terms = np.empty((n_batches, 4))  # of the loss; where the critic takes no part, its one is 0
-        limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+        # + The loss of Eq. 4.3.
+        loss = Loss(
+            bc_coef=1.0,
+            bc_loss=CLONING_LOSSES.index(self.bc_loss),
+            vf_coef=self.vf_coef,
+            clip_range_vf=np.inf if clip_range_vf is None else clip_range_vf,
+            ent_coef=self.ent_coef,
+            l2_coef=self.l2_coef,
+        )
+        network, (actor, critic) = network_of(self.policy), parameters_of_both(self.policy)
 
-        for i, for_actor in enumerate(actor_batches):
+        # + Rows of the dataset for the actor, and of the rollout for the critic, which takes part in every so many steps.
+        buffer, rng = self.rollout_buffer, self._generator(1)
+        n_rows = buffer.buffer_size * buffer.n_envs
+        n_batches = self.gradient_steps or self.n_epochs * -(-n_rows // self.batch_size)
+        n_batches = min(n_batches, self.n_epochs * n_rows)
+        n_critic = min(self.n_epochs * -(-n_rows // self.batch_size), n_batches)
+        actor_rows = sample_rows(len(self.dataset), n_batches * self.batch_size, rng, self.shuffle).reshape(n_batches, -1)
+        critic_rows = iter(np.array_split(sample_rows(n_rows, self.n_epochs * n_rows, rng, self.shuffle), n_critic))
+        flown = buffer.observations.reshape(n_rows, *buffer.obs_shape)
+        targets = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
+        limit = float("inf") if self.max_grad_norm is None else self.max_grad_norm
+        monitored: dict[str, list[float]] = {}  # by name: the term of each step
+
+        for i, rows in enumerate(actor_rows):
             due = (i + 1) * n_critic // n_batches > i * n_critic // n_batches
-            step = (for_actor, flown, values, next(critic_batches) if due else None, clip_range_vf)
-            terms[i] = self._gradients(*step) if networks is None else self._compiled_gradients(networks, *step)
-            for parameter in groups[True] if not due else ():
-                parameter.grad = None
-            norms = [th.nn.utils.clip_grad_norm_(groups[part], limit) for part in (False, True)[: 1 + due]]
-            if not np.isfinite(terms[i]).all() or not all(th.isfinite(norm) for norm in norms):
+            for_critic = Batch(next(critic_rows), flown, targets) if due else None
+            terms = gradients(network, loss, self.dataset.batch(rows), for_critic)
+            if not due:
+                for parameter in critic:
+                    parameter.grad = None
+            # Clip grad norm, + of actor and critic each by itself
+            norms = [th.nn.utils.clip_grad_norm_(group, limit) for group in ((actor, critic) if due else (actor,))]
+            if not np.isfinite([*terms.values(), *map(float, norms)]).all():  # +
                 self.policy.optimizer.zero_grad()
                 raise TrainingError(
-                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms[i, 0]:.3g}, value loss "
-                    f"{terms[i, 1]:.3g}); lower learning_rate, or look for rewards and observations that are not finite"
+                    f"training diverged at {self.num_timesteps} timesteps (cloning loss {terms['bc_loss']:.3g}, value loss "
+                    f"{terms.get('value_loss', 0.0):.3g}); lower learning_rate, or look for rewards and observations that are "
+                    "not finite"
                 )
             self.policy.optimizer.step()
-            self.policy.log_std.data.clamp_(min=self.log_std_min)
+            self.policy.log_std.data.clamp_(min=self.log_std_min)  # +
             self._n_updates += 1
+            for name, term in terms.items():
+                monitored.setdefault(name, []).append(term)
 
-        bc, v_loss, entropy_loss, l2 = terms.sum(axis=0) / (n_batches, n_critic, n_batches, n_batches)
-        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
-        averages = {"loss": loss, "bc_loss": bc, "value_loss": v_loss, "entropy_loss": entropy_loss, "l2_loss": l2}
-        for name, average in averages.items():
-            self.logger.record(f"train/{name}", float(average))
+        for name, values in monitored.items():
+            self.logger.record(f"train/{name}", float(np.mean(values)))
         self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         self.logger.record("train/explained_variance", explained_variance(buffer.values.flatten(), buffer.returns.flatten()))
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
-
-    def _batch_rows(self) -> tuple[int, int]:
-        """Rows of the rollout, and of a mini-batch; the dataset counts in the same rows."""
-        return self.rollout_buffer.buffer_size * self.rollout_buffer.n_envs, self.batch_size
-
-    def _critic_data(self) -> tuple[npt.NDArray[Any], Float32Array]:
-        """Observations (n, ...) of the rollout; V when it was flown, and the returns, (n, 2)."""
-        buffer = self.rollout_buffer
-        values = np.stack([buffer.values.reshape(-1), buffer.returns.reshape(-1)], axis=1)
-        return buffer.observations.reshape(len(values), *buffer.obs_shape), values
-
-    def _gradients(
-        self,
-        for_actor: IntArray,
-        flown: npt.NDArray[Any],
-        values: Float32Array,
-        for_critic: IntArray | None,
-        clip_range_vf: float | None,
-    ) -> FloatArray:
-        """Set the gradient of Eq. 4.3 for rows of the dataset, and of the rollout just flown.
-
-        :param flown: see :meth:`_critic_data`; :param values: likewise.
-        :param for_critic: None: the critic takes no part.
-        :return: the terms of cloning, value, entropy and weights.
-        """
-        policy, log_std = self.policy, self.policy.log_std
-        bc = common.cloning_errors(self.bc_loss, *self._actor_batch(for_actor)).mean()
-        entropy_loss, l2 = -common.gaussian_entropy(log_std), common.l2_loss(policy)
-        v_loss = th.zeros((), device=self.device)
-        if for_critic is not None:
-            now, bounds = self._critic_batch(flown, values, for_critic)
-            v_loss = common.value_loss(now, bounds[:, 0], bounds[:, 1], clip_range_vf)
-        loss = bc + self.l2_coef * l2 + self.ent_coef * entropy_loss + self.vf_coef * v_loss
-        policy.optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        terms: FloatArray = th.stack([bc, v_loss, entropy_loss, l2]).detach().double().cpu().numpy()
-        return terms
-
-    def _actor_batch(self, rows: IntArray) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        """Means (b, action_dim), log_std and labels (b, action_dim) for rows of the dataset."""
-        observations, labels = (part.to(self.device) for part in self.dataset.pairs(th.from_numpy(rows)))
-        return common.actor_mean(self.policy, observations), self.policy.log_std, labels
-
-    def _critic_batch(self, flown: npt.NDArray[Any], values: Float32Array, rows: IntArray) -> tuple[th.Tensor, th.Tensor]:
-        """V now (b,), and V when it was flown with the returns (b, 2), for rows of the rollout."""
-        states, bounds = (th.as_tensor(part[rows], device=self.device) for part in (flown, values))
-        return common.critic_values(self.policy, states), bounds
-
-    def _compiled_gradients(
-        self,
-        networks: common.Perceptrons,
-        for_actor: IntArray,
-        flown: npt.NDArray[Any],
-        values: Float32Array,
-        for_critic: IntArray | None,
-        clip_range_vf: float | None,
-    ) -> FloatArray:
-        """The same by compiled code."""
-        observations, expert_actions, rows = self.dataset.arrays(for_actor)
-        loss = common.actor_terms(self.bc_loss, 1.0)
-        (bc, *_) = networks.actor.gradient(observations, rows, expert_actions, loss, networks.log_std) / len(rows)
-        v_loss = 0.0
-        if for_critic is not None:
-            loss = common.critic_terms(self.vf_coef, clip_range_vf)
-            sums = networks.critic.gradient(flown.reshape(len(flown), -1), for_critic, values, loss)
-            v_loss = sums[0] / len(for_critic)
-        return np.array([bc, v_loss, *common.add_penalties(self.policy, self.ent_coef, self.l2_coef)])
 
     def learn(
         self,
@@ -468,7 +389,7 @@ class DAgger(common.Taught, OnPolicyAlgorithm):
         self.set_expert(self.expert)
         if reset_num_timesteps:
             self._n_rollouts = 0
-        with shared_out(common.perceptrons(self.policy) is not None):
+        with one_torch_thread(network_of(self.policy) is not self.policy):
             return super().learn(
                 total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
             )

@@ -10,23 +10,26 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.type_aliases import MaybeCallback, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
+from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms import common
+from sb3_quad.algorithms.buffers import ExpertReplayBuffer, ExpertReplaySamples
+from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero
+from sb3_quad.algorithms.networks.losses import CloningLoss, agree, cloning_errors
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 
-BC_LOSSES: tuple[common.CloningLoss, ...] = ("mse", "huber", "huber_mse")
+BC_LOSSES: tuple[CloningLoss, ...] = ("mse", "huber", "huber_mse")
 BC_FILTERS = ("none", "q", "agreement")
-LABELS = "labels"  # among what is remembered: the expert's actions for the present states
+LABELS = "labels"  # in the state of the expert: its actions for the present states
 
 
-class SACBC(common.Taught, SAC):
+class SACBC(ExpertMixin, SAC):
     """Soft Actor-Critic with an expert (SAC+BC): its transitions, its actions and its proposals, each a switch of its own.
 
     All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the additions at their defaults it is
@@ -71,20 +74,74 @@ class SACBC(common.Taught, SAC):
 
     def __init__(
         self,
-        *args: Any,
+        policy: str | type[SACPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
         expert: Any = None,
         expert_timesteps: int = 0,
         expert_fraction: float = 0.0,
         bc_coef: float | Schedule = 0.0,
-        bc_loss: common.CloningLoss = "mse",
+        bc_loss: CloningLoss = "mse",
         bc_filter: str = "none",
         expert_proposal: bool = False,
         critic_warmup: int = 0,
         critic_layer_norm: bool = False,
         _init_setup_model: bool = True,
-        **kwargs: Any,
     ):
-        super().__init__(*args, _init_setup_model=False, **kwargs)  # type: ignore[misc]
+        super().__init__(
+            policy,
+            env,
+            learning_rate=learning_rate,
+            buffer_size=buffer_size,
+            learning_starts=learning_starts,
+            batch_size=batch_size,
+            tau=tau,
+            gamma=gamma,
+            train_freq=train_freq,
+            gradient_steps=gradient_steps,
+            action_noise=action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
         for name, value, valid in (("bc_loss", bc_loss, BC_LOSSES), ("bc_filter", bc_filter, BC_FILTERS)):
             if value not in valid:
                 raise ConfigError(unknown(name, value, valid))
@@ -97,13 +154,11 @@ class SACBC(common.Taught, SAC):
             raise ConfigError(f"bc_coef is {bc_coef}, must be finite and at least 0")
         if expert_fraction > 0.0 and expert_timesteps == 0:
             raise ConfigError(f"expert_fraction is {expert_fraction}, but expert_timesteps is 0: the expert has flown nothing")
-        if expert_proposal and self.n_steps != 1:
-            raise ConfigError(f"expert_proposal needs n_steps 1, not {self.n_steps}: it proposes for the next state")
         self.expert = expert
         self.expert_timesteps = expert_timesteps
         self.expert_fraction = expert_fraction
         self.bc_coef = bc_coef
-        self.bc_loss: common.CloningLoss = bc_loss
+        self.bc_loss: CloningLoss = bc_loss
         self.bc_filter = bc_filter
         self.expert_proposal = expert_proposal
         self.critic_warmup = critic_warmup
@@ -117,27 +172,29 @@ class SACBC(common.Taught, SAC):
 
     def _setup_model(self) -> None:
         self.bc_coef = FloatSchedule(self.bc_coef)
-        self._clones = common.is_ever_nonzero(self.bc_coef)
+        self._clones = is_ever_nonzero(self.bc_coef)
         if self.will_clone() and isinstance(self.observation_space, spaces.Dict):
             raise ConfigError(
                 f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the "
                 "environment in gymnasium.wrappers.FlattenObservation"
             )
+        labels = self._clones or self.expert_proposal
+        if labels and (self.n_steps != 1 or self.replay_buffer_class not in (None, ExpertReplayBuffer)):
+            raise ConfigError(
+                f"n_steps is {self.n_steps}, replay_buffer_class {self.replay_buffer_class}: bc_coef and expert_proposal need "
+                "n_steps 1 and no replay_buffer_class, since their buffer holds the expert's actions"
+            )
+        if labels:
+            self.replay_buffer_class = ExpertReplayBuffer
         super()._setup_model()
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
             _normalise_layers(self.critic_target)
-        # A row of actions holds the one flown; the expert's, if it is cloned; the expert's for the next state, if it proposes.
-        width = 1 + self._clones + self.expert_proposal
         assert self.replay_buffer is not None and self.replay_buffer_class is not None
-        if width > 1:
-            _widen(self.replay_buffer, width)
         if self.expert_timesteps > 0:
             size = -(-self.expert_timesteps // self.n_envs) * self.n_envs
             arguments = size, self.observation_space, self.action_space, self.device, self.n_envs, self.optimize_memory_usage
             self.expert_buffer = self.replay_buffer_class(*arguments, **self.replay_buffer_kwargs)
-            if width > 1:
-                _widen(self.expert_buffer, width)
 
     @property
     def expert_flies(self) -> bool:
@@ -201,25 +258,23 @@ class SACBC(common.Taught, SAC):
     ) -> None:
         buffer = self.expert_buffer if self.expert_flies and self.expert_buffer is not None else replay_buffer
         if self._labels is not None:
-            now, following = self._labels, self._ask(new_obs, dones)
-            parts = [buffer_action.reshape(len(now), -1), *([now] if self._clones else [])]
-            if self.expert_proposal:  # of an episode that has ended, the state that the expert would have to see is gone
-                parts.append(np.where(dones[:, None], np.float32(np.nan), following))
-            buffer_action, self._labels = np.hstack(parts), following
+            following = self._ask(new_obs, dones)
+            if isinstance(
+                buffer, ExpertReplayBuffer
+            ):  # of an episode that has ended, the next state is not there to be asked about
+                buffer.label(self._labels, following, ~dones)
+            self._labels = following
         super()._store_transition(buffer, buffer_action, new_obs, reward, dones, infos)
         if not self._needs_labels:
             self._labels = None
 
-    def _sample(self, batch_size: int) -> tuple[ReplayBufferSamples, th.Tensor | None, th.Tensor | None]:
-        """A mini-batch; the expert's actions for its states and for the next ones, (b, dim), None where there are none."""
+    def _sample(self, batch_size: int) -> ReplayBufferSamples | ExpertReplaySamples:
+        """A mini-batch, of which ``expert_fraction`` comes from the expert's own flights."""
         n_expert = round(batch_size * self.expert_fraction)
-        parts = [(self.replay_buffer, batch_size - n_expert), (self.expert_buffer, n_expert)]
-        drawn = [buffer.sample(n, env=self._vec_normalize_env) for buffer, n in parts if buffer is not None and n > 0]
-        joined: list[Any] = [None if column[0] is None else th.cat(column) for column in zip(*drawn, strict=True)]
-        data = drawn[0] if len(drawn) == 1 else ReplayBufferSamples(*joined)
-        actions, *labels = data.actions.chunk(1 + self._clones + self.expert_proposal, dim=1)
-        following = labels.pop() if self.expert_proposal else None
-        return data._replace(actions=actions), labels.pop() if labels else None, following
+        buffers = [(self.replay_buffer, batch_size - n_expert), (self.expert_buffer, n_expert)]
+        parts = [buffer.sample(n, env=self._vec_normalize_env) for buffer, n in buffers if buffer is not None and n > 0]
+        joined = [None if column[0] is None else th.cat(column) for column in zip(*parts, strict=True)]
+        return parts[0] if len(parts) == 1 else type(parts[0])(*joined)
 
     @staticmethod
     def _least_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
@@ -243,14 +298,14 @@ class SACBC(common.Taught, SAC):
                 monitored.setdefault(name, []).append(value.item())
 
         for gradient_step in range(gradient_steps):
-            data, labels, following = self._sample(batch_size)  # + from both buffers, with the expert's actions
+            data = self._sample(batch_size)  # + from both buffers, with the expert's actions
             discounts = data.discounts if data.discounts is not None else self.gamma
             if self.use_sde:
                 self.actor.reset_noise()
 
             actions_pi, log_prob = self.actor.action_log_prob(data.observations)
             log_prob = log_prob.reshape(-1, 1)
-            mean = self.actor.action_dist.mode() if labels is not None and bc_coef > 0.0 else None  # +
+            mean = self.actor.action_dist.mode() if bc_coef > 0.0 else None  # +
             warming_up = self._n_updates + gradient_step < self.critic_warmup  # +
 
             if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
@@ -271,10 +326,9 @@ class SACBC(common.Taught, SAC):
                 next_actions, next_log_prob = self.actor.action_log_prob(data.next_observations)
                 next_q = self._least_q(self.critic_target, data.next_observations, next_actions)
                 next_values = next_q - ent_coef * next_log_prob.reshape(-1, 1)
-                if following is not None:  # + the expert's proposal, where there is one and it is better
-                    known = following.isfinite().all(dim=1, keepdim=True)
-                    proposed = self._least_q(self.critic_target, data.next_observations, following.nan_to_num())
-                    next_values = th.where(known & (proposed > next_q), proposed, next_values)
+                if self.expert_proposal and isinstance(data, ExpertReplaySamples):  # + where there is one and it is better
+                    proposed = self._least_q(self.critic_target, data.next_observations, data.next_expert_actions)
+                    next_values = th.where(data.next_is_labelled & (proposed > next_q), proposed, next_values)
                 targets = data.rewards + (1 - data.dones) * discounts * next_values
 
             current = self.critic(data.observations, data.actions)
@@ -291,8 +345,8 @@ class SACBC(common.Taught, SAC):
                 q_pi = self._least_q(self.critic, data.observations, actions_pi)
                 actor_loss = (ent_coef * log_prob - q_pi).mean()
                 monitor(actor_loss=actor_loss)
-                if mean is not None and labels is not None:  # +
-                    bc_loss, cloned = self._bc_loss(data.observations, mean, labels)
+                if mean is not None and isinstance(data, ExpertReplaySamples):  # +
+                    bc_loss, cloned = self._bc_loss(data.observations, mean, data.expert_actions)
                     actor_loss = actor_loss + bc_coef * q_pi.detach().abs().mean() * bc_loss
                     monitor(bc_loss=bc_loss, bc_share=cloned)
                 self.actor.optimizer.zero_grad()
@@ -316,14 +370,14 @@ class SACBC(common.Taught, SAC):
 
         :param mean: the policy's mean actions, (b, dim), as ``labels`` the expert's.
         """
-        errors = common.cloning_errors(self.bc_loss, mean, mean, labels)  # no kind of error here needs log_std
+        errors = cloning_errors(self.bc_loss, mean, mean, labels)  # no kind of error here needs log_std
         kept = th.ones_like(errors, dtype=th.bool)
         with th.no_grad():
             if self.bc_filter == "q":
                 theirs, own = (self._least_q(self.critic, observations, each) for each in (labels, mean))
                 kept = (theirs > own).flatten()
             elif self.bc_filter == "agreement":
-                kept = common.agree(mean, labels)
+                kept = agree(mean, labels)
         return (errors * kept).mean(), kept.float().mean()
 
     def learn(
@@ -343,15 +397,16 @@ class SACBC(common.Taught, SAC):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "expert_buffer", "_labels"]
+        own = ["replay_buffer_class"] if self.replay_buffer_class is ExpertReplayBuffer else []
+        return [*super()._excluded_save_params(), "expert_buffer", "_labels", *own]
 
-    def memory(self) -> Arrays:
-        """As of any algorithm that an expert teaches, and what the expert has said."""
-        return super().memory() | ({} if self._labels is None else {LABELS: self._labels})
+    def expert_state(self) -> Arrays:
+        """As of any algorithm with an expert, and its actions for the present states."""
+        return super().expert_state() | ({} if self._labels is None else {LABELS: self._labels})
 
-    def restore_memory(self, memory: Arrays) -> None:
-        self._labels = memory.get(LABELS)
-        super().restore_memory({name: array for name, array in memory.items() if name != LABELS})
+    def restore_expert_state(self, state: Arrays) -> None:
+        self._labels = state.get(LABELS)
+        super().restore_expert_state({name: array for name, array in state.items() if name != LABELS})
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:
@@ -362,12 +417,3 @@ def _normalise_layers(critic: ContinuousCritic) -> None:
             if isinstance(layer, nn.Linear):
                 normal = nn.LayerNorm(layer.out_features, elementwise_affine=False)
                 network[i + 1] = nn.Sequential(normal, network[i + 1])
-
-
-def _widen(buffer: ReplayBuffer, width: int) -> None:
-    """Give each row of a new buffer room for ``width`` actions side by side, which SB3's own sampling then gives back."""
-    buffer.action_dim *= width
-    buffer.actions = np.zeros((*buffer.actions.shape[:2], buffer.action_dim), dtype=np.float32)
-
-
-SACBC.__init__.__signature__ = common.full_signature(SAC, SACBC)  # type: ignore[attr-defined]

@@ -77,7 +77,7 @@ class SnapshotFile(LastGoodModel):
         batch: Any = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
         state = random_state()
         state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
-        state |= _with_prefix(EXPERT_STATE, model.memory() if hasattr(model, "memory") else {})
+        state |= _with_prefix(EXPERT_STATE, model.expert_state() if hasattr(model, "expert_state") else {})
         if self._run.episodes.is_file():
             state["episodes"] = np.array(self._run.episodes.stat().st_size)
         if self._run.best_model.is_file():
@@ -135,8 +135,8 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         _fill(buffer, _part(state, f"{name}."), path)
     if environment:
         batch.restore(environment)
-        if hasattr(model, "restore_memory"):
-            model.restore_memory(_part(state, EXPERT_STATE))
+        if hasattr(model, "restore_expert_state"):
+            model.restore_expert_state(_part(state, EXPERT_STATE))
     _take_back(run, state, model.num_timesteps)
     set_random_state(state)
     return cast(BaseAlgorithm, model)

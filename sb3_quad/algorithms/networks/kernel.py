@@ -2,20 +2,17 @@
 
 A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop.
 Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a row: weights (outputs, inputs), then biases.
+A chunk is a number of blocks; whichever thread computes it, its sums are the same.
 """
 
 import numpy as np
-from numba import carray, float32, uint64
+from numba import float32, uint64
 
 from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
-from sb3_quad.simulation.compiled import atomic_add, atomic_get, compiled, give_way, pointer
+from sb3_quad.simulation.compiled import compiled
 
 ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
 LINEAR, TANH, RELU = range(3)
-LEFT, DONE, CONTROL = 0, 16, 32  # places, each on a cache line of its own, and size of the control array
-ALIGNED = 16  # float32 numbers in a cache line: vectors that straddle two take a third longer
-SPIN = 20_000  # looks at a chunk that another thread still has, before that is let have the core: some 30 microseconds
-LATE = SPIN + 5_000  # looks, with that: longer than a chunk takes
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
 _TILE = np.uint64(16)  # inputs at once: their rows stay in the first cache
 _FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
@@ -113,14 +110,8 @@ def _undo_activation(g, h, kind, db):
 
 
 @compiled
-def _aligned(address):
-    """The first place from ``address`` on where a cache line begins."""
-    return (address + 63) // 64 * 64
-
-
-@compiled
 def _touch(rows, index, first, count):
-    """Have rows brought into the cache, many at a time; where they lie far apart, each would else be waited for."""
+    """Prefetch rows, many at a time: otherwise each gather stalls where they lie far apart."""
     total = float32(0.0)
     for i in range(first, first + count):
         total += rows[index[i], 0] + rows[index[i], rows.shape[1] - 1]
@@ -129,7 +120,7 @@ def _touch(rows, index, first, count):
 
 @compiled
 def _load(rows, index, first, count, h):
-    """Rows of (m, size) into a block, (width, ROWS), zeros around them: the ``count`` from ``first`` on in ``index``."""
+    """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block (width, ROWS), zeros around them."""
     h[0, 0] = _touch(rows, index, first, count)
     for k in range(h.shape[0]):
         for i in range(count if k < rows.shape[1] else 0, ROWS):
@@ -141,117 +132,115 @@ def _load(rows, index, first, count, h):
 
 
 @compiled
-def _through(at, widths, kinds, parameters):
-    """All layers of a block, which lie behind one another from ``at`` on, the inputs first; where the outputs begin."""
-    place = parameters.ctypes.data
+def _layer(scratch, at, width):
+    """The ``width`` units of a layer that begin at a place in the scratch memory: (width, ROWS)."""
+    return scratch[at : at + width * ROWS].reshape(width, ROWS)
+
+
+@compiled
+def _forward(scratch, x, index, first, count, widths, kinds, parameters):
+    """Compute all layers of a block, which lie behind one another, the inputs first; returns where the outputs begin."""
+    _load(x, index, first, count, _layer(scratch, 0, widths[0]))
+    at = place = 0
     for layer in range(1, len(widths)):
         rows, columns = widths[layer], widths[layer - 1]
-        x = carray(pointer(at), (columns, ROWS), np.float32)
-        at += 4 * columns * ROWS
-        h = carray(pointer(at), (rows, ROWS), np.float32)
-        _multiply(carray(pointer(place), (rows, columns), np.float32), x, h)
-        _activate(h, carray(pointer(place + 4 * rows * columns), (rows,), np.float32), kinds[layer - 1])
-        place += 4 * rows * (columns + 1)
+        before, at, middle = _layer(scratch, at, columns), at + columns * ROWS, place + rows * columns
+        h = _layer(scratch, at, rows)
+        _multiply(parameters[place:middle].reshape(rows, columns), before, h)
+        _activate(h, parameters[middle : middle + rows], kinds[layer - 1])
+        place = middle + rows
     return at
 
 
 @compiled
-def _back(at, widths, kinds, transposed, sums, sides):
-    """The gradient by the parameters, added to ``sums``, of a block whose outputs' gradient lies in the first of ``sides``.
+def _backward(scratch, at, widths, kinds, transposed, sums):
+    """Add to ``sums`` the gradient by the parameters of a block whose outputs begin at ``at``.
 
-    :param at: where the block's outputs begin; :param transposed: weights as (inputs, outputs).
+    The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns.
+
+    :param transposed: the parameters with each layer's weights as (inputs, outputs).
     """
-    last, place = len(widths) - 1, 4 * len(sums)
-    g = carray(pointer(sides[0]), (widths[last], ROWS), np.float32)
-    for layer in range(last, 0, -1):
+    here, there, place = widths.sum() * ROWS, (widths.sum() + widths.max()) * ROWS, len(sums)
+    for layer in range(len(widths) - 1, 0, -1):
         rows, columns = widths[layer], widths[layer - 1]
-        h = carray(pointer(at), (rows, ROWS), np.float32)
-        at -= 4 * columns * ROWS
-        x = carray(pointer(at), (columns, ROWS), np.float32)
-        place -= 4 * rows * (columns + 1)
-        here = sums.ctypes.data + place
-        _undo_activation(g, h, kinds[layer - 1], carray(pointer(here + 4 * rows * columns), (rows,), np.float32))
-        _add_products(g, x, carray(pointer(here), (rows, columns), np.float32))
+        g, h = _layer(scratch, here, rows), _layer(scratch, at, rows)
+        at -= columns * ROWS
+        place -= rows * (columns + 1)
+        middle = place + rows * columns
+        _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows])
+        _add_products(g, _layer(scratch, at, columns), sums[place:middle].reshape(rows, columns))
         if layer > 1:
-            y = carray(pointer(sides[(last - layer + 1) % 2]), (columns, ROWS), np.float32)
-            _multiply(carray(pointer(transposed.ctypes.data + place), (columns, rows), np.float32), g, y)
-            g = y
+            _multiply(transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns))
+            here, there = there, here
 
 
 @compiled
-def _finish(control, chunks):
-    """Wait for the chunks that other threads still have; whether one of them has lost its core meanwhile."""
-    looks = 0
-    while atomic_get(control, DONE) < chunks:
-        looks += 1
-        if looks > SPIN:
-            give_way()
-    return looks > LATE
+def forward(first_chunk, last_chunk, chunks, scratch, x, index, widths, kinds, parameters, out):
+    """The outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs), into ``out``, for some of all ``chunks``.
 
-
-@compiled
-def forward(control, main, chunks, x, widths, kinds, parameters, out):
-    """The outputs of all rows of x (n, inputs), into ``out`` (n, outputs).
-
-    Takes chunks of blocks as long as there are any; ``main`` then waits until all are done.
-
-    :param control: int64 (CONTROL,): chunks left and done, shared by all threads.
+    :param scratch: of the size of :func:`scratch_size`, aligned to cache lines.
     :param widths: of all layers, the inputs first, padded; :param kinds: the activation of each but the first.
-    :return: whether ``main`` had to wait.
     """
-    n = len(x)
-    blocks, index = (n + ROWS - 1) // ROWS, np.arange(n)
-    scratch = np.empty(widths.sum() * ROWS + ALIGNED, np.float32)
-    while True:
-        number = chunks - atomic_add(control, LEFT, -1)
-        if number >= chunks:
-            return main and _finish(control, chunks)
-        for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
-            first, begin = block * ROWS, _aligned(scratch.ctypes.data)
-            count = min(ROWS, n - first)
-            _load(x, index, first, count, carray(pointer(begin), (widths[0], ROWS), np.float32))
-            at = _through(begin, widths, kinds, parameters)
-            h = carray(pointer(at), (out.shape[1], ROWS), np.float32)
-            for i in range(count):
-                for j in range(out.shape[1]):
-                    out[first + i, j] = h[j, i]
-        atomic_add(control, DONE, 1)
+    n = len(index)
+    blocks = (n + ROWS - 1) // ROWS
+    for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
+        first = block * ROWS
+        count = min(ROWS, n - first)
+        at = _forward(scratch, x, index, first, count, widths, kinds, parameters)
+        h = _layer(scratch, at, widths[-1])
+        for i in range(count):
+            for j in range(out.shape[1]):
+                out[first + i, j] = h[j, i]
 
 
 @compiled
-def gradient(control, main, chunks, x, index, widths, kinds, parameters, transposed, targets, loss, log_std, sums, terms):
+def gradient(
+    first_chunk,
+    last_chunk,
+    chunks,
+    scratch,
+    x,
+    index,
+    widths,
+    kinds,
+    parameters,
+    transposed,
+    targets,
+    loss,
+    log_std,
+    sums,
+    terms,
+):
     """The gradient of a loss (:mod:`.losses`) by all parameters; a block stays in the cache for its way forth and back.
 
-    :param x: (m, inputs), and :param targets: (m, columns) of the loss, of which the rows ``index`` (n,) are meant.
-    :param transposed: the parameters with each layer's weights as (inputs, outputs).
+    As :func:`forward`, and:
+
+    :param targets: (m, columns) of the loss, of the same rows.
+    :param transposed: see :func:`_backward`.
+    :param loss: :class:`~sb3_quad.algorithms.networks.losses.Loss`.
     :param log_std: of the actions, (a,); of size 0 for a critic.
-    :param sums: (chunks, parameters + a): the part of each chunk, so that threads do not change what their sum is.
-    :param terms: float64 (chunks, TERMS), likewise, what the loss adds up for the log.
+    :param sums: float32 (chunks, parameters + a), the gradient of each chunk.
+    :param terms: float64 (chunks, TERMS), likewise, the loss's terms.
     """
     n, size = len(index), len(transposed)
-    blocks, widest = (n + ROWS - 1) // ROWS, widths.max() * ROWS
-    scratch = np.empty((widths.sum() * ROWS) + 2 * widest + ALIGNED, np.float32)
-    begin = _aligned(scratch.ctypes.data)
-    first_side = begin + 4 * widths.sum() * ROWS
-    sides = first_side, first_side + 4 * widest
-    while True:
-        number = chunks - atomic_add(control, LEFT, -1)
-        if number >= chunks:
-            return main and _finish(control, chunks)
-        sums[number, :] = 0.0
-        terms[number, :] = 0.0
-        for block in range(number * blocks // chunks, (number + 1) * blocks // chunks):
+    blocks, outputs = (n + ROWS - 1) // ROWS, widths[-1]
+    for chunk in range(first_chunk, last_chunk):
+        sums[chunk, :] = 0.0
+        terms[chunk, :] = 0.0
+        for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
             first = block * ROWS
             count = min(ROWS, n - first)
-            _load(x, index, first, count, carray(pointer(begin), (widths[0], ROWS), np.float32))
-            at = _through(begin, widths, kinds, parameters)
-            y = carray(pointer(at), (widths[-1], ROWS), np.float32)
-            g = carray(pointer(sides[0]), (widths[-1], ROWS), np.float32)
+            at = _forward(scratch, x, index, first, count, widths, kinds, parameters)
+            y, g = _layer(scratch, at, outputs), _layer(scratch, widths.sum() * ROWS, outputs)
             g[:, :] = 0.0
             g[0, 0] = 0.0 * _touch(targets, index, first, count)
             if len(log_std) > 0:
-                actor_loss(y, index, first, count, targets, loss, log_std, g, sums[number, size:], terms[number])
+                actor_loss(y, index, first, count, targets, loss, log_std, g, sums[chunk, size:], terms[chunk])
             else:
-                critic_loss(y, index, first, count, targets, loss, g, terms[number])
-            _back(at, widths, kinds, transposed, sums[number, :size], sides)
-        atomic_add(control, DONE, 1)
+                critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
+            _backward(scratch, at, widths, kinds, transposed, sums[chunk, :size])
+
+
+def scratch_size(widths):
+    """Numbers of a thread's scratch memory: all layers of a block, and the gradients of two."""
+    return int(widths.sum() + 2 * widths.max()) * ROWS

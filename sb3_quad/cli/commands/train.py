@@ -133,12 +133,12 @@ def prepare(options: argparse.Namespace) -> None:
     """
     import torch
 
-    from sb3_quad.algorithms.networks import share_out
+    from sb3_quad.algorithms.networks import use_one_torch_thread
     from sb3_quad.base.imports import import_packages
 
     import_packages(options.gym_packages, "--gym-packages")
     if options.num_threads is None:
-        share_out()
+        use_one_torch_thread()
     else:
         torch.set_num_threads(options.num_threads)
 

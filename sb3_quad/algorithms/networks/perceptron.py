@@ -1,26 +1,25 @@
-"""A multilayer perceptron and its gradients, computed by :mod:`.kernel` on as many cores as are free."""
+"""A multilayer perceptron and its gradients, computed by :mod:`.kernel` on as many threads as PyTorch had."""
 
-import os
-import queue
-import threading
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import torch as th
 from torch import nn
 
-from sb3_quad.algorithms.networks.kernel import CONTROL, LINEAR, RELU, ROWS, TANH, forward, gradient
-from sb3_quad.algorithms.networks.losses import TERMS
+from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, forward, gradient, scratch_size
+from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 
-CHUNKS = 16  # at most, of a mini-batch: what a thread takes at once
+CHUNKS = 16  # at most, of a mini-batch: their sums are added up, so the number of threads changes no bit
 WORTHWHILE = 4  # blocks; fewer are done before another thread has woken
-REST = 100  # calls without helpers after one kept a call waiting: its core is busy with something else
+PARTS = 4  # of a mini-batch for each thread: one that is held up does fewer of them
+CACHE_LINE = 64  # bytes; vectors that straddle two take a third longer
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
-_NO_ONE = np.empty(0)
+_TYPES = tuple(Loss.__annotations__.values())  # of its fields: an int where a float is meant would be compiled anew
+_NONE = np.empty(0)
 
 
 class Perceptron:
@@ -46,7 +45,7 @@ class Perceptron:
 
     @staticmethod
     def fits(modules: Sequence[nn.Module]) -> bool:
-        """Whether these are linear layers and activations in turn, in float32 on the CPU, and nobody listens to them."""
+        """Whether these are linear layers and activations in turn, in float32 on the CPU, without hooks."""
         linear = modules[::2]
         return (
             len(modules) % 2 == 1
@@ -59,26 +58,23 @@ class Perceptron:
     def __call__(self, x: Float32Array) -> Float32Array:
         """The outputs (n, outputs) for x (n, inputs)."""
         out = np.empty((len(x), self._layers[-1].out_features), np.float32)
-        _helpers.run(forward, len(x), x, self._widths, self._kinds, self._pack()[0], out)
+        self._compute(forward, len(x), x, np.arange(len(x)), self._widths, self._kinds, self._pack()[0], out)
         return out
 
     def gradient(
-        self, x: Float32Array, index: IntArray, targets: Float32Array, loss: Any, log_std: th.Tensor | None = None
+        self, x: Float32Array, index: IntArray, targets: Float32Array, loss: Loss, log_std: th.Tensor | None = None
     ) -> FloatArray:
         """Set the gradient of a loss over the rows ``index`` of x and ``targets`` as ``.grad`` of all parameters.
 
-        The number of threads changes no bit of it.
-
-        :param loss: of dtype ``LOSS``, (1,).
         :param log_std: of an actor, (a,); its gradient is set, too.
         :return: the terms of the loss, sums over the rows.
         """
-        stds = _NO_ONE if log_std is None else log_std.detach().double().numpy()
+        stds = _NONE if log_std is None else log_std.detach().double().numpy()
         chunks = _chunks(len(index))
         sums, terms = np.empty((chunks, self._size + len(stds)), np.float32), np.empty((chunks, TERMS))
-        _helpers.run(
-            gradient, len(index), x, index, self._widths, self._kinds, *self._pack(), targets, loss, stds, sums, terms
-        )
+        typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
+        network = self._widths, self._kinds, *self._pack()
+        self._compute(gradient, len(index), x, index, *network, targets, typed, stds, sums, terms)
         total = th.from_numpy(sums.sum(axis=0))
         for layer, at, rows, columns in self._places():
             middle = at + rows * columns
@@ -90,9 +86,9 @@ class Perceptron:
         result: FloatArray = terms.sum(axis=0)
         return result
 
-    def parameters(self) -> Iterator[nn.Parameter]:
+    def parameters(self) -> list[nn.Parameter]:
         """PyTorch's, by layers."""
-        return (parameter for layer in self._layers for parameter in (layer.weight, layer.bias))
+        return [parameter for layer in self._layers for parameter in (layer.weight, layer.bias)]
 
     def _places(self) -> Iterator[tuple[Any, int, int, int]]:
         """Of each layer where its parameters begin, and its padded outputs and inputs."""
@@ -106,78 +102,65 @@ class Perceptron:
             there[...] = here
         return self._packed
 
+    def _compute(self, function: Callable[..., None], n: int, *arguments: Any) -> None:
+        """Call a function of :mod:`.kernel` for all chunks of n rows, on several threads where that is worthwhile."""
+        chunks, threads = _chunks(n), _threads if n > (WORTHWHILE - 1) * ROWS else 1
+        size = -(-chunks // (PARTS * threads)) if threads > 1 else chunks
+        firsts = iter(range(0, chunks, size))  # each part is taken by one thread: `next` holds Python's lock
+
+        def work() -> None:
+            scratch = _aligned(scratch_size(self._widths))
+            for first in firsts:
+                function(first, min(first + size, chunks), chunks, scratch, *arguments)
+
+        helpers = [_pool.submit(work) for _ in range(threads - 1)] if _pool is not None else []
+        work()
+        for helper in helpers:
+            if not helper.cancel():  # one that has not begun is not waited for: its core is busy with something else
+                helper.result()
+
 
 def _chunks(n: int) -> int:
     return min(CHUNKS, -(-n // ROWS))
 
 
-class _Helpers:
-    """Threads that take chunks of a call, too. A call returns when all chunks are done, and waits for nobody without one."""
-
-    def __init__(self) -> None:
-        self.threads = 1
-        self._begun = 0
-        self._resting = 0
-        self._calls: queue.SimpleQueue[tuple[Callable[..., bool], Any]] = queue.SimpleQueue()
-
-    def run(self, function: Callable[..., bool], n: int, *arguments: npt.NDArray[Any]) -> None:
-        """Call a function of :mod:`.kernel` for n rows."""
-        chunks = _chunks(n)
-        control = np.zeros(CONTROL, dtype=np.int64)
-        control[0] = chunks
-        count = min(self.threads, chunks) - 1 if n > (WORTHWHILE - 1) * ROWS else 0
-        if self._resting > 0:
-            self._resting -= 1
-            count = 0
-        while self._begun < count:
-            threading.Thread(target=self._help, daemon=True, name="sb3_quad networks").start()
-            self._begun += 1
-        for _ in range(count):
-            self._calls.put((function, (control, False, chunks, *arguments)))
-        if function(control, True, chunks, *arguments):
-            self._resting = REST
-
-    def _help(self) -> None:
-        while True:
-            function, arguments = self._calls.get()
-            function(*arguments)
-            del arguments
+def _aligned(size: int) -> Float32Array:
+    """Room for ``size`` numbers that begins with a cache line."""
+    room = np.empty(size + CACHE_LINE // 4, np.float32)
+    return room[-room.ctypes.data % CACHE_LINE // 4 :][:size]
 
 
-_helpers = _Helpers()
+_threads = 1  # that share the work of every perceptron
+_pool: ThreadPoolExecutor | None = None  # of the others
 
 
-def _renew() -> None:
-    global _helpers
-    _helpers = _Helpers()  # a forked child has no threads but the one that forked
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_renew)
-
-
-def share_out() -> None:
+def use_one_torch_thread() -> None:
     """From now on PyTorch has one thread, and as many as it had share the work of every :class:`Perceptron`.
 
     PyTorch's own threads wait for one another at every operation: on a machine that does something else beside they are up to
     ten times slower than one.
     """
-    if _helpers.threads == 1:
-        _helpers.threads = th.get_num_threads()
+    global _threads, _pool
+    if _threads == 1 and th.get_num_threads() > 1:
+        _threads = th.get_num_threads()
+        _pool = ThreadPoolExecutor(_threads - 1, "sb3_quad networks")
         th.set_num_threads(1)
 
 
 @contextmanager
-def shared_out(compiled: bool) -> Iterator[None]:
-    """:func:`share_out` within the block.
+def one_torch_thread(compiled: bool) -> Iterator[None]:
+    """:func:`use_one_torch_thread` within the block.
 
     :param compiled: whether there is work for perceptrons; else nothing is changed.
     """
-    before = th.get_num_threads(), _helpers.threads
+    global _threads, _pool
+    before = th.get_num_threads(), _threads, _pool
     if compiled:
-        share_out()
+        use_one_torch_thread()
     try:
         yield
     finally:
         th.set_num_threads(before[0])
-        _helpers.threads = before[1]
+        if _pool is not before[2] and _pool is not None:
+            _pool.shutdown()
+        _threads, _pool = before[1:]
