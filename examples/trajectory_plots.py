@@ -1,18 +1,28 @@
-"""Flights of the policy as it is, as plots in TensorBoard."""
+"""A callback of one's own: flights of the policy as it is, as plots in TensorBoard.
 
+    python examples/trajectory_plots.py
+    tensorboard --logdir tb
+
+In a settings file, with ``-tb FOLDER`` and ``PYTHONPATH=examples`` on the command line::
+
+    callback:
+      - trajectory_plots.TrajectoryPlots: {every: 1000000, task: state_recovery}
+"""
+
+import argparse
 from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure as Picture
+from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Figure
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.callbacks.every import EveryTimesteps
-from sb3_quad.controllers.controller import Controller
-from sb3_quad.envs.batch_env import quadcopter_spaces
+from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import ACTIONS, fly_settings
+from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings
 
@@ -23,21 +33,12 @@ class TrajectoryPlots(EveryTimesteps):
     It works with any algorithm whose policy flies on the quadcopter's own observation. The flights are deterministic, the
     same each time, and separate from the training: neither its environments nor its random numbers are touched.
 
-    >>> from stable_baselines3 import PPO
-    >>> from sb3_quad.envs import QuadcopterVecEnv
-    >>> env = QuadcopterVecEnv(8, "state_recovery", seed=0)
-    >>> model = PPO("MlpPolicy", env, n_steps=100, batch_size=400, tensorboard_log="tb", device="cpu")
-    >>> plots = TrajectoryPlots(every=800, n_flights=2, max_steps=50, task="state_recovery")
-    >>> _ = model.learn(800, callback=plots)
-
-    In a configuration file, with ``-tb`` on the command line: ``TrajectoryPlots: {every: 1000000, task: state_recovery}``.
-
     :param every: timesteps between plots.
     :param n_flights: episodes in a plot.
     :param seed: of the flights.
     :param max_steps: control steps after which an episode ends at the latest.
     :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as ``task`` and ``vehicle``.
-    :raises ConfigError: ``every`` or ``n_flights`` below 1, an unknown keyword; a policy of other spaces.
+    :raises ConfigError: ``every`` or ``n_flights`` below 1, or an unknown keyword.
     """
 
     def __init__(
@@ -52,10 +53,6 @@ class TrajectoryPlots(EveryTimesteps):
         super().__init__(every, verbose, n_flights=n_flights, max_steps=max_steps)
         self._seeds = row_seeds(seed, n_flights)
         self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_steps)
-
-    def _on_training_start(self) -> None:
-        super()._on_training_start()
-        Controller(self.model, ACTIONS, quadcopter_spaces(self._settings.size)[0], kind="TrajectoryPlots: policy")
 
     def _on_event(self) -> bool:
         recorder = Recorder(len(self._seeds))
@@ -85,4 +82,13 @@ def _plot(flights: Arrays) -> Picture:
     return picture
 
 
-TrajectoryFigures = TrajectoryPlots  # its former name
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+    arguments = parser.parse_args()
+
+    env = QuadcopterVecEnv(240, task="state_recovery", seed=0)
+    model = PPO("MlpPolicy", env, n_steps=50, batch_size=4000, tensorboard_log="tb", seed=0, device="cpu")
+    plots = TrajectoryPlots(every=12_000, n_flights=2, max_steps=200, task="state_recovery")
+    model.learn(arguments.timesteps, callback=plots)
+    print("plots are in tb/")

@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
 
@@ -147,3 +148,32 @@ def test_unfit_experts_are_refused_at_once(expert, message):
 def test_a_model_of_another_environment_is_refused():
     with pytest.raises(ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"):
         Controller.for_env(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), QuadcopterVecEnv(2))
+
+
+class Counter:
+    """Its state is how often it was asked; it notes what it was given, as SB3's recurrent policies are."""
+
+    def __init__(self):
+        self.given, self.starts = [], []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        self.given.append(state)
+        self.starts.append(episode_start)
+        return np.zeros((len(observation), 4)), (1 if state is None else state + 1)
+
+
+def test_the_state_of_a_controller_is_of_one_flight():
+    counter = Counter()
+    for n in (3, 2):
+        fly(counter, "target_tracking", n, max_steps=4)
+    assert counter.given == [None, 1, 2, 3] * 2
+
+
+def test_the_state_of_an_expert_goes_on_in_its_environment():
+    counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
+    labeller, observation, starts = Controller.for_env(counter, env), env.reset(), np.array([True, False])
+    labeller.labels(observation, np.ones(2, dtype=bool))
+    Controller.for_env(counter, env, labeller).labels(observation, starts)
+    Controller.for_env(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)
+    assert counter.given == [None, 1, None]
+    np.testing.assert_array_equal(counter.starts[1], starts)

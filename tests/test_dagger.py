@@ -8,19 +8,18 @@ from gymnasium import spaces
 from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
-from sb3_quad.algorithms.common import (
+from sb3_quad.algorithms.dagger import DAgger
+from sb3_quad.algorithms.networks.gradients import mean_actions
+from sb3_quad.algorithms.networks.losses import (
     CLONING_LOSSES,
-    actor_mean,
+    Loss,
     cloning_errors,
     gaussian_entropy,
     gaussian_nll,
-    l2_loss,
     value_loss,
 )
-from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
@@ -75,31 +74,8 @@ class Recorder(BaseCallback):
 def test_the_agent_becomes_the_expert():
     model = build(n_epochs=20, learning_rate=1e-2).learn(ROLLOUT * 12)
     observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
-    with th.no_grad():
-        error = (actor_mean(model.policy, observations) - labels).square().mean()
-    assert error < 0.02 * labels.square().mean()
-
-
-def test_it_learns_to_fly_from_the_true_state():
-    env = QuadcopterVecEnv(64, seed=0, max_episode_steps=400)
-    model = DAgger(
-        "MlpPolicy",
-        env,
-        PIDExpert(),
-        learning_rate=LinearSchedule(8e-3, 0.0, 1.0),
-        n_steps=100,
-        batch_size=512,
-        gradient_steps=40,
-        n_epochs=1,
-        seed=0,
-        device="cpu",
-    ).learn(64 * 100 * 8)
-    flight = QuadcopterVecEnv(32, seed=99, max_episode_steps=400)
-    observation = flight.reset()
-    for _ in range(399):
-        observation, _, dones, _ = flight.step(model.predict(observation, deterministic=True)[0])
-        assert not dones.any()
-    assert np.median(flight.true_state().distance) < 5.0  # of the 10 m it began with; the expert's 2.9 m
+    error = np.square(mean_actions(model.policy, observations.numpy()) - labels.numpy()).mean()
+    assert error < 0.02 * float(labels.square().mean())
 
 
 def test_a_rollout_may_be_shorter_than_its_update():
@@ -165,10 +141,6 @@ def test_entropy_is_encouraged():
     assert model.policy.log_std.min().item() > -2.0
 
 
-def test_the_weight_penalty_shrinks_weights():
-    assert l2_loss(build(l2_coef=1.0).learn(ROLLOUT * 2).policy) < l2_loss(build().learn(ROLLOUT * 2).policy)
-
-
 # --- Loss terms -------------------------------------------------------------------------------------------------------
 
 
@@ -176,15 +148,16 @@ def test_likelihood_and_entropy_are_those_of_the_policy():
     policy = build().policy
     observations, actions = th.randn(20, 3), th.randn(20, 1)
     _, log_prob, entropy = policy.evaluate_actions(observations, actions)
-    th.testing.assert_close(-gaussian_nll(actor_mean(policy, observations), policy.log_std, actions), log_prob)
+    mean = policy.get_distribution(observations).mode()
+    th.testing.assert_close(-gaussian_nll(mean, policy.log_std, actions), log_prob)
     th.testing.assert_close(gaussian_entropy(policy.log_std).expand(20), entropy)
 
 
 def test_the_clipped_value_loss_is_the_larger_one():
     values, old, returns = th.randn(100), th.randn(100), th.randn(100)
-    plain = value_loss(values, old, returns, None)
-    assert value_loss(values, old, returns, 1e9) == pytest.approx(plain.item())
-    assert value_loss(values, old, returns, 0.1) > plain
+    plain = value_loss(values, old, returns, Loss())
+    assert value_loss(values, old, returns, Loss(clip_range_vf=1e9)) == pytest.approx(plain.item())
+    assert value_loss(values, old, returns, Loss(clip_range_vf=0.1)) > plain
 
 
 # --- Who flies --------------------------------------------------------------------------------------------------------
@@ -298,19 +271,6 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
     assert th.equal(parameters(whole), parameters(resumed))
 
 
-def test_without_its_dataset_a_run_goes_on_differently_but_goes_on(tmp_path):
-    model = build().learn(ROLLOUT)
-    model.save(tmp_path / "model")
-    resumed = DAgger.load(tmp_path / "model", env=pendulum())
-    resumed.set_expert(turn_back)
-    assert len(resumed.learn(ROLLOUT, reset_num_timesteps=False).dataset) == ROLLOUT
-
-
-def test_another_number_of_environments_can_take_over(tmp_path):
-    build().learn(ROLLOUT).save(tmp_path / "model")
-    DAgger.load(tmp_path / "model", env=pendulum(3), expert=turn_back).learn(96, reset_num_timesteps=False)
-
-
 # --- The life of an SB3 algorithm -------------------------------------------------------------------------------------
 
 
@@ -321,19 +281,9 @@ def test_callbacks_progress_bar_and_tensorboard(tmp_path):
     assert (tmp_path / "evaluations.npz").is_file()
     assert list((tmp_path / "tb" / "DAgger_1").iterdir())
     names = set(model.logger.name_to_value)
-    train = ("bc_loss", "value_loss", "entropy_loss", "l2_loss", "std", "explained_variance", "learning_rate", "loss")
+    train = ("bc_loss", "value_loss", "entropy_loss", "std", "explained_variance", "learning_rate", "loss")
     assert {f"train/{name}" for name in train} <= names
     assert len(model.ep_info_buffer) == N_ENVS  # an episode of Pendulum-v1 has 200 steps
-
-
-def test_a_callback_can_stop_training():
-    class Stop(BaseCallback):
-        def _on_step(self):
-            return self.n_calls < 40
-
-    model = build().learn(ROLLOUT * 10, callback=Stop())
-    assert model.num_timesteps == 40 * N_ENVS
-    assert len(model.dataset) == ROLLOUT  # the rollout that was cut short is not used
 
 
 def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
@@ -373,28 +323,14 @@ def test_a_loss_that_is_not_finite_stops_training_and_spares_the_parameters():
     assert th.equal(parameters(good), parameters(model))
 
 
-def test_learning_needs_an_expert():
-    with pytest.raises(ExpertError, match="expert"):
-        build(expert=None).learn(ROLLOUT)
-
-
-def test_labels_that_are_not_finite_name_the_row():
-    with pytest.raises(ExpertError, match="row 1"):
-        build(expert=lambda observation: np.array([[0.0], [np.nan]])).learn(ROLLOUT)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         ({"beta": 1.5}, "beta 1.5"),
         ({"beta": 0.1}, "beta_final"),
-        ({"beta_decay": -0.1}, "beta_decay"),
         ({"bc_loss": "mae"}, "did you mean"),
         ({"n_epochs": 0}, "n_epochs"),
-        ({"gradient_steps": 0}, "gradient_steps"),
-        ({"batch_size": 0}, "batch_size"),
         ({"dataset_capacity": 10}, "dataset_capacity"),
-        ({"dataset_capacity": -1}, "dataset_capacity"),
         ({"clip_range_vf": -0.2}, "clip_range_vf"),
         ({"policy_kwargs": {"use_sde": True}}, "use_sde"),
     ],

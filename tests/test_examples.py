@@ -1,5 +1,6 @@
 """The scripts in examples/, run as a newcomer would run them, but for a short while."""
 
+import importlib.util
 import runpy
 import sys
 from pathlib import Path
@@ -64,3 +65,14 @@ def test_own_reward(run):
 def test_own_callback(run):
     output = run("own_callback.py", "--timesteps", "100000")  # the first episodes end in the third rollout
     assert "episodes crashed, beta 0.80" in output and "Table A.2" in output
+
+
+def test_trajectory_plots(run, tmp_path):
+    assert "tb/" in run("trajectory_plots.py", *SHORT)
+    assert list(tmp_path.glob("tb/*/events*"))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("foundation_policy") is None, reason="needs foundation-policy")
+def test_raptor(run):
+    output = run("raptor.py")
+    assert output.count("survival") == 2

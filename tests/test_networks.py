@@ -2,19 +2,22 @@
 
 import itertools
 import os
-from unittest.mock import patch
 
 import numpy as np
 import pytest
 import torch as th
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 from torch import nn
 
 from sb3_quad import PPOBC, DAgger, GeometricExpert
-from sb3_quad.algorithms import common
-from sb3_quad.algorithms.networks import Perceptron, losses, mlp, shared_out
+from sb3_quad.algorithms import dagger, ppo_bc
+from sb3_quad.algorithms.networks import gradients as networks
+from sb3_quad.algorithms.networks import losses
+from sb3_quad.algorithms.networks.gradients import Batch, Perceptrons
+from sb3_quad.algorithms.networks.losses import Loss
+from sb3_quad.algorithms.networks.perceptron import Perceptron, one_torch_thread
 from sb3_quad.envs import QuadcopterVecEnv
 
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU}
@@ -29,11 +32,10 @@ def perceptron(widths, activation="tanh", seed=0):
 def cloning(net, x, labels, index):
     """The loss "mse" over some rows, and its gradient by each parameter, from compiled code."""
     log_std = nn.Parameter(th.zeros(labels.shape[1]))
-    terms = Perceptron([*net]).gradient(x.numpy(), index, labels.numpy(), common.actor_terms("mse", 1.0), log_std)
+    terms = Perceptron([*net]).gradient(x.numpy(), index, labels.numpy(), Loss(bc_coef=1.0), log_std)
     return [th.tensor(terms[losses.CLONING] / len(index)), *(parameter.grad.clone() for parameter in net.parameters())]
 
 
-@settings(max_examples=30)
 @given(
     widths=st.lists(st.integers(1, 70), min_size=2, max_size=5),
     activation=st.sampled_from([*ACTIVATIONS]),
@@ -68,21 +70,20 @@ def test_the_number_of_threads_changes_no_bit(threads):
     alone = cloning(net, x, labels, index)
     for count in (2, 3, 8):
         threads(count)
-        with shared_out(compiled=True):
+        with one_torch_thread(compiled=True):
             assert th.get_num_threads() == 1
             for _ in range(20):
                 assert all(th.equal(*pair) for pair in zip(alone, cloning(net, x, labels, index), strict=True))
         assert th.get_num_threads() == count
 
 
-def test_a_forked_child_computes_with_threads_of_its_own(threads):
+def test_a_forked_child_computes_alone(threads):
     net, x = Perceptron([*perceptron([18, 64, 4])]), np.ones((4096, 18), np.float32)
     threads(2)
-    with shared_out(compiled=True):
+    with one_torch_thread(compiled=True):
         expected = net(x)
         child = os.fork()
         if child == 0:
-            mlp._helpers.threads = 2
             os._exit(0 if (net(x) == expected).all() else 1)
         assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
 
@@ -97,45 +98,79 @@ def test_what_is_not_finite_stays_so(value, activation):
     assert not all(th.isfinite(each).all() for each in cloning(net, x, th.zeros(300, 2), np.arange(300))[1:])
 
 
-PPO_BC = [
-    {"bc_loss": "mse", "bc_coef": 1.0},
-    {"bc_loss": "huber", "bc_coef": 2.0, "clip_range_vf": 0.1},
-    {"bc_loss": "huber_mse", "bc_coef": 1.0, "bc_filter": "agreement", "l2_coef": 1e-3, "ent_coef": 1e-3},
-    {"bc_loss": "nll", "bc_coef": 0.1, "bc_filter": "negative_advantage", "clip_range_vf": 0.2, "max_clipped_value": False},
-    {"bc_coef": 0.0, "l2_coef": 1e-4, "normalize_advantage": False},
-    {"critic_warmup": 1},
+N, A = 700, 4  # rows and actions
+LOSSES = [
+    *(Loss(bc_coef=2.0, bc_loss=kind, vf_coef=0.5) for kind in range(len(losses.CLONING_LOSSES))),
+    *(Loss(policy_coef=1.0, bc_coef=0.5, bc_loss=kind, bc_filter=kind, vf_coef=0.5, clip_range_vf=0.1) for kind in range(3)),
+    Loss(policy_coef=1.0, normalize_advantage=True, vf_coef=0.5, clip_range_vf=0.1, max_clipped_value=False, ent_coef=0.01),
+    Loss(policy_coef=1.0, bc_coef=1.0, ent_coef=0.01, l2_coef=0.1),
 ]
-DAGGER = [
-    {"bc_loss": "mse"},
-    {"bc_loss": "huber", "dataset_capacity": 2000, "gradient_steps": 30},
-    {"bc_loss": "huber_mse", "l2_coef": 1e-3, "ent_coef": 1e-3},
-    {"bc_loss": "nll", "clip_range_vf": 0.2, "max_grad_norm": None},
-]
+
+
+def batches(seed=0):
+    """Mini-batches of actor and critic: labels, actions, log-probabilities and advantages; values and returns."""
+    rng = np.random.default_rng(seed)
+    observations, rows = rng.normal(size=(N, 18)).astype(np.float32), rng.integers(0, N, 500)
+    for_actor = np.hstack([0.3 * rng.normal(size=(N, A)), 0.3 * rng.normal(size=(N, A)), rng.normal(size=(N, 2)) - [2.0, 0.0]])
+    for_critic = rng.normal(size=(N, 2)).astype(np.float32)
+    return Batch(rows, observations, for_actor.astype(np.float32)), Batch(rows, observations, for_critic)
+
+
+@pytest.mark.parametrize("with_critic", [True, False])
+@pytest.mark.parametrize("loss", LOSSES)
+def test_compiled_gradients_are_those_of_autograd(loss, with_critic):
+    policy = PPO("MlpPolicy", QuadcopterVecEnv(2), policy_kwargs={"log_std_init": -0.5}, seed=0, device="cpu").policy
+    network, (actor, critic) = networks.network_of(policy), batches()
+    assert isinstance(network, Perceptrons)
+    found = []
+    for each in (network, policy):
+        terms = networks.gradients(each, loss, actor, critic if with_critic else None)
+        found.append((terms, {name: parameter.grad for name, parameter in policy.named_parameters()}))
+    (ours, compiled), (theirs, plain) = found
+    assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)
+    for name, parameter in policy.named_parameters():  # no gradient is one of zero
+        one, other = (th.zeros_like(parameter) if each[name] is None else each[name] for each in (compiled, plain))
+        th.testing.assert_close(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()) + 1e-8)
+    norms = [networks.gradient_norms(each, loss, actor, critic) for each in (network, policy)]
+    assert norms[0] == pytest.approx(norms[1], rel=1e-4)
+
+
+@pytest.mark.parametrize(("bc_filter", "kept"), [("none", [0, 1, 2]), ("negative_advantage", [1]), ("agreement", [0, 1])])
+def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
+    policy = PPO("MlpPolicy", "Pendulum-v1", device="cpu").policy
+    for parameter in policy.parameters():
+        parameter.data.zero_()  # so that every mean action is zero
+    labels, advantages = np.array([[0.1], [-0.2], [0.4]]), np.array([[1.0], [-1.0], [0.0]])
+    batch = Batch(
+        np.arange(3), np.zeros((3, 3), np.float32), np.hstack([labels, 0 * labels, 0 * labels, advantages], dtype=np.float32)
+    )
+    loss = Loss(bc_coef=1.0, bc_filter=losses.BC_FILTERS.index(bc_filter))
+    for network in (policy, networks.network_of(policy)):
+        terms = networks.gradients(network, loss, batch, None)
+        assert terms["bc_loss"] == pytest.approx(np.square(labels[kept]).sum() / 3)
 
 
 @pytest.mark.parametrize(
-    ("algorithm", "keywords"), [*((PPOBC, each) for each in PPO_BC), *((DAgger, each) for each in DAGGER)]
+    ("algorithm", "module", "keywords"),
+    [
+        (PPOBC, ppo_bc, {"bc_loss": "huber_mse", "bc_coef": 1.0, "critic_warmup": 1, "clip_range_vf": 0.2}),
+        (DAgger, dagger, {"bc_loss": "nll", "dataset_capacity": 2000, "gradient_steps": 30, "max_grad_norm": None}),
+    ],
 )
-def test_a_training_is_the_one_by_autograd(algorithm, keywords):
+def test_a_training_is_the_one_by_autograd(monkeypatch, algorithm, module, keywords):
     def train():
-        sizes = {
-            "n_steps": 100,
-            "batch_size": 400,
-            "n_epochs": 3,
-            "learning_rate": 1e-3,
-            "policy_kwargs": {"log_std_init": -1.0},
-        }
-        env = QuadcopterVecEnv(16, seed=0)
-        model = algorithm("MlpPolicy", env, expert=GeometricExpert(), seed=0, device="cpu", **sizes, **keywords)
-        model.learn(1600 if algorithm is PPOBC else 3200)
+        sizes = {"n_steps": 100, "batch_size": 400, "n_epochs": 3, "learning_rate": 1e-3}
+        env, policy_kwargs = QuadcopterVecEnv(16, seed=0), {"log_std_init": -1.0}
+        model = algorithm("MlpPolicy", env, expert=GeometricExpert(), policy_kwargs=policy_kwargs, seed=0, **sizes, **keywords)
+        model.learn(3200)
         logged = {name: value for name, value in model.logger.name_to_value.items() if name.startswith("train/")}
         return logged, [parameter.detach() for parameter in model.policy.parameters()]
 
     ours, compiled = train()
-    with patch.object(common, "perceptrons", lambda policy: None):
-        theirs, plain = train()
-    assert "train/loss" in ours and ours == pytest.approx(theirs, rel=1e-3, abs=1e-6)
-    assert max(float((one - other).abs().max()) for one, other in zip(compiled, plain, strict=True)) < 1e-5
+    monkeypatch.setattr(module, "network_of", lambda policy: policy)
+    theirs, plain = train()
+    assert "train/loss" in ours and ours == pytest.approx(theirs, rel=1e-2, abs=1e-4)
+    assert max(float((one - other).abs().max()) for one, other in zip(compiled, plain, strict=True)) < 1e-4
 
 
 @pytest.mark.parametrize(
@@ -149,24 +184,20 @@ def test_a_training_is_the_one_by_autograd(algorithm, keywords):
 )
 def test_policies_give_what_their_own_methods_give(keywords, computed):
     policy = PPO("MlpPolicy", QuadcopterVecEnv(4, seed=0), policy_kwargs=keywords, device="cpu").policy
-    networks = common.perceptrons(policy)
-    assert (networks is not None) == computed
-    x = th.randn(500, 18)
-    np.testing.assert_allclose(
-        common.outputs(networks, policy, "actor", x.numpy()), policy.get_distribution(x).mode().detach(), atol=1e-6
-    )
-    np.testing.assert_allclose(
-        common.outputs(networks, policy, "critic", x.numpy()), policy.predict_values(x).detach()[:, 0], atol=1e-6
-    )
-    if networks is not None:
-        th.manual_seed(1)
-        ours = common.act(networks, policy, x)
-        th.manual_seed(1)
-        for one, other in zip(ours, policy(x), strict=True):
-            th.testing.assert_close(one, other.detach(), rtol=1e-4, atol=1e-5)
+    network, x = networks.network_of(policy), th.randn(500, 18)
+    assert isinstance(network, Perceptrons) == computed
+    means, values = policy.get_distribution(x).mode().detach(), policy.predict_values(x).detach()[:, 0]
+    np.testing.assert_allclose(networks.mean_actions(network, x.numpy()), means, atol=1e-6)
+    np.testing.assert_allclose(networks.state_values(network, x.numpy()), values, atol=1e-6)
+    th.manual_seed(1)
+    with th.no_grad():
+        ours = networks.act(network, x)
+    th.manual_seed(1)
+    for one, other in zip(ours, policy(x), strict=True):
+        th.testing.assert_close(one, other.detach(), rtol=1e-4, atol=1e-5)
 
 
-def test_layers_that_somebody_listens_to_are_left_to_pytorch():
+def test_layers_with_hooks_or_of_other_types_are_left_to_pytorch():
     net = perceptron([3, 8, 2])
     assert Perceptron.fits([*net])
     net[1].register_forward_hook(lambda *_: None)

@@ -77,6 +77,7 @@ def test_an_interrupted_run_goes_on_to_the_same_agent(tmp_path, algo):
     assert saved_algorithm(whole.run.model) == {"sac": "SAC", "td3": "TD3", "sac_bc": "SACBC"}[algo]
 
 
+@pytest.mark.slow
 def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, short_clone):
     one = {
         "name": "one",
@@ -119,6 +120,7 @@ def clone(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_an_agent_is_handed_over_to_sac_and_flies(clone):
     before, after = (fly(load_model(path), "state_recovery", 240, 3) for path in (pretrained("itm-recovery"), clone))
     assert before.survival.mean() > 0.98 and after.survival.mean() > before.survival.mean() - 0.03
@@ -135,6 +137,7 @@ def test_the_deviation_of_a_clone_is_that_of_its_settings(short_clone, given, lo
     assert th.equal(model.actor.get_action_dist_params(seen)[1], th.full((8, 4), log_std))
 
 
+@pytest.mark.slow
 def test_its_offset_is_trimmed(clone):
     model = load_model(clone)
     with th.no_grad():
@@ -143,6 +146,7 @@ def test_its_offset_is_trimmed(clone):
     assert trim(model).after < 0.1 * before > 0.1
 
 
+@pytest.mark.slow
 def test_its_export_flies_where_it_flies(clone, tmp_path):
     """In closed loop: the file's thrusts lead to the same ends."""
     assert main(["export", str(clone), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 0
@@ -177,12 +181,8 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
     ("algo", "changes", "message"),
     [
         ("sac", {"expert": "pid"}, "learns from no expert"),
-        ("sac", {"bc_coef": 1.0}, "bc_coef"),
         ("td3", {"noise_type": "pink"}, "noise_type"),
-        ("td3", {"noise_std": -0.1}, "noise_std"),
-        ("sac_bc", {"buffer_size": 0}, "buffer_size"),
         ("sac_bc", {"buffer_size": 2**39}, "this machine's memory"),
-        ("sac_bc", {"expert_fraction": 2.0}, "from 0 to 1"),
         ("sac_bc", {"train_freq": [2, "episode"]}, "counts episodes"),
         ("sac_bc", {"ent_coef": "much"}, "cannot be made"),
         ("ppo", {"noise_type": "normal"}, "samples its actions"),

@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_quad.algorithms.networks import Batch
+from sb3_quad.algorithms.networks.gradients import Batch
 from sb3_quad.base.arrays import BoolArray, Float32Array, IntArray
 
 
@@ -56,10 +56,10 @@ class ExpertReplaySamples(NamedTuple):
     next_observations: th.Tensor
     dones: th.Tensor
     rewards: th.Tensor
+    discounts: th.Tensor | None
     expert_actions: th.Tensor
     next_expert_actions: th.Tensor
     next_is_labelled: th.Tensor
-    discounts: None = None
 
 
 class ExpertReplayBuffer(ReplayBuffer):
@@ -80,20 +80,13 @@ class ExpertReplayBuffer(ReplayBuffer):
         self.next_is_labelled[self.pos] = next_is_labelled[:, None]
 
     def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> ExpertReplaySamples:  # type: ignore[override]
-        """As SB3's, which does not tell which environments it samples."""
-        at = batch_inds, np.random.randint(0, high=self.n_envs, size=len(batch_inds))  # noqa: NPY002
-        if self.optimize_memory_usage:
-            next_observations = self.observations[(batch_inds + 1) % self.buffer_size, at[1]]
-        else:
-            next_observations = self.next_observations[at]
-        data: tuple[Any, ...] = (
-            self._normalize_obs(self.observations[at], env),
-            self.actions[at],
-            self._normalize_obs(next_observations, env),
-            (self.dones[at] * (1 - self.timeouts[at])).reshape(-1, 1),  # only dones that are not due to timeouts
-            self._normalize_reward(self.rewards[at].reshape(-1, 1), env),
-            self.expert_actions[at],
-            self.next_expert_actions[at],
-            self.next_is_labelled[at],
-        )
-        return ExpertReplaySamples(*map(self.to_torch, data))
+        # SB3 samples each row's environment itself and keeps it to itself: the same numbers are sampled twice.
+        before = np.random.get_state()  # noqa: NPY002
+        at = batch_inds, np.random.randint(0, high=self.n_envs, size=batch_inds.shape)  # noqa: NPY002
+        np.random.set_state(before)  # noqa: NPY002
+        labels = self.expert_actions[at], self.next_expert_actions[at], self.next_is_labelled[at]
+        return ExpertReplaySamples(*super()._get_samples(batch_inds, env), *map(self.to_torch, labels))
+
+
+class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):
+    """The same with SB3's n-step returns; the next state's labels are those one step on."""

@@ -22,17 +22,9 @@ from typing_extensions import Self
 
 from sb3_quad.algorithms.common import ExpertMixin, parameters_of_both
 from sb3_quad.algorithms.dataset import AggregatedDataset, sample_rows
-from sb3_quad.algorithms.networks import (
-    CLONING_LOSSES,
-    Batch,
-    CloningLoss,
-    Loss,
-    gradients,
-    mean_actions,
-    network_of,
-    one_torch_thread,
-    state_values,
-)
+from sb3_quad.algorithms.networks.gradients import Batch, gradients, mean_actions, network_of, state_values
+from sb3_quad.algorithms.networks.losses import CLONING_LOSSES, CloningLoss, Loss
+from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 import torch as th
 
-from sb3_quad.algorithms.networks import Batch
+from sb3_quad.algorithms.networks.gradients import Batch
 from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays

@@ -17,17 +17,9 @@ from typing_extensions import Self
 
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, parameters_of_both
-from sb3_quad.algorithms.networks import (
-    BC_FILTERS,
-    CLONING_LOSSES,
-    CloningLoss,
-    Loss,
-    act,
-    gradient_norms,
-    gradients,
-    network_of,
-    one_torch_thread,
-)
+from sb3_quad.algorithms.networks.gradients import act, gradient_norms, gradients, network_of
+from sb3_quad.algorithms.networks.losses import BC_FILTERS, CLONING_LOSSES, CloningLoss, Loss
+from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 

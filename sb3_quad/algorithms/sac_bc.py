@@ -7,7 +7,7 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, ReplayBufferSamples, Schedule
@@ -17,7 +17,7 @@ from torch import nn
 from torch.nn import functional as F
 from typing_extensions import Self
 
-from sb3_quad.algorithms.buffers import ExpertReplayBuffer, ExpertReplaySamples
+from sb3_quad.algorithms.buffers import ExpertNStepReplayBuffer, ExpertReplayBuffer, ExpertReplaySamples
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero
 from sb3_quad.algorithms.networks.losses import CloningLoss, agree, cloning_errors
 from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
@@ -178,23 +178,27 @@ class SACBC(ExpertMixin, SAC):
                 f"observation space {self.observation_space}: SACBC does not support Dict with an expert; wrap the "
                 "environment in gymnasium.wrappers.FlattenObservation"
             )
-        labels = self._clones or self.expert_proposal
-        if labels and (self.n_steps != 1 or self.replay_buffer_class not in (None, ExpertReplayBuffer)):
-            raise ConfigError(
-                f"n_steps is {self.n_steps}, replay_buffer_class {self.replay_buffer_class}: bc_coef and expert_proposal need "
-                "n_steps 1 and no replay_buffer_class, since their buffer holds the expert's actions"
-            )
-        if labels:
-            self.replay_buffer_class = ExpertReplayBuffer
+        if self.expert_proposal and self.n_steps != 1:
+            raise ConfigError(f"expert_proposal needs n_steps 1, not {self.n_steps}: it proposes for the next state")
+        if self._clones or self.expert_proposal:
+            if self.replay_buffer_class not in (None, ReplayBuffer, NStepReplayBuffer):
+                raise ConfigError(f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's actions")
+            self.replay_buffer = self._new_buffer(self.buffer_size)
         super()._setup_model()
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
             _normalise_layers(self.critic_target)
-        assert self.replay_buffer is not None and self.replay_buffer_class is not None
         if self.expert_timesteps > 0:
-            size = -(-self.expert_timesteps // self.n_envs) * self.n_envs
-            arguments = size, self.observation_space, self.action_space, self.device, self.n_envs, self.optimize_memory_usage
-            self.expert_buffer = self.replay_buffer_class(*arguments, **self.replay_buffer_kwargs)
+            self.expert_buffer = self._new_buffer(-(-self.expert_timesteps // self.n_envs) * self.n_envs)
+
+    def _new_buffer(self, size: int) -> ReplayBuffer:
+        """SB3's replay buffer, with the expert's actions beside those flown where they are used."""
+        kind, keywords = self.replay_buffer_class or ReplayBuffer, {**self.replay_buffer_kwargs}
+        if self._clones or self.expert_proposal:
+            kind = ExpertReplayBuffer if self.n_steps == 1 else ExpertNStepReplayBuffer
+            keywords |= {} if self.n_steps == 1 else {"n_steps": self.n_steps, "gamma": self.gamma}
+        arguments = size, self.observation_space, self.action_space, self.device, self.n_envs, self.optimize_memory_usage
+        return kind(*arguments, **keywords)
 
     @property
     def expert_flies(self) -> bool:
@@ -397,8 +401,7 @@ class SACBC(ExpertMixin, SAC):
         return super().learn(total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar)
 
     def _excluded_save_params(self) -> list[str]:
-        own = ["replay_buffer_class"] if self.replay_buffer_class is ExpertReplayBuffer else []
-        return [*super()._excluded_save_params(), "expert_buffer", "_labels", *own]
+        return [*super()._excluded_save_params(), "expert_buffer", "_labels"]
 
     def expert_state(self) -> Arrays:
         """As of any algorithm with an expert, and its actions for the present states."""

@@ -5,10 +5,13 @@ Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a ro
 A chunk is a number of blocks; whichever thread computes it, its sums are the same.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import float32, uint64
 
 from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
+from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
 ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
@@ -17,6 +20,21 @@ _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
 _TILE = np.uint64(16)  # inputs at once: their rows stay in the first cache
 _FAST = {"reassoc", "contract", "nsz"}  # not "nnan": what is not finite must stay so
 _END = np.float32(7.90531110763549805)  # beyond, float32's tanh is 1
+
+
+class Layers(NamedTuple):
+    """The layers of a perceptron.
+
+    :param widths: of all layers, the inputs first, padded.
+    :param kinds: the activation of each but the first.
+    :param parameters: of one layer after another.
+    :param transposed: the same with each layer's weights as (inputs, outputs).
+    """
+
+    widths: IntArray
+    kinds: IntArray
+    parameters: Float32Array
+    transposed: Float32Array
 
 
 @compiled(fastmath=_FAST)
@@ -138,8 +156,9 @@ def _layer(scratch, at, width):
 
 
 @compiled
-def _forward(scratch, x, index, first, count, widths, kinds, parameters):
+def _forward(scratch, x, index, first, count, layers):
     """Compute all layers of a block, which lie behind one another, the inputs first; returns where the outputs begin."""
+    widths, kinds, parameters, _ = layers
     _load(x, index, first, count, _layer(scratch, 0, widths[0]))
     at = place = 0
     for layer in range(1, len(widths)):
@@ -153,13 +172,12 @@ def _forward(scratch, x, index, first, count, widths, kinds, parameters):
 
 
 @compiled
-def _backward(scratch, at, widths, kinds, transposed, sums):
+def _backward(scratch, at, layers, sums):
     """Add to ``sums`` the gradient by the parameters of a block whose outputs begin at ``at``.
 
     The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns.
-
-    :param transposed: the parameters with each layer's weights as (inputs, outputs).
     """
+    widths, kinds, _, transposed = layers
     here, there, place = widths.sum() * ROWS, (widths.sum() + widths.max()) * ROWS, len(sums)
     for layer in range(len(widths) - 1, 0, -1):
         rows, columns = widths[layer], widths[layer - 1]
@@ -175,70 +193,53 @@ def _backward(scratch, at, widths, kinds, transposed, sums):
 
 
 @compiled
-def forward(first_chunk, last_chunk, chunks, scratch, x, index, widths, kinds, parameters, out):
+def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
     """The outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs), into ``out``, for some of all ``chunks``.
 
     :param scratch: of the size of :func:`scratch_size`, aligned to cache lines.
-    :param widths: of all layers, the inputs first, padded; :param kinds: the activation of each but the first.
+    :param layers: :class:`Layers`.
     """
     n = len(index)
     blocks = (n + ROWS - 1) // ROWS
     for block in range(first_chunk * blocks // chunks, last_chunk * blocks // chunks):
         first = block * ROWS
         count = min(ROWS, n - first)
-        at = _forward(scratch, x, index, first, count, widths, kinds, parameters)
-        h = _layer(scratch, at, widths[-1])
+        at = _forward(scratch, x, index, first, count, layers)
+        h = _layer(scratch, at, layers.widths[-1])
         for i in range(count):
             for j in range(out.shape[1]):
                 out[first + i, j] = h[j, i]
 
 
 @compiled
-def gradient(
-    first_chunk,
-    last_chunk,
-    chunks,
-    scratch,
-    x,
-    index,
-    widths,
-    kinds,
-    parameters,
-    transposed,
-    targets,
-    loss,
-    log_std,
-    sums,
-    terms,
-):
+def gradient(first_chunk, last_chunk, chunks, scratch, layers, x, index, targets, loss, log_std, sums, terms):
     """The gradient of a loss (:mod:`.losses`) by all parameters; a block stays in the cache for its way forth and back.
 
     As :func:`forward`, and:
 
     :param targets: (m, columns) of the loss, of the same rows.
-    :param transposed: see :func:`_backward`.
     :param loss: :class:`~sb3_quad.algorithms.networks.losses.Loss`.
     :param log_std: of the actions, (a,); of size 0 for a critic.
     :param sums: float32 (chunks, parameters + a), the gradient of each chunk.
     :param terms: float64 (chunks, TERMS), likewise, the loss's terms.
     """
-    n, size = len(index), len(transposed)
-    blocks, outputs = (n + ROWS - 1) // ROWS, widths[-1]
+    n, size, outputs = len(index), len(layers.parameters), layers.widths[-1]
+    blocks, behind = (n + ROWS - 1) // ROWS, layers.widths.sum() * ROWS
     for chunk in range(first_chunk, last_chunk):
         sums[chunk, :] = 0.0
         terms[chunk, :] = 0.0
         for block in range(chunk * blocks // chunks, (chunk + 1) * blocks // chunks):
             first = block * ROWS
             count = min(ROWS, n - first)
-            at = _forward(scratch, x, index, first, count, widths, kinds, parameters)
-            y, g = _layer(scratch, at, outputs), _layer(scratch, widths.sum() * ROWS, outputs)
+            at = _forward(scratch, x, index, first, count, layers)
+            y, g = _layer(scratch, at, outputs), _layer(scratch, behind, outputs)
             g[:, :] = 0.0
             g[0, 0] = 0.0 * _touch(targets, index, first, count)
             if len(log_std) > 0:
                 actor_loss(y, index, first, count, targets, loss, log_std, g, sums[chunk, size:], terms[chunk])
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            _backward(scratch, at, widths, kinds, transposed, sums[chunk, :size])
+            _backward(scratch, at, layers, sums[chunk, :size])
 
 
 def scratch_size(widths):

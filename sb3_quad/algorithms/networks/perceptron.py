@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, forward, gradient, scratch_size
+from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, Layers, forward, gradient, scratch_size
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 
@@ -58,7 +58,7 @@ class Perceptron:
     def __call__(self, x: Float32Array) -> Float32Array:
         """The outputs (n, outputs) for x (n, inputs)."""
         out = np.empty((len(x), self._layers[-1].out_features), np.float32)
-        self._compute(forward, len(x), x, np.arange(len(x)), self._widths, self._kinds, self._pack()[0], out)
+        self._compute(forward, len(x), x, np.arange(len(x)), out)
         return out
 
     def gradient(
@@ -73,8 +73,7 @@ class Perceptron:
         chunks = _chunks(len(index))
         sums, terms = np.empty((chunks, self._size + len(stds)), np.float32), np.empty((chunks, TERMS))
         typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
-        network = self._widths, self._kinds, *self._pack()
-        self._compute(gradient, len(index), x, index, *network, targets, typed, stds, sums, terms)
+        self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
         total = th.from_numpy(sums.sum(axis=0))
         for layer, at, rows, columns in self._places():
             middle = at + rows * columns
@@ -97,13 +96,11 @@ class Perceptron:
             yield layer, at, rows, columns
             at += rows * (columns + 1)
 
-    def _pack(self) -> Float32Array:
-        for there, here in self._copies:
-            there[...] = here
-        return self._packed
-
     def _compute(self, function: Callable[..., None], n: int, *arguments: Any) -> None:
         """Call a function of :mod:`.kernel` for all chunks of n rows, on several threads where that is worthwhile."""
+        for there, here in self._copies:
+            there[...] = here
+        layers = Layers(self._widths, self._kinds, *self._packed)
         chunks, threads = _chunks(n), _threads if n > (WORTHWHILE - 1) * ROWS else 1
         size = -(-chunks // (PARTS * threads)) if threads > 1 else chunks
         firsts = iter(range(0, chunks, size))  # each part is taken by one thread: `next` holds Python's lock
@@ -111,7 +108,7 @@ class Perceptron:
         def work() -> None:
             scratch = _aligned(scratch_size(self._widths))
             for first in firsts:
-                function(first, min(first + size, chunks), chunks, scratch, *arguments)
+                function(first, min(first + size, chunks), chunks, scratch, layers, *arguments)
 
         helpers = [_pool.submit(work) for _ in range(threads - 1)] if _pool is not None else []
         work()

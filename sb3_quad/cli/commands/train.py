@@ -133,7 +133,7 @@ def prepare(options: argparse.Namespace) -> None:
     """
     import torch
 
-    from sb3_quad.algorithms.networks import use_one_torch_thread
+    from sb3_quad.algorithms.networks.perceptron import use_one_torch_thread
     from sb3_quad.base.imports import import_packages
 
     import_packages(options.gym_packages, "--gym-packages")
