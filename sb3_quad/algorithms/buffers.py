@@ -88,5 +88,5 @@ class ExpertReplayBuffer(ReplayBuffer):
         return ExpertReplaySamples(*super()._get_samples(batch_inds, env), *map(self.to_torch, labels))
 
 
-class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):
+class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
     """The same with SB3's n-step returns; the next state's labels are those one step on."""

@@ -252,7 +252,7 @@ class PPOBC(ExpertMixin, PPO):
                 if infos[idx].get("terminal_observation") is not None and infos[idx].get("TimeLimit.truncated", False):
                     terminal_obs = self.policy.obs_to_tensor(infos[idx]["terminal_observation"])[0]
                     with th.no_grad():
-                        rewards[idx] += self.gamma * self.policy.predict_values(terminal_obs)[0]  # type: ignore[arg-type]
+                        rewards[idx] += self.gamma * self.policy.predict_values(terminal_obs)[0]
 
             rollout_buffer.add(self._last_obs, actions, rewards, self._last_episode_starts, values, log_probs)  # type: ignore[arg-type]
             self._last_obs = new_obs  # type: ignore[assignment]
@@ -332,10 +332,10 @@ class PPOBC(ExpertMixin, PPO):
         self._n_rollouts_trained += 1
         explained_var = explained_variance(self.rollout_buffer.values.flatten(), self.rollout_buffer.returns.flatten())
 
-        averages = {name: np.mean(values) for name, values in monitored.items()}
-        averages |= {"approx_kl": np.mean(approx_kl_divs), "loss": terms["loss"], "explained_variance": explained_var}
+        averages = {name: float(np.mean(values)) for name, values in monitored.items()}
+        averages |= {"approx_kl": float(np.mean(approx_kl_divs)), "loss": terms["loss"], "explained_variance": explained_var}
         for name, average in averages.items():
-            self.logger.record(f"train/{name}", float(average))
+            self.logger.record(f"train/{name}", average)
         if hasattr(self.policy, "log_std"):
             self.logger.record("train/std", th.exp(self.policy.log_std).mean().item())
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")

@@ -277,7 +277,7 @@ class SACBC(ExpertMixin, SAC):
         n_expert = round(batch_size * self.expert_fraction)
         buffers = [(self.replay_buffer, batch_size - n_expert), (self.expert_buffer, n_expert)]
         parts = [buffer.sample(n, env=self._vec_normalize_env) for buffer, n in buffers if buffer is not None and n > 0]
-        joined = [None if column[0] is None else th.cat(column) for column in zip(*parts, strict=True)]
+        joined: list[Any] = [None if column[0] is None else th.cat(column) for column in zip(*parts, strict=True)]
         return parts[0] if len(parts) == 1 else type(parts[0])(*joined)
 
     @staticmethod

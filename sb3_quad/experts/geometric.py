@@ -19,13 +19,13 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
-_TOLD_YAW = 4.0  # times the yaw gain: an agent's error in the moment that it sets against a torque becomes a yaw rate / gain
+_TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
-    """Gains for a vehicle whose YAML has none, from its control authority: ITM's, found by search, without their dimension.
+    """Gains for a vehicle whose YAML has none: ITM's, found by search, scaled by the vehicle's control authority.
 
-    The units are the lag τ from a command to its thrust (:class:`~sb3_quad.vehicles.authority.Authority`); the greatest
+    The scales are the lag τ from a command to its thrust (:class:`~sb3_quad.vehicles.authority.Authority`); the greatest
     angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
     upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
     limits in hover thrusts.
@@ -58,8 +58,8 @@ def _derived(turn: Any, lag: Any, gravity: Any, least: Any, most: Any) -> dict[s
     }
 
 
-class _Told:
-    """What the law needs of n vehicles whose true parameters are known; of those that changed it is worked out anew."""
+class _TrueConstants:
+    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed."""
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
         self._control_step = vehicle.control_step
@@ -105,16 +105,15 @@ class GeometricExpert(Expert):
     velocities and body rates that the vehicle can brake from, the attitude as it will be when the command acts, the long
     way round where the spin makes that quicker, and rotor thrusts that give up yaw before thrust and thrust before tilt.
 
-    The actions are a function of what the 18 observed features hold; nothing is remembered.
+    The actions are a function of what the 18 observed features hold; the expert has no state.
 
     :param vehicle: name, YAML path or Vehicle it is designed for.
     :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
         :func:`derived_gains` where it has none.
-    :param told: whether it flies each vehicle by its true parameters and takes from forces and moments what pushes it, as far
-        as a state says (``state.vehicles``, ``state.wrench``). Its gains then change from vehicle to vehicle as those of
-        :func:`derived_gains` do.
-    :param reserve: weights of thrust that it does not count on when it plans to brake a descent; above 0 it also counts with
-        the force that it is told of.
+    :param told: whether it uses each vehicle's true parameters and compensates the external wrench, as far as a state holds
+        them (``state.vehicles``, ``state.wrench``). Its gains then scale with the vehicle as :func:`derived_gains` do.
+    :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent; above 0 its plan also includes
+        the known external force.
     :raises ConfigError: a negative reserve, or one without ``told``.
     """
 
@@ -136,7 +135,7 @@ class GeometricExpert(Expert):
         body = np.array([v.mass, v.gravity, *v.inertia, Authority(v).command_lag])
         designed = self.gains.values(), body, np.array(v.thrust_range)
         self._constants = designed[0][:, None], body[:, None], v.mixer_inverse[None], designed[2][:, None]
-        self._told = _Told(v, self.gains) if told else None
+        self._told = _TrueConstants(v, self.gains) if told else None
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
@@ -151,14 +150,14 @@ class GeometricExpert(Expert):
 
 
 def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """A :class:`GeometricExpert` that is told the true vehicle and wrench."""
+    """A :class:`GeometricExpert` that knows the true vehicle and wrench."""
     return GeometricExpert(vehicle, told=True)
 
 
 def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """The told expert for an agent that must find out what its rotors lift before it falls too fast to be stopped.
+    """As :func:`told_geometric`, with gentle descents: half the acceleration, braked with 0.05 weights of thrust in reserve.
 
-    It begins descents with half the acceleration and brakes them with 0.05 weights of thrust in reserve.
+    It teaches agents that must find out what their rotors lift before they fall too fast to stop.
     """
     gains = GeometricExpert(vehicle).gains
     gentle = gains.model_copy(update={"descent": 0.5 * gains.descent})

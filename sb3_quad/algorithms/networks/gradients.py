@@ -82,7 +82,7 @@ def mean_actions(network: Network, observations: npt.NDArray[Any]) -> Float32Arr
     if isinstance(network, Perceptrons):
         return network.actor(_flat(observations))
     with th.no_grad():
-        means = network.get_distribution(th.as_tensor(observations, device=network.device)).mode()  # type: ignore[arg-type]
+        means = network.get_distribution(th.as_tensor(observations, device=network.device)).mode()
     return np.asarray(means.cpu().numpy())
 
 
@@ -91,7 +91,7 @@ def state_values(network: Network, observations: npt.NDArray[Any]) -> Float32Arr
     if isinstance(network, Perceptrons):
         return network.critic(_flat(observations))[:, 0]
     with th.no_grad():
-        values = network.predict_values(th.as_tensor(observations, device=network.device))  # type: ignore[arg-type]
+        values = network.predict_values(th.as_tensor(observations, device=network.device))
     return np.asarray(values.flatten().cpu().numpy())
 
 
@@ -113,7 +113,10 @@ def gradients(network: Network, loss: Loss, actor: Batch, critic: Batch | None) 
     :return: the terms that were computed, without their weights, and their weighted sum, as the logger calls them; NaN for a
         policy that is no longer finite.
     """
-    terms = (_compiled if isinstance(network, Perceptrons) else _by_autograd)(network, loss, actor, critic)
+    if isinstance(network, Perceptrons):
+        terms = _compiled(network, loss, actor, critic)
+    else:
+        terms = _by_autograd(network, loss, actor, critic)
     weighted = (getattr(loss, coefficient) * terms.get(name, 0.0) for name, coefficient in COEFFICIENTS.items())
     return {"loss": sum(weighted), **terms}
 
@@ -123,7 +126,8 @@ def gradient_norms(network: Network, loss: Loss, actor: Batch, critic: Batch) ->
     norms = {}
     for name, coefficient in COEFFICIENTS.items():
         if getattr(loss, coefficient) != 0.0:
-            alone = loss._replace(**{other: 0.0 for other in COEFFICIENTS.values() if other != coefficient})
+            others: dict[str, Any] = {other: 0.0 for other in COEFFICIENTS.values() if other != coefficient}
+            alone = loss._replace(**others)
             gradients(network, alone, actor, critic if name == "value_loss" else None)
             own = [each.grad.norm() for each in network.parameters() if each.grad is not None]
             norms[name.removesuffix("_loss").removesuffix("_gradient")] = float(th.stack(own).norm())
@@ -134,16 +138,18 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
     observations, targets = actor.tensors(policy.device)
     kind, a = losses.CLONING_LOSSES[loss.bc_loss], get_action_dim(policy.action_space)
     terms: dict[str, th.Tensor] = {}
+    values: th.Tensor | None = None
     log_prob, raw_advantages = None, targets[:, -1].contiguous()  # as SB3 has it: strided, a sum may round differently
     try:
         if loss.policy_coef != 0.0:
             actions, old_log_prob = targets[:, -a - 2 : -2].contiguous(), targets[:, -2].contiguous()
             if isinstance(policy.action_space, spaces.Discrete):
                 actions = actions.long().flatten()
-            values, log_prob, entropy = policy.evaluate_actions(observations, actions)  # type: ignore[arg-type]
+            values, log_prob, entropy = policy.evaluate_actions(observations, actions)
         else:
-            entropy = policy.get_distribution(observations).entropy()  # type: ignore[arg-type]
-            values = critic and policy.predict_values(critic.tensors(policy.device)[0])  # type: ignore[arg-type,assignment]
+            entropy = policy.get_distribution(observations).entropy()
+            if critic is not None:
+                values = policy.predict_values(critic.tensors(policy.device)[0])
     except ValueError:  # of a distribution whose mean is not finite
         return dict.fromkeys(COEFFICIENTS, np.nan)
 
@@ -167,7 +173,7 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
         elif loss.bc_filter == losses.AGREEMENT:
             errors = errors * losses.agree(mean, labels)
         terms["bc_loss"] = errors.mean()
-    if critic is not None:
+    if critic is not None and values is not None:
         old_values, returns = critic.tensors(policy.device)[1].T.contiguous()
         terms["value_loss"] = losses.value_loss(values.flatten(), old_values, returns, loss)
     terms["entropy_loss"] = -entropy.mean() if entropy is not None else log_prob.mean()  # type: ignore[union-attr]

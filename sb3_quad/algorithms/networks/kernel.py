@@ -196,7 +196,8 @@ def _backward(scratch, at, layers, sums):
 def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
     """The outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs), into ``out``, for some of all ``chunks``.
 
-    :param scratch: of the size of :func:`scratch_size`, aligned to cache lines.
+    :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of all layers, and
+        twice for the widest layer's gradients.
     :param layers: :class:`Layers`.
     """
     n = len(index)
@@ -240,8 +241,3 @@ def gradient(first_chunk, last_chunk, chunks, scratch, layers, x, index, targets
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
             _backward(scratch, at, layers, sums[chunk, :size])
-
-
-def scratch_size(widths):
-    """Numbers of a thread's scratch memory: all layers of a block, and the gradients of two."""
-    return int(widths.sum() + 2 * widths.max()) * ROWS

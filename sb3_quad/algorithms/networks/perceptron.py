@@ -9,7 +9,7 @@ import numpy as np
 import torch as th
 from torch import nn
 
-from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, Layers, forward, gradient, scratch_size
+from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, Layers, forward, gradient
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 
@@ -106,7 +106,7 @@ class Perceptron:
         firsts = iter(range(0, chunks, size))  # each part is taken by one thread: `next` holds Python's lock
 
         def work() -> None:
-            scratch = _aligned(scratch_size(self._widths))
+            scratch = _aligned(int(self._widths.sum() + 2 * self._widths.max()) * ROWS)
             for first in firsts:
                 function(first, min(first + size, chunks), chunks, scratch, layers, *arguments)
 
