@@ -1,7 +1,5 @@
 """Expert labels: whom the labeller asks, with what, and which answers it accepts."""
 
-import pickle
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -14,6 +12,7 @@ from sb3_quad.base.errors import ExpertError
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.evaluation.scaling import AdaptiveScaling
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
 
@@ -49,12 +48,6 @@ def test_the_true_state_is_collected_from_single_environments():
     labeller = Controller.for_env(FromState(), env)
     assert labeller.needs_state
     np.testing.assert_array_equal(labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1))
-
-
-def test_a_state_can_come_from_another_process():
-    """SubprocVecEnv sends it through a pipe."""
-    state = pickle.loads(pickle.dumps(QuadcopterVecEnv(3, seed=0).true_state()))
-    assert PIDExpert().actions(state).shape == (3, 4)
 
 
 @pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecNormalize(VecMonitor(env))])
@@ -177,3 +170,11 @@ def test_the_state_of_an_expert_goes_on_in_its_environment():
     Controller.for_env(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)
     assert counter.given == [None, 1, None]
     np.testing.assert_array_equal(counter.starts[1], starts)
+
+
+def test_scaled_observations_leave_the_state_to_the_controller():
+    counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
+    labeller = Controller.for_env(AdaptiveScaling(counter), env)
+    for _ in range(2):
+        labeller.labels(env.reset())
+    assert counter.given == [None, 1]

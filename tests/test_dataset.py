@@ -1,7 +1,5 @@
 """The aggregated dataset: a ring that forgets the oldest, and its file."""
 
-import os
-
 import numpy as np
 import pytest
 import torch as th
@@ -63,13 +61,6 @@ def test_pairs_do_not_depend_on_where_the_ring_begins(tmp_path):
         np.testing.assert_array_equal(mine, theirs)
 
 
-def test_a_smaller_capacity_keeps_the_last(tmp_path):
-    filled(8, 8).save(tmp_path / "d.npz")
-    small = AggregatedDataset(3, (2,), 1)
-    small.load(tmp_path / "d.npz")
-    np.testing.assert_array_equal(contents(small)[1][:, 0], [50, 60, 70])
-
-
 def test_unfit_files_are_named(tmp_path):
     path = tmp_path / "d.npz"
     filled(8, 8).save(path)
@@ -82,15 +73,3 @@ def test_unfit_files_are_named(tmp_path):
     with pytest.raises(ConfigError, match=r"\(8, 3\)"):
         AggregatedDataset(8, (3,), 1).load(path)
     assert len(dataset) == 2
-
-
-def test_an_interrupted_save_leaves_the_file_before_it(tmp_path, monkeypatch):
-    path = tmp_path / "d.npz"
-    filled(8, 3).save(path)
-    monkeypatch.setattr(os, "replace", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
-    with pytest.raises(KeyboardInterrupt):
-        filled(8, 8).save(path)
-    assert [entry.name for entry in tmp_path.iterdir()] == ["d.npz"]
-    dataset = filled(8)
-    dataset.load(path)
-    assert len(dataset) == 3

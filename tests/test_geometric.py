@@ -104,12 +104,6 @@ def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target() -> None:
     assert tracking.final_error.max() < 0.01
 
 
-def test_it_flies_as_well_on_noisy_observations() -> None:
-    """What a policy can learn from it: a function of the 18 features that their noise does not upset."""
-    recovery = fly(lambda observation: EXPERT.predict(observation)[0], "state_recovery", 120, 14, max_steps=350, noise=0.05)
-    assert recovery.survival.mean() >= 0.99
-
-
 def changed(**changes: object) -> GeometricExpert:
     return GeometricExpert(ITM.model_copy(update=changes))
 
@@ -120,7 +114,6 @@ def changed(**changes: object) -> GeometricExpert:
         changed(motor_gain=10.0),
         changed(inertia=tuple(3 * each for each in ITM.inertia)),
         changed(thrust_limits=(0.7, 1.25)),
-        changed(thrust_limits=(0.0, 3.0)),
         changed(delay=4),
         changed(
             mass=0.03,
@@ -129,7 +122,7 @@ def changed(**changes: object) -> GeometricExpert:
             moment_thrust_ratio=0.006,
         ),
     ],
-    ids=["slow motors", "heavy arms", "weak", "strong", "late", "palm-sized plus"],
+    ids=["slow motors", "heavy arms", "weak", "late", "palm-sized plus"],
 )
 def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(expert: GeometricExpert) -> None:
     vehicle = expert.vehicle

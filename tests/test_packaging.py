@@ -219,9 +219,6 @@ def test_the_wheel_works_from_another_folder(installed, tmp_path):
 import importlib, importlib.resources, json, pkgutil, sys, sb3_quad
 names = [found.name for found in pkgutil.walk_packages(sb3_quad.__path__, "sb3_quad.") if "__main__" not in found.name]
 names.remove("sb3_quad.zoo")  # needs rl_zoo3
-names.remove("sb3_quad.experts.raptor")  # needs foundation_policy
-names.remove("sb3_quad.dagger.recurrent")  # needs sb3_contrib
-names.remove("sb3_quad.recurrent.raptor_policy")  # needs sb3_contrib
 for name in names: importlib.import_module(name)
 configs = importlib.resources.files("sb3_quad.zoo_configs")
 print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs.joinpath("dagger.yml").read_text()]))

@@ -27,7 +27,7 @@ class ExpertMixin:
 
     def expert_state(self) -> Arrays:
         """What an expert with a state, such as a recurrent policy, carries on, which no zip holds."""
-        return {} if self._labeller is None else self._labeller.memory()
+        return {} if self._labeller is None else self._labeller.state()
 
     def restore_expert_state(self, state: Arrays) -> None:
         """Go back to an :meth:`expert_state`; the model needs its expert and environment.

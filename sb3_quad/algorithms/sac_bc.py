@@ -263,10 +263,8 @@ class SACBC(ExpertMixin, SAC):
         buffer = self.expert_buffer if self.expert_flies and self.expert_buffer is not None else replay_buffer
         if self._labels is not None:
             following = self._ask(new_obs, dones)
-            if isinstance(
-                buffer, ExpertReplayBuffer
-            ):  # of an episode that has ended, the next state is not there to be asked about
-                buffer.label(self._labels, following, ~dones)
+            if isinstance(buffer, ExpertReplayBuffer):
+                buffer.label(self._labels, following, ~dones)  # the expert cannot see the state in which an episode has ended
             self._labels = following
         super()._store_transition(buffer, buffer_action, new_obs, reward, dones, infos)
         if not self._needs_labels:

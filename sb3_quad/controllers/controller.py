@@ -142,7 +142,7 @@ class Controller:
         actions, self._state, *_ = self.source.predict(observation, deterministic=self._deterministic, **before)
         return actions
 
-    def memory(self) -> Arrays:
+    def state(self) -> Arrays:
         """The state that ``predict`` is given next, as :meth:`restore` takes it."""
         if self._state is None:
             return {}
@@ -150,15 +150,15 @@ class Controller:
             return {UNSAVED: np.array(self.name)}
         return {str(number): part.copy() for number, part in enumerate(self._state)}
 
-    def restore(self, memory: Arrays) -> None:
-        """Go back to a :meth:`memory`.
+    def restore(self, state: Arrays) -> None:
+        """Go back to a :meth:`state`.
 
         :raises ExpertError: it could not be saved.
         """
-        if UNSAVED in memory:
-            name = memory[UNSAVED]
+        if UNSAVED in state:
+            name = state[UNSAVED]
             raise ExpertError(f"{self.kind} {name}: its state was no tuple of arrays, so no snapshot holds it; begin anew")
-        self._state = tuple(memory[str(number)] for number in range(len(memory))) if memory else None
+        self._state = tuple(state[str(number)] for number in range(len(state))) if state else None
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
