@@ -10,10 +10,32 @@ Never imported by the rest of this package: rl_zoo3 replaces Gymnasium's ``TimeL
 :raises MissingExtra: rl_zoo3 is not installed (the extra ``zoo``).
 """
 
+import importlib
+import sys
+
 from sb3_quad.base.imports import require
 
 require("rl_zoo3", "zoo", "sb3_quad.zoo")
 
-from sb3_quad.zoo.registration import register  # noqa: E402
+from rl_zoo3 import ALGOS  # noqa: E402
 
-register()
+from sb3_quad.training.algorithms import get_algorithm  # noqa: E402
+from sb3_quad.training.config import SETTINGS  # noqa: E402
+from sb3_quad.zoo.search_spaces import OWN_ALGORITHMS, register_space  # noqa: E402
+
+
+def _register() -> None:
+    for algo in OWN_ALGORITHMS:
+        ALGOS[algo] = get_algorithm(algo)
+        register_space(algo, next(iter(SETTINGS.read(f"{algo}.yml")[0].values())))
+    # rl_zoo3's record_video imports exp_manager, which imports custom_envs, which may import this: too early for a subclass
+    # of what exp_manager is about to define, and none is needed there.
+    if hasattr(importlib.import_module("rl_zoo3.exp_manager"), "ExperimentManager"):
+        from sb3_quad.zoo.manager import QuadExperimentManager
+
+        for name, module in list(sys.modules.items()):
+            if name.startswith("rl_zoo3.") and hasattr(module, "ExperimentManager"):
+                module.ExperimentManager = QuadExperimentManager  # type: ignore[attr-defined]
+
+
+_register()

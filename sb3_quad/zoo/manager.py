@@ -22,7 +22,7 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.training.algorithms import takes_expert
 from sb3_quad.training.config import SETTINGS, VEC_ENVS
 from sb3_quad.training.transfer import transfer_policy
-from sb3_quad.zoo.registration import OWN_ALGORITHMS, Settings, register_space, to_keywords
+from sb3_quad.zoo.search_spaces import OWN_ALGORITHMS, Settings, register_space, to_keywords
 
 
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):

@@ -1,7 +1,5 @@
-"""What rl_zoo3 looks up by name: algorithms, search spaces, and the class that sets a training up."""
+"""Our algorithms' settings as rl_zoo3 wants them: keywords of a constructor, and what a search varies."""
 
-import importlib
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,28 +7,12 @@ from rl_zoo3 import ALGOS
 from rl_zoo3.hyperparams_opt import HYPERPARAMS_CONVERTER, HYPERPARAMS_SAMPLER
 
 from sb3_quad.base.literals import parse_mapping
-from sb3_quad.training.algorithms import constructor_parameters, get_algorithm
-from sb3_quad.training.config import SETTINGS
+from sb3_quad.training.algorithms import constructor_parameters
 from sb3_quad.training.values import convert
 from sb3_quad.tuning.space import load_space
 
 Settings = dict[str, Any]
 OWN_ALGORITHMS = ("dagger", "ppo_bc", "sac_bc")
-
-
-def register() -> None:
-    """Make them known; calling it again changes nothing."""
-    for name in OWN_ALGORITHMS:
-        ALGOS[name] = get_algorithm(name)
-        register_space(name, next(iter(SETTINGS.read(f"{name}.yml")[0].values())))
-    # rl_zoo3's record_video imports exp_manager, which imports custom_envs, which may import this: too early for a
-    # subclass of what it is about to define, and none is needed there.
-    if hasattr(importlib.import_module("rl_zoo3.exp_manager"), "ExperimentManager"):
-        from sb3_quad.zoo.manager import QuadExperimentManager
-
-        for name, module in list(sys.modules.items()):
-            if name.startswith("rl_zoo3.") and hasattr(module, "ExperimentManager"):
-                module.ExperimentManager = QuadExperimentManager  # type: ignore[attr-defined]
 
 
 def register_space(algo: str, settings: Mapping[str, Any]) -> None:
