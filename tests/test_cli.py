@@ -1,4 +1,4 @@
-"""The command line: one line and code 2 on bad input, nothing lost on interruption, a run that resumes as if nothing was."""
+"""The command line: light until a command runs, nothing lost on interruption, a run that resumes as if nothing was."""
 
 import json
 import os
@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -86,87 +85,6 @@ def one_line_of_error(capsys) -> str:
     return lines[0]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["trian"], "did you mean 'train'"),
-        (["train", "--sede", "1"], "did you mean '--seed'"),
-        (["train", "--algo", "dager"], "did you mean 'dagger'"),
-        (["train", "--env", "QuadTargetTraking-v0"], "did you mean 'QuadTargetTracking-v0'"),
-        (["train", "--algo", "dagger", "--n-envs", "0"], "at least 1"),
-        (["train", "--algo", "dagger", "-n", "many"], "no whole number"),
-        (["train", "--algo", "dagger", "--hyperparams", "n_setps:3"], "did you mean 'n_steps'"),
-        (["train", "--algo", "dagger", "--hyperparams", "n_steps"], "key:value"),
-        (["train", "--algo", "dagger", "--hyperparams", "batch_size:0"], "batch_size is 0"),
-        (["train", "--algo", "dagger", "--env-kwargs", "noise:-1"], "noise -1"),
-        (["train", "--algo", "dagger", "--env-kwargs", "vehicle:itn"], "did you mean 'itm'"),
-        (["train", "--algo", "dagger", "--env-kwargs", "task_kwargs:{'target_distanse':3}"], "did you mean 'target_distance'"),
-        (["train", "--algo", "dagger", "--vec-env", "bath"], "'batch', 'dummy' or 'subproc'"),
-        (["train", "--algo", "dagger", "--expert", "pit"], "unknown expert"),
-        (["train", "--algo", "dagger", "--conf-file", "thesis/dager.yml"], "did you mean 'thesis/dagger.yml'"),
-        (["train", "--algo", "dagger", "-i", "missing.zip"], "missing.zip: no such file"),
-        (["train", "--algo", "dagger", "--device", "cuda"], "device cuda: PyTorch finds no CUDA"),
-        (["train", "--device", "cuda:1"], "device cuda:1"),
-        (["train", "--algo", "dagger", "--seed", str(2**40)], "seed"),
-        (["train", "--algo", "dagger", "--gym-packages", "no_such_package"], "no_such_package"),
-        (["train", "--algo", "dagger", "--num-threads", "0"], "at least 1"),
-        (["train", "--resume", "no_such_folder"], "no such folder"),
-        (["train", "--resume", ".", "--seed", "1"], "leave --seed away"),
-        (["benchmark", "--sizes", "0"], "at least 1"),
-    ],
-)
-def test_bad_input_is_one_line_and_code_2(arguments, message, capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert main(arguments) == 2
-    assert message in one_line_of_error(capsys)
-    assert not any(tmp_path.rglob("*.zip"))
-
-
-def test_a_log_folder_that_cannot_be_written(capsys, tmp_path):
-    (tmp_path / "file").write_text("")
-    assert main(["train", "--algo", "dagger", "-f", str(tmp_path / "file")]) == 2
-    assert "cannot be written" in one_line_of_error(capsys)
-
-
-@pytest.mark.parametrize("what", [[], ["--algo", "dagger"]])
-def test_a_tensorboard_folder_that_cannot_be_written_leaves_no_run(what, capsys, tmp_path):
-    (tmp_path / "file").write_text("")
-    assert main(["train", *what, "-f", str(tmp_path / "logs"), "-tb", str(tmp_path / "file" / "tb")]) == 2
-    assert "TensorBoard folder" in one_line_of_error(capsys)
-    assert not (tmp_path / "logs").exists()
-
-
-def damaged_zip(tmp_path, kind):
-    path = tmp_path / "agent.zip"
-    PPO("MlpPolicy", "Pendulum-v1", n_steps=8, batch_size=8, device="cpu").save(path)
-    content = path.read_bytes()
-    if kind == "half":
-        path.write_bytes(content[: len(content) // 2])
-    elif kind == "other":
-        with zipfile.ZipFile(path, "w") as archive:
-            archive.writestr("readme", "no model")
-    elif kind == "text":
-        path.write_text("no zip at all")
-    return path
-
-
-@pytest.mark.parametrize(
-    ("kind", "message"),
-    [
-        ("half", "not a complete SB3 zip"),
-        ("other", "not a complete SB3 zip"),
-        ("text", "not a complete SB3 zip"),
-        ("of another space", "layer mlp_extractor.policy_net.0.weight has shape (64, 3), here it is (8, 18)"),
-    ],
-)
-def test_agents_that_do_not_fit_are_refused(kind, message, capsys, tmp_path, settings_file):
-    path = damaged_zip(tmp_path, kind)
-    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "-i", str(path)]
-    assert main(arguments) == 2
-    assert message in one_line_of_error(capsys)
-    assert not (tmp_path / "logs").exists()
-
-
 def test_the_version(capsys):
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"sb3_quad {sb3_quad.__version__}\n"
@@ -174,15 +92,14 @@ def test_the_version(capsys):
 
 def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():
     code = (
-        "import sys\nfrom sb3_quad.cli import main\n"
-        "codes = [main(a) for a in (['--help'], ['train', '--help'], ['benchmark', '--help'])]\n"
+        "import sys\nfrom sb3_quad.cli.app import COMMANDS, main\n"
+        "codes = [main(['--help']), *(main([name, '--help']) for name in COMMANDS)]\n"
         "codes.append(main(['train', '-i', 'missing.zip']) != 2)\n"
-        "sys.exit(any(codes) or 'torch' in sys.modules or 'numba' in sys.modules)"
+        "sys.exit(any(codes) or bool({'torch', 'numba', 'matplotlib', 'rich'} & sys.modules.keys()))"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
-    assert result.stdout.count("examples:") == 3
-    assert "exit codes:" in result.stdout
+    assert result.stdout.count("examples:") == 1 + len(COMMANDS) and "exit codes:" in result.stdout
 
 
 def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
@@ -207,14 +124,14 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
         assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
 
 
-@pytest.mark.parametrize("vec_env", ["batch", "dummy"])
+@pytest.mark.parametrize("vec_env", ["batch", pytest.param("dummy", marks=pytest.mark.slow)])
 def test_episodes_end_at_all_ages_from_the_first_rollout_on(tmp_path, vec_env):
     result = train(job(tmp_path, vec_env=vec_env, n_timesteps=400), report=lambda line: None)  # 50 steps of at most 60
     assert load_results(str(result.run.path)).l.tolist() == [8, 15, 23, 30, 38, 45]
     assert [info["l"] for info in result.model.ep_info_buffer] == [8, 15, 23, 30, 38, 45]
 
 
-@pytest.mark.parametrize(("n_timesteps", "last"), [(400, 1e-3), (1000, 1e-3 / 3), (1200, 1e-3 / 3)])
+@pytest.mark.parametrize(("n_timesteps", "last"), [(400, 1e-3), (1000, 1e-3 / 3)])
 def test_the_last_update_learns(tmp_path, n_timesteps, last):
     model = train(job(tmp_path, n_timesteps=n_timesteps), report=lambda line: None).model
     assert model.logger.name_to_value["train/learning_rate"] == pytest.approx(last)
@@ -256,6 +173,7 @@ def test_other_environments_train_too(tmp_path):
     assert result.run.best_model.is_file()
 
 
+@pytest.mark.slow
 def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
     """In a process of its own, as a shell would send it; SIGTERM is sent by the tests of resumption."""
     arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path), "-n", "1e9"]
@@ -268,11 +186,10 @@ def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
         env={**os.environ, "OMP_NUM_THREADS": "1"},
     )
     log = tmp_path / "dagger" / f"{ENV}_1" / "0.monitor.csv"
-    end = time.monotonic() + 120
-    while process.poll() is None and time.monotonic() < end and (not log.is_file() or log.read_text().count("\n") < 10):
+    while process.poll() is None and (not log.is_file() or log.read_text().count("\n") < 10):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    output, errors = process.communicate(timeout=60)
+    output, errors = process.communicate()
     assert process.returncode == 130, errors
     assert "SIGINT" in output
     assert "Traceback" not in errors
@@ -281,8 +198,7 @@ def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
     assert PPO.load(saved).num_timesteps > 0
 
 
-@pytest.mark.parametrize("algo", ["dagger", "ppo", "ppo_bc"])
-@pytest.mark.parametrize("after", [8, 900, 1000])
+@pytest.mark.parametrize(("algo", "after"), [("dagger", 8), ("dagger", 900), ("ppo", 1000), ("ppo_bc", 900)])
 def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after):
     interruption = {"test_cli.Interrupt": {"after": after}}
     Interrupt.sent = True
@@ -340,34 +256,23 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     assert run.path.name in output.out and f"{run.path.name} flies heavy, the reference flies itm" in output.err
     assert main(["publish", str(run.path), "--name", "mine", "--episodes", "2"]) == 0
     card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
-    for part in (
+    facts = (
         "vehicle `heavy`",
         "scaled by a mean and std of its own",
         arguments["commit"],
         arguments["versions"],
         "| seed | 0 |",
-    ):
-        assert part in card
-    assert run.command.read_text().strip() in card
+    )
+    assert all(part in card for part in (*facts, run.command.read_text().strip()))
     assert agent_settings("mine.zip")[0] == agent_settings("mailed_best_model.zip")[0]
     assert main(["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]) == 2
     assert f"{run.best_model}: layer" in capsys.readouterr().err  # of other sizes
 
 
-def test_only_interrupted_runs_resume(tmp_path, capsys):
-    result = train(job(tmp_path, n_timesteps=400), report=lambda line: None)
-    assert main(["train", "--resume", str(result.run.path)]) == 2
-    assert f"-i {result.run.model}" in one_line_of_error(capsys)
-
-
-@pytest.mark.parametrize("name", ["resume_state", "config"])
-def test_damaged_run_folders_are_refused(tmp_path, capsys, name):
-    Interrupt.sent = False
-    run = train(job(tmp_path, callback={"test_cli.Interrupt": {"after": 500}}), report=lambda line: None).run
-    path = getattr(run, name)
-    path.write_bytes(path.read_bytes()[:100].replace(b": ", b"; "))
-    assert main(["train", "--resume", str(run.path)]) == 2
-    assert path.name in one_line_of_error(capsys)
+def test_only_interrupted_runs_resume(trained_runs, capsys):
+    run = trained_runs("dagger")
+    assert main(["train", "--resume", str(run)]) == 2
+    assert f"-i {run / run.name.removesuffix('_1')}.zip" in one_line_of_error(capsys)
 
 
 @pytest.mark.parametrize("algo", ["dagger", "ppo"])
@@ -417,16 +322,11 @@ def test_the_benchmark_says_where_the_time_of_a_training_goes(tmp_path, capsys):
     assert main(arguments) == 0
     content = json.loads((tmp_path / "out.json").read_text())
     assert [entry["name"] for entry in content["results"]][::3] == ["dagger, whole loop", "ppo_bc, whole loop"]
-    for algorithm, parts in content["seconds"].items():
-        assert all(seconds > 0.0 for seconds in parts.values()), (algorithm, parts)
-        whole = sum(parts.values())
-        rates = next(entry["rates"] for entry in content["results"] if entry["name"] == f"{algorithm}, whole loop")
-        assert whole == pytest.approx(sum(40 / rate for rate in rates) / len(rates), rel=0.2)
+    assert all(seconds > 0.0 for parts in content["seconds"].values() for seconds in parts.values())
     assert "rollout: the rest" in capsys.readouterr().out
 
 
-def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with(monkeypatch):
-    monkeypatch.setattr(closing, "FRESH_EPISODES", 4)
+def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with():
     scaling = {"noise": 0.0, "observation_mean": [5.0] * 18, "observation_std": [2.0] * 18}
     config = build_config("ppo", ENV, {"n_timesteps": 1, "env_kwargs": {**scaling, "max_episode_steps": 2}})
     seen = []

@@ -249,7 +249,7 @@ def test_ours_shows_its_runs(session, capsys):
 def test_the_plain_command_knows_us_by_custom_envs(tmp_path):
     (tmp_path / "custom_envs.py").write_text("import sb3_quad.zoo\n")
     code = "import sys; sys.argv = ['rl_zoo3', 'train', '--help']; from rl_zoo3.cli import main; main()"
-    assert "dagger,ppo_bc,recurrent_dagger" in "".join(run("-c", code, cwd=tmp_path).split())
+    assert "dagger,ppo_bc,sac_bc" in "".join(run("-c", code, cwd=tmp_path).split())
 
 
 def test_without_rl_zoo3_the_bridge_says_what_is_missing(tmp_path):

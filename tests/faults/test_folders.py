@@ -4,6 +4,7 @@ import csv
 import errno
 import os
 import platform
+import shlex
 import signal
 import subprocess
 import sys
@@ -17,8 +18,8 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
-from sb3_quad.cli.commands import publish
 from sb3_quad.evaluation.results import load_results
+from sb3_quad.report import card
 from sb3_quad.tuning.study import LEASE, OWNER, dead_trials, open_study
 
 
@@ -78,24 +79,14 @@ class KilledAtSecond(BaseCallback):
         return True
 
 
-@pytest.mark.timeout(200)
+@pytest.mark.slow
 def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     settings = "n_timesteps: 32, n_steps: 32, batch_size: 32, callback: test_folders.KilledAtSecond"
     (tmp_path / "small.yml").write_text(f"Pendulum-v1: {{{settings}}}\n")
     (tmp_path / "space.yml").write_text("gamma: {low: 0.5, high: 1.0}\n")
     command = ["tune", "--algo", "ppo", "--env", "Pendulum-v1", "--conf-file", "small.yml", "--search-space", "space.yml"]
-    command += [
-        "--eval-episodes",
-        "1",
-        "--n-evaluations",
-        "1",
-        "--no-progress",
-        "--storage",
-        "study.log",
-        "--sampler",
-        "random",
-    ]
+    command += shlex.split("--eval-episodes 1 --n-evaluations 1 --no-progress --storage study.log --sampler random")
     path = os.pathsep.join([str(Path(__file__).parents[2]), str(Path(__file__).parent)])
     environment = {**os.environ, "KILL": "yes", "PYTHONPATH": path}
     killed = subprocess.run([sys.executable, "-m", "sb3_quad.cli", *command], env=environment, check=False)
@@ -103,11 +94,8 @@ def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypa
     assert main([*command, "--max-total-trials", "2"]) == 0
     with (tmp_path / "logs/tune/ppo/Pendulum-v1_2/trials.csv").open(encoding="utf-8") as file:
         trials = list(csv.DictReader(file))
-    assert [(trial["state"], trial["error"]) for trial in trials] == [
-        ("COMPLETE", ""),
-        ("FAIL", "interrupted"),
-        ("COMPLETE", ""),
-    ]
+    ends = [(trial["state"], trial["error"]) for trial in trials]
+    assert ends == [("COMPLETE", ""), ("FAIL", "interrupted"), ("COMPLETE", "")]
     assert trials[2]["gamma"] == trials[1]["gamma"] != trials[0]["gamma"]
 
 
@@ -154,6 +142,6 @@ def test_publish_replaces_both_the_zip_and_its_card_or_neither(tmp_path, monkeyp
     assert main(["publish", "itm-imitation", *command]) == 0
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     assert len(before) == 2
-    monkeypatch.setattr(publish, "measure" if code == 130 else "write_card", fault)
+    monkeypatch.setattr(card, "measure" if code == 130 else "write_card", fault)
     assert main(["publish", "itm-recovery", *command, "--overwrite"]) == code
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
