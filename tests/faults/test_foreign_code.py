@@ -4,7 +4,6 @@ import base64
 import json
 import os
 import pickle
-import shutil
 import zipfile
 from pathlib import Path
 
@@ -28,7 +27,6 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 MARK = Path("foreign_code_ran")
 AGENT = pretrained("itm-imitation")
 COMMAND = f"echo > {MARK}"
-RUN = Path(__file__).parent.parent / "data" / "version_0_1" / "QuadTargetTracking-v0_1"
 
 
 class Calls:
@@ -109,7 +107,10 @@ def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
     ("command", "key"),
     [
         ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_kwargs"),
-        ("evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2", "policy_kwargs"),
+        pytest.param(
+            *("evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2", "policy_kwargs"),
+            marks=pytest.mark.slow,
+        ),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
         ("export foreign.zip --format torchscript", "observation_space"),
         ("publish foreign.zip --name mine", "policy_kwargs"),
@@ -129,11 +130,10 @@ def test_no_command_runs_what_a_zip_holds(command, key, capsys):
 
 
 @pytest.mark.parametrize("key", ["learning_rate", "policy_class", "clip_range", "anything"])
-def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, here):
-    shutil.copytree(RUN, "run")
-    zip_file = Path("run/QuadTargetTracking-v0.zip")
-    foreign_zip(key, zip_file, str(zip_file))
-    assert main(["train", "--resume", "run"]) == 2
+def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, dagger_run):
+    content = Path(foreign_zip(key, dagger_run / "QuadStateRecovery-v0.zip")).read_bytes()
+    np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=np.frombuffer(content, dtype=np.uint8))
+    assert main(["train", "--resume", str(dagger_run)]) == 2
     assert f"its {key} names posix.system, which may run anything" in capsys.readouterr().err
     assert not MARK.exists()
 
@@ -187,14 +187,15 @@ def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
 @pytest.mark.parametrize("way", ["a settings file", "a run folder"])
 def test_settings_call_only_classes_of_the_right_kind(key, entry, way, capsys):
     environment = "QuadTargetTracking-v0"
-    settings = {"n_timesteps": 400, "n_envs": 2, "n_steps": 100, "vec_env": "dummy", key: entry}
+    content = {"n_timesteps": 400, "n_envs": 2, "n_steps": 100, "vec_env": "dummy", key: entry}
+    file, how = Path("foreign.yml"), ["--conf-file", "foreign.yml", "--algo", "dagger"]
     if way == "a run folder":
-        shutil.copytree(RUN, "run")
-        file, content = Path(f"run/{environment}/config.yml"), settings
+        file, how = Path(f"run/{environment}/config.yml"), ["--resume", "run"]
+        file.parent.mkdir(parents=True)
+        (file.parent / "args.yml").write_text(f"{{algo: dagger, env: {environment}}}")
     else:
-        file, content = Path("foreign.yml"), {environment: settings}
+        content = {environment: content}
     file.write_text(json.dumps(content))  # which is YAML, too
-    how = ["--resume", "run"] if way == "a run folder" else ["--conf-file", "foreign.yml", "--algo", "dagger"]
     assert main(["train", *how]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"error: {file}: {key}: ")
