@@ -3,15 +3,16 @@
 import hashlib
 import json
 import math
+import os
+import platform
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from optuna import Trial
-from optuna.exceptions import OptunaError, UpdateFinishedTrialError
-from optuna.trial import FrozenTrial, TrialState
+from optuna import Study, Trial
+from optuna.exceptions import OptunaError, TrialPruned
+from optuna.trial import FrozenTrial
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
@@ -20,7 +21,7 @@ from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
-from sb3_quad.tuning.study import PRUNERS, SAMPLERS, ask, dead_trials, open_study, owned
+from sb3_quad.tuning.study import OWNER, PRUNERS, SAMPLERS, NumberedSampler, open_study, retry_dead_trials
 
 BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
@@ -61,10 +62,11 @@ class Search:
         if min(n_evaluations, job.eval_episodes) < 1 or n_startup_trials < 0:
             raise ConfigError("n_evaluations and eval_episodes must be at least 1, n_startup_trials at least 0")
         self.job, self.space, self.name, self.storage = job, space, name, storage
-        self.sampler, self.n_startup_trials, self.n_evaluations = sampler, n_startup_trials, n_evaluations
+        self.n_evaluations = n_evaluations
         wanted = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
         self.study, known = open_study(name, storage, "maximize", (BEGUN_WITH, wanted), space.start())
         self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
+        self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
         where = f"study {name} in {storage}"
         if not isinstance(known, dict):
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
@@ -84,19 +86,22 @@ class Search:
         :raises ConfigError: a storage that fails meanwhile.
         """
         most = math.inf if max_total_trials is None else max_total_trials
-        failures = 0
+        ended: list[FrozenTrial] = []
+
+        def is_over() -> bool:
+            return signals.received is not None or len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most
+
+        def after(study: Study, trial: FrozenTrial) -> None:
+            ended.append(trial)
+            after_each(trial)
+            check_hopeless(ended)
+            if is_over():
+                study.stop()
+
         try:
-            for number in range(n_trials):
-                self._free_dead_trials()
-                if signals.received is not None or len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
-                    break
-                trial = ask(self.study, self.sampler, self.job.seed, self.n_startup_trials)
-                self._train(trial)
-                ended = self.study.get_trials(deepcopy=False)[trial.number]
-                after_each(ended)
-                failures += ended.state.name == "FAIL" and signals.received is None
-                if failures == number + 1 == HOPELESS:
-                    raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {ended.user_attrs[ERROR]}")
+            retry_dead_trials(self.study)
+            if not is_over():
+                self.study.optimize(self._train, n_trials, catch=(Exception,), callbacks=[after])
         except (OSError, OptunaError) as error:
             raise ConfigError(f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})") from error
 
@@ -110,33 +115,22 @@ class Search:
         """The best trial that was finished, of any process; None if there is none."""
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
-    def _train(self, trial: Trial) -> None:
-        """Train as a trial says, and tell the study how it ended."""
-        state, value, error = "FAIL", None, INTERRUPTED
+    def _train(self, trial: Trial) -> float:
+        """Train as a trial says; its value. Whatever a choice of settings leads to, the next one may fare better."""
+        trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
         try:
-            with owned(trial):
-                state, value = self._outcome(trial)
-        except Exception as failure:  # whatever a choice of settings leads to, the next one may fare better
-            error = f"{type(failure).__name__}: {' '.join(str(failure).split())}"
-        finally:
-            self._tell(trial, state, value, error)
+            return self._value(trial)
+        except TrialPruned:
+            raise
+        except Exception as error:
+            trial.set_user_attr(ERROR, f"{type(error).__name__}: {one_line(error)}")
+            raise
+        except KeyboardInterrupt:
+            trial.set_user_attr(ERROR, INTERRUPTED)
+            self.study.enqueue_trial(trial.params)
+            raise TrainingError(INTERRUPTED) from None
 
-    def _free_dead_trials(self) -> None:
-        """Have the trials of processes that were killed tried again."""
-        for dead in dead_trials(self.study):
-            self._tell(Trial(self.study, dead._trial_id), "FAIL", None, INTERRUPTED)
-
-    def _tell(self, trial: Trial, state: str, value: float | None, error: str) -> None:
-        """Tell the study how a trial ended, unless one that took this process for dead did; if interrupted, try it again."""
-        with suppress(UpdateFinishedTrialError):
-            if state == "FAIL":
-                trial.set_user_attr(ERROR, error)
-            self.study.tell(trial, value, state=TrialState[state])
-            if state == "FAIL" and error == INTERRUPTED and trial.params:
-                self.study.enqueue_trial(trial.params)
-
-    def _outcome(self, trial: Trial) -> tuple[str, float | None]:
-        """Train as a trial says: its state, which is FAIL if it was interrupted, and its value if it is COMPLETE."""
+    def _value(self, trial: Trial) -> float:
         known, count = self.job.config, self.n_evaluations
         settings = self.space.suggest(trial)
         trial.set_user_attr(SETTINGS, json.dumps(settings))
@@ -164,14 +158,14 @@ class Search:
                 should_continue=should_continue,
             )
         if result.exit_code != 0:
-            return "FAIL", None
+            raise KeyboardInterrupt
         trial.set_user_attr(SUCCESS, evaluations[-1][0])
         trial.set_user_attr(REWARD, evaluations[-1][1])
         if result.model.num_timesteps < total:
-            return "PRUNED", None
+            raise TrialPruned
         if not math.isfinite(value()):
             raise TrainingError(f"the mean reward is {evaluations[-1][1]}")
-        return "COMPLETE", value()
+        return value()
 
     def _kind(self) -> dict[str, Any]:
         """What all trials of a study must share to be compared."""
@@ -206,6 +200,13 @@ def train_trial(
     with StopSignals() as signals:
         Search(job, space, name, storage, *study).run(1, most, signals, lambda trial: numbers.append(trial.number))
     return numbers[0] if numbers else None
+
+
+def check_hopeless(ended: Sequence[FrozenTrial]) -> None:
+    """:raises TrainingError: the first trials have all failed, not counting interrupted ones."""
+    failures = [trial for trial in ended if trial.state.name == "FAIL" and trial.user_attrs.get(ERROR) != INTERRUPTED]
+    if len(failures) == len(ended) == HOPELESS:
+        raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {failures[-1].user_attrs[ERROR]}")
 
 
 def score(success: float, reward: float, n_episodes: int) -> float:

@@ -22,7 +22,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError, WorkerDied
+from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
 from sb3_quad.cli.parser import Parser, add_common, given, natural, positive, seed, whole
@@ -88,14 +88,14 @@ def _share(options: argparse.Namespace, search: Any, signals: StopSignals, after
     :raises TrainingError: the first trials of all have failed.
     """
     from sb3_quad.executors import start_executor
-    from sb3_quad.tuning.search import ERROR, HOPELESS, train_trial
+    from sb3_quad.tuning.search import check_hopeless, train_trial
 
     if options.address is not None and options.storage is None:
         raise ConfigError("--address: workers elsewhere need a study that they see; name one with --storage")
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
     storage = str(search.storage) if "://" in str(search.storage) else str(Path(str(search.storage)).absolute())
     shared = search.job.model_copy(update={"log_folder": str(Path(search.job.log_folder).absolute())})
-    ended, failures, stopped = 0, 0, False
+    ended, stopped = list[Any](), False
     with start_executor(options.executor, options.workers, options.address) as executor:
         arguments = shared, search.space, search.name, storage, study, options.max_total_trials
         futures = {executor.submit(train_trial, *arguments) for _ in range(options.n_trials)}
@@ -107,13 +107,10 @@ def _share(options: argparse.Namespace, search: Any, signals: StopSignals, after
                 except WorkerDied as error:
                     print(f"a trial is lost, and tried again by whoever goes on: {error}", file=sys.stderr)
                     continue
-                if number is None:
-                    continue
-                trial = search.study.get_trials(deepcopy=False)[number]
-                after_each(trial)
-                ended, failures = ended + 1, failures + (trial.state.name == "FAIL")
-                if failures == ended == HOPELESS and not stopped:
-                    raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {trial.user_attrs[ERROR]}")
+                if number is not None:
+                    ended.append(search.study.get_trials(deepcopy=False)[number])
+                    after_each(ended[-1])
+                    check_hopeless(ended)
             if signals.received is not None and not stopped:
                 stopped = True
                 executor.stop()
@@ -164,12 +161,12 @@ def _line(search: Any, trial: Any) -> str:
 
 def _print_results(search: Any) -> None:
     """Print the best trials, the best agent on fresh episodes, and where everything is."""
-    from sb3_quad.tuning.results import BEST, PLOT, TRIALS, train_command, write_plot
+    from sb3_quad.tuning.results import BEST, PLOTS, TRIALS, train_command, write_plots
 
     if search.best is not None:
-        write_plot(search)
+        write_plots(search)
         _print_best(search, search.best)
-    written = [TRIALS] if search.best is None else [TRIALS, BEST, PLOT]
+    written = [TRIALS] if search.best is None else [TRIALS, BEST, *PLOTS]
     print(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
     print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
     if search.best is not None:
