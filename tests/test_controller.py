@@ -90,14 +90,6 @@ def test_an_sb3_model_and_its_policy():
         np.testing.assert_array_equal(Controller.for_env(expert, env).labels(observation), expected)
 
 
-def test_a_function_sees_what_the_policy_sees():
-    env = VecNormalize(make_vec_env("Pendulum-v1", 3, seed=0))
-    observation = env.reset()
-    seen = []
-    Controller.for_env(lambda given: seen.append(given) or given[:, :1], env).labels(observation)
-    np.testing.assert_array_equal(seen[0], observation)
-
-
 def test_labels_are_clipped_to_the_action_space():
     env = make_vec_env("Pendulum-v1", 2, seed=0)
     labels = Controller.for_env(lambda observation: np.array([[9.0], [-9.0]]), env).labels(env.reset())

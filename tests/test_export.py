@@ -254,14 +254,6 @@ def test_a_header_that_does_not_compile_is_refused(zips, monkeypatch):
         export_policy(zips / "tanh.zip", "c", n_observations=100)
 
 
-def test_without_a_compiler_a_header_is_refused(zips, tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert main(["export", str(zips / "tanh.zip"), "--format", "c", "-o", str(tmp_path / "agent.h")]) == 2
-    error = capsys.readouterr().err
-    assert "install gcc or clang" in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())
-
-
 def test_an_onnx_model_says_what_it_takes_and_gives(zips):
     onnx = pytest.importorskip("onnx")
     exported = export_policy(zips / "tanh.zip", "onnx", "speeds", n_observations=100)
@@ -338,13 +330,9 @@ def test_a_policy_that_cannot_fly_so_is_refused(make, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["nowhere.zip", "--format", "c"], "no such file"),
-        (["agent.zip", "--format", "onyx"], "did you mean 'onnx'"),
-        (["agent.zip"], "--format"),
         (["agent.zip", "--format", "c"], "--overwrite"),
         (["agent.zip", "--format", "c", "--overwrite", "-o", "agent.zip"], "the model itself"),
         (["agent.zip", "--format", "c", "-o", "b.h", "--name", "1st"], "C identifier"),
-        (["agent.zip", "--format", "c", "-o", "b.h", "--output", "speed"], "did you mean 'speeds'"),
         (["agent.zip", "--format", "onnx"], r"pip install '\.\[export\]'"),
     ],
 )

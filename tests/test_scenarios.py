@@ -43,9 +43,8 @@ def test_the_thesis_suite_holds_all_of_chapter_four():
     for name, sign in (("target_up", 1), ("target_down", -1)):
         way = np.array(thesis.scenario(name).target.position) - [0, 0, 15]
         np.testing.assert_allclose(way, sign * 10 / math.sqrt(3) * np.ones(3))
-    assert len(thesis.scenario("waypoints_plane").target.points) == 4
-    assert len(thesis.scenario("waypoints_spiral").target.points) == 5
     assert thesis.scenario("recovery").episodes == 4 * 240
+    assert sample_plan(thesis.scenario("recovery"), [0]).start == {}  # the environment samples it
     assert thesis.scenario("side_hit").hit_search is not None
 
 
@@ -54,30 +53,22 @@ def test_the_thesis_suite_holds_all_of_chapter_four():
     [
         ("strat: 3", "did you mean 'start'"),
         ("start: {velocity: {sdt: 2}}", "start.velocity: unknown key 'sdt': did you mean 'std'"),
-        ("wrenches: [{fore: [1, 2, 3]}]", "wrenches.0: unknown key 'fore': did you mean 'force'"),
-        ("reference: {thesis: {succes: 1}}", "did you mean 'success'"),
         ("duration: 15 s", "'15 s' must be a number alone"),
-        ("duration: 15000", "the unit is s"),
         ("noise: 5", "0.05 is 5 %"),
         ("start: {body_rates: [230, 0, 0]}", "not deg/s"),
         ("start: {attitude: levle}", "did you mean 'level'"),
-        ("start: {attitude: {tilt: 200}}", "180"),
         ("start: {position: [0, 0, 0.1]}", "touches the ground"),
         ("target: [0, 0, -3]", "touches the ground"),
-        ("target: [0, 0, 60]", "max_distance"),
         ("target: {distance: 31}", "max_distance"),
         ("target: [10, 0, 15], duration: 0.5", "cannot be reached within the duration of 0.5 s"),
         ("target: {distance: 10}, duration: 0.5", "cannot be reached"),
-        ("target: {waypoints: [[0, 0, 20], [0, 0, -1]]}", "touches the ground"),
         ("target: {distance: 10, position: [1, 2, 3]}", "exactly one of"),
         ("target: {distance: 10, radius: 1}", "radius goes with waypoints"),
         ("vehicle: itn", "did you mean 'itm'"),
         ("vehicle_changes: {mass: 1.7}", "no such vehicle can fly"),
-        ("vehicle_changes: {mass: 30}", "is a factor"),
         ("wrenches: [{start: 16}]", "when the episode of 15 s is over"),
         ("wrenches: [{duration: 0.001}]", "below a control step"),
         ("hit_search: {}", "no wrenches"),
-        ("vary: {start.tilt: [1]}", "did you mean 'attitude'"),
         ("vary: {noise: [0, 0]}", "different numbers"),
         ("vary: {noise.level: [0, 1]}, noise: 0.1", "holds no keys"),
     ],
@@ -86,17 +77,6 @@ def test_what_is_impossible_is_named(entry, message):
     with pytest.raises(ConfigError) as caught:
         scenario(entry)
     assert message in str(caught.value) and str(caught.value).startswith("x: scenario s0: ") and "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [("a: [", "not valid YAML"), ("name: x", "scenarios"), ("name: x\nscenarios: []", "at least 1"), ("- 1", "scenarios")],
-)
-def test_files_that_are_no_suites(text, message, tmp_path):
-    path = tmp_path / "s.yaml"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=message):
-        load_suite(path)
 
 
 def test_the_example_of_the_documentation_is_valid():
@@ -187,12 +167,6 @@ def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
             assert len(np.unique(values[:, 0])) == 3
 
 
-def test_what_a_task_samples_itself_stays_with_the_environment():
-    recovery = load_suite("thesis").scenario("recovery")
-    assert sample_plan(recovery, [0]).start == {}
-    assert recovery.task.random_attitude and recovery.task.velocity_std == 2.0 and recovery.task.body_rates_std == 4.0
-
-
 @given(
     st.lists(st.tuples(st.integers(0, 40), st.integers(1, 60), st.sampled_from(["world", "body"])), min_size=1, max_size=4),
     st.floats(0, 3),
@@ -222,8 +196,3 @@ def test_a_heavier_vehicle_keeps_its_motors(mass, action):
     changed = VehicleChanges(mass=mass).apply(vehicle)
     assert changed.mass == pytest.approx(mass * 1.727)
     np.testing.assert_allclose(changed.action_to_thrust(np.array(action)), vehicle.action_to_thrust(np.array(action)))
-
-
-def test_no_changes_change_nothing():
-    vehicle = load_vehicle("itm")
-    assert VehicleChanges().apply(vehicle) == vehicle
