@@ -42,11 +42,12 @@ def import_packages(packages: Iterable[str], where: str) -> None:
 def require(module: str, extra: str, what: str) -> Any:
     """The module, imported.
 
-    :param extra: of this package, which brings it.
+    :param extra: of this package, which brings it; empty: none does.
     :param what: needs it, for the message.
     :raises MissingExtra: it cannot be imported; the message says what to install.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise MissingExtra(f"{what} needs {module} ({error}): pip install '.[{extra}]' from a clone of sb3_quad") from None
+        install = f"'.[{extra}]' from a clone of sb3_quad" if extra else module.replace("_", "-")
+        raise MissingExtra(f"{what} needs {module} ({error}): pip install {install}") from None

@@ -95,12 +95,11 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     """The model in an SB3 ``.zip``, of any algorithm of Stable-Baselines3 (and of this package), ready for ``predict``.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown family, or with parameters
-        that are not finite; a file that may run code of its own. :class:`MissingExtra`: a recurrent one, without sb3-contrib.
+        that are not finite; a file that may run code of its own. :class:`MissingExtra`: a recurrent one, and no sb3-contrib.
     """
     algorithm = saved_algorithm(path)
     name = _STOCK.get(algorithm, algorithm)
-    recurrent = name == "RecurrentPPO"
-    library = require("sb3_contrib", "recurrent", f"model {path}") if recurrent else stable_baselines3
+    library = require("sb3_contrib", "", f"model {path}") if name == "RecurrentPPO" else stable_baselines3
     stock: type[BaseAlgorithm] = getattr(library, name)
     try:
         model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
