@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 import torch as th
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 from torch import nn
@@ -36,6 +36,7 @@ def cloning(net, x, labels, index):
     return [th.tensor(terms[losses.CLONING] / len(index)), *(parameter.grad.clone() for parameter in net.parameters())]
 
 
+@settings(max_examples=settings().max_examples // 2)
 @given(
     widths=st.lists(st.integers(1, 70), min_size=2, max_size=5),
     activation=st.sampled_from([*ACTIVATIONS]),
@@ -159,10 +160,10 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
 )
 def test_a_training_is_the_one_by_autograd(monkeypatch, algorithm, module, keywords):
     def train():
-        sizes = {"n_steps": 100, "batch_size": 400, "n_epochs": 3, "learning_rate": 1e-3}
+        sizes = {"n_steps": 50, "batch_size": 400, "n_epochs": 3, "learning_rate": 1e-3}
         env, policy_kwargs = QuadcopterVecEnv(16, seed=0), {"log_std_init": -1.0}
         model = algorithm("MlpPolicy", env, expert=GeometricExpert(), policy_kwargs=policy_kwargs, seed=0, **sizes, **keywords)
-        model.learn(3200)
+        model.learn(1600)
         logged = {name: value for name, value in model.logger.name_to_value.items() if name.startswith("train/")}
         return logged, [parameter.detach() for parameter in model.policy.parameters()]
 

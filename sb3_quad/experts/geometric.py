@@ -1,7 +1,6 @@
 """A geometric controller for large angles: it recovers from nearly every attitude, spin and fall, and flies to targets."""
 
 import math
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,14 +29,19 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
     upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
     limits in hover thrusts.
     """
-    least, most = vehicle.thrust_limits
-    able = Authority(vehicle)
-    derived = _derived(float(able.accelerations[:2].min()), able.command_lag, vehicle.gravity, least, most)
-    return GeometricGains.model_validate({name: float(value) for name, value in derived.items()})
+    derived = _derived_gains(vehicle.parameters()[:, None], vehicle.control_step)
+    return GeometricGains.model_validate({name: float(value[0]) for name, value in derived.items()})
 
 
-def _derived(turn: Any, lag: Any, gravity: Any, least: Any, most: Any) -> dict[str, Any]:
-    """The gains of :func:`derived_gains` by name, of one vehicle or of arrays of them."""
+def _command_lag(v: FloatArray, control_step: float) -> FloatArray:
+    return np.asarray((v[P.delay] + 0.5) * control_step + 1.0 / v[P.motor_gain])
+
+
+def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:
+    """The gains of :func:`derived_gains` by name, (n,) each, for the parameters of n vehicles."""
+    moments = np.abs(v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)).sum(axis=1) * v[P.thrust_half_range]
+    turn, lag, gravity = (moments / v[[P.ixx, P.iyy]]).min(axis=0), _command_lag(v, control_step), v[P.gravity]
+    least, most = ((v[P.thrust_middle] + sign * v[P.thrust_half_range]) / v[P.hover_thrust] for sign in (-1.0, 1.0))
     rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
     sideways = np.sqrt(np.maximum(most, 1.01) ** 2 - 1.0)  # a tired vehicle may not even hover
     upwards = gravity * (np.maximum(most, 1.01) - 1.0)
@@ -62,20 +66,12 @@ class _TrueConstants:
     """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed."""
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
-        self._control_step = vehicle.control_step
-        nominal = vehicle.parameters()[:, None]
-        self._seen = np.empty(0)
-        self._scale = gains.values()[:, None] / self._gains(nominal)
+        self._control_step, self._seen = vehicle.control_step, np.empty(0)
+        self._scale = gains.values()[:, None] / self._gains(vehicle.parameters()[:, None])
         self._scale[G.yaw_rate] *= _TOLD_YAW
 
-    def _lag(self, v: FloatArray) -> FloatArray:
-        return np.asarray((v[P.delay] + 0.5) * self._control_step + 1.0 / v[P.motor_gain])
-
     def _gains(self, v: FloatArray) -> FloatArray:
-        moments = np.abs(v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)).sum(axis=1) * v[P.thrust_half_range]
-        limits = ((v[P.thrust_middle] + sign * v[P.thrust_half_range]) / v[P.hover_thrust] for sign in (-1.0, 1.0))
-        turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
-        return np.stack([*_derived(turn, self._lag(v), v[P.gravity], *limits).values()])
+        return np.stack([*_derived_gains(v, self._control_step).values()])
 
     def constants(self, vehicles: FloatArray) -> tuple[FloatArray, ...]:
         """Gains (gains, n), body (6, n), inverses of mixers (n, 4, 4) and thrust ranges (2, n)."""
@@ -88,7 +84,7 @@ class _TrueConstants:
             v = self._seen[:, new] = vehicles[:, new]
             gains, body, inverses, ranges = self._all
             gains[:, new] = self._scale * self._gains(v)
-            body[:, new] = np.stack([v[P.mass], v[P.gravity], v[P.ixx], v[P.iyy], v[P.izz], self._lag(v)])
+            body[:, new] = *v[[P.mass, P.gravity, P.ixx, P.iyy, P.izz]], _command_lag(v, self._control_step)
             arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
             inverses[new] = np.linalg.inv(np.concatenate([np.ones((1, *arms.shape[1:])), arms]).transpose(2, 0, 1))
             ranges[:, new] = v[P.thrust_middle] - v[P.thrust_half_range], v[P.thrust_middle] + v[P.thrust_half_range]
@@ -133,8 +129,7 @@ class GeometricExpert(Expert):
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
         body = np.array([v.mass, v.gravity, *v.inertia, Authority(v).command_lag])
-        designed = self.gains.values(), body, np.array(v.thrust_range)
-        self._constants = designed[0][:, None], body[:, None], v.mixer_inverse[None], designed[2][:, None]
+        self._constants = self.gains.values()[:, None], body[:, None], v.mixer_inverse[None], np.array(v.thrust_range)[:, None]
         self._told = _TrueConstants(v, self.gains) if told else None
 
     def actions(self, state: QuadcopterState) -> Actions:
