@@ -1,7 +1,6 @@
 """Cameras, and where to put them so that everything is in the picture. The world frame has z up; lengths are in m."""
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +12,8 @@ SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that near and far ar
 CHASE_SLOPE = math.tan(math.radians(27.0))
 ELEVATIONS = math.radians(-45.0), math.radians(52.0)  # of a chasing camera
 ELEVATION_AT_TARGET = math.radians(-8.0)
-DOWN = math.radians(5.0)  # how far cameras of films look down
+DOWN = math.radians(5.0)  # how far a camera that frames points looks down
 LOWEST = (-math.inf, -math.inf, 0.3)  # where a camera is at least, m
-SMOOTHING = 0.35  # standard deviation of a camera's smoothing over time, s
 
 
 class Lens(NamedTuple):
@@ -66,28 +64,12 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
     :param forward: where it looks, a unit vector, (3,), not vertical.
     """
     axes, slopes = _axes(forward), lens.slopes
-    before, after = _needed(points @ axes.T, slopes, margin)
+    local = points @ axes.T
+    across, room = local[:, 1:], margin - slopes * local[:, :1]
+    # How far it must see, in the plane through the origin, to the left and down, and to the right and up.
+    before, after = (room - across).max(axis=0), (room + across).max(axis=0)
     distance = float((0.5 * (before + after) / slopes).max())
     return Camera(np.maximum(np.array([-distance, *(0.5 * (after - before))]) @ axes, LOWEST), axes, lens)
-
-
-def following_cameras(
-    points: Sequence[FloatArray], frame_seconds: float, margin: float, forward: FloatArray, lens: Lens
-) -> list[Camera]:
-    """As :func:`framing_camera`, for each frame of a film one that has that frame's points in its picture and moves smoothly.
-
-    :param points: for each frame (n, 3), m; ``frame_seconds`` of flight lie between two.
-    """
-    axes, slopes = _axes(forward), lens.slopes
-    places = np.array([axes @ framing_camera(each, margin, forward, lens).eye for each in points])  # forward, right and up
-    reach = math.ceil(3.0 * SMOOTHING / frame_seconds)
-    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) * frame_seconds / SMOOTHING) ** 2)
-    padded = np.pad(places, ((reach, reach), (0, 0)), mode="edge")
-    smooth = np.stack([np.convolve(column, weights / weights.sum(), "valid") for column in padded.T], axis=1)
-    for place, each in zip(smooth, points, strict=True):  # farther away where smoothing has cut something off
-        before, after = _needed(each @ axes.T, slopes, 0.6 * margin)
-        place[0] = min(place[0], -(np.maximum(after - place[1:], before + place[1:]) / slopes).max())
-    return [Camera(np.maximum(place @ axes, LOWEST), axes, lens) for place in smooth]
 
 
 class ChaseCamera:
@@ -127,12 +109,3 @@ def _axes(forward: FloatArray) -> FloatArray:
     right = np.cross(forward, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
     return np.stack([forward, right, np.cross(right, forward)])
-
-
-def _needed(local: FloatArray, slopes: FloatArray, margin: float) -> tuple[FloatArray, FloatArray]:
-    """How far a camera must see, in the plane through the origin, to the left and down, and to the right and up; (2,) each.
-
-    :param local: (n, 3), points to be seen with ``margin`` around them, along the camera's axes.
-    """
-    across, room = local[:, 1:], margin - slopes * local[:, :1]
-    return (room - across).max(axis=0), (room + across).max(axis=0)

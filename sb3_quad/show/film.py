@@ -16,19 +16,18 @@ from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
-from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, following_cameras, framing_camera
-from sb3_quad.envs.rendering.labels import side_by_side, with_header
+from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.picture import Overlay
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.episodes import Recording
+from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s
-MARGIN = 0.9  # around vehicle and target, m, for a vehicle of the default one's size
+MARGIN, AHEAD = 0.9, 2.5  # around the vehicle, and how much of the way to its target is seen, m; for the default vehicle
 PANELS_ABREAST = 3
-SMALL = 0.2  # a vehicle whose breadth is less of the picture's height is shown from near as well
-CLOSE_UP, GAP = 0.34, 8  # side of that picture, of the panel's; its distance from the edges, pixels
+FOLLOWING = 0.4  # share of the way by which a camera follows in a frame: smoothly, where a target is replaced
 WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
 FORMATS = (".mp4", ".gif")
@@ -86,42 +85,36 @@ def film_frames(recordings: Sequence[Recording], width: int, height: int, speed:
         yield side_by_side(pictures, PANELS_ABREAST)
 
 
+def following_cameras(
+    recordings: Sequence[Recording], times: FloatArray, scale: float, forward: FloatArray, lens: Lens
+) -> Iterator[Camera]:
+    """For each time (s) a camera that has all vehicles in its picture, and their targets when these are near.
+
+    :param scale: the vehicles' size, in that of the default one.
+    :param forward: where the cameras look, a unit vector, (3,), not vertical.
+    """
+    eye = None
+    for seconds in times:
+        seen = []
+        for recording in recordings:
+            vehicle, target = recording.vehicle_and_target(recording.at(seconds))
+            way = target - vehicle
+            seen += [vehicle, vehicle + way * min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9))]
+        camera = framing_camera(np.stack(seen), MARGIN * scale, forward, lens)
+        eye = camera.eye if eye is None else eye + FOLLOWING * (camera.eye - eye)
+        yield camera._replace(eye=eye)
+
+
 def _panel(recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens) -> Iterator[Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
-    steps = [recording.at(seconds) for seconds in times]
-    seen = [recording.vehicle_and_target(step) for step in steps]
-    frame_seconds, font_size = max(float(times[1] - times[0]), 1e-3), max(12, round(lens.height / 26))
-    side = round(CLOSE_UP * min(lens.width, lens.height))
+    path, font_size = recording.state.position, max(12, round(lens.height / 26))
     with closing(Scene(recording.vehicle)) as scene:
-        cameras = following_cameras(seen, frame_seconds, MARGIN * scene.scale, forward, lens)
-        corner = _free_corner(cameras, seen, side)
-        shown = None
-        for step, camera in zip(steps, cameras, strict=True):
-            if shown != (key := (step, camera.eye.round(3).tolist())):
-                shown, pixels = key, _draw(recording, step, scene, camera, corner, side)
-                picture = with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
-            yield picture
-
-
-def _draw(recording: Recording, step: int, scene: Scene, camera: Camera, corner: tuple[int, int], side: int) -> Image:
-    """A picture of one step; where the vehicle is small, with a close-up in a corner."""
-    path, (left, top) = recording.state.position, corner
-    scene.place([recording.pose(step)], recording.state.target[[step]])
-    trail = Overlay(path[: step + 1 : 2], recording.colour, 0.75, width=0.03 * scene.scale)
-    pixels = scene.picture(camera, [trail])
-    if scene.span < SMALL * float((path[step] - camera.eye) @ camera.axes[0]) * camera.lens.slope:
-        near = framing_camera(path[[step]], 1.15 * scene.span, camera.axes[0], Lens(side, side))
-        pixels[top - 2 : top + side + 2, left - 2 : left + side + 2] = 255
-        pixels[top : top + side, left : left + side] = scene.picture(near, [trail])
-    return pixels
-
-
-def _free_corner(cameras: Sequence[Camera], seen: Sequence[FloatArray], side: int) -> tuple[int, int]:
-    """Left and top of a close-up, in the corner in which the points that are ``seen`` are least."""
-    spots = np.concatenate([camera.project(points)[:, :2] for camera, points in zip(cameras, seen, strict=True)])
-    right, bottom, half = cameras[0].lens.width - side - GAP, cameras[0].lens.height - side - GAP, side / 2
-    corners = [(GAP, bottom), (right, bottom), (GAP, GAP), (right, GAP)]
-    return min(corners, key=lambda corner: int((np.abs(spots - corner - half) < half + GAP).all(axis=1).sum()))
+        for seconds, camera in zip(times, following_cameras([recording], times, scene.scale, forward, lens), strict=True):
+            step = recording.at(seconds)
+            scene.place([recording.pose(step)], recording.state.target[[step]])
+            trail = Overlay(path[: step + 1 : 2], recording.colour, 0.75, width=0.03 * scene.scale)
+            pixels = scene.picture(camera, [trail])
+            yield with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
 
 
 def _caption(recording: Recording, step: int) -> str:
@@ -156,9 +149,8 @@ def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: 
 
 def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: float) -> None:
     times, client = frame_times(recordings, speed), scene.client
-    seen = [np.concatenate([each.vehicle_and_target(each.at(seconds)) for each in recordings]) for seconds in times]
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
-    cameras = following_cameras(seen, speed / FPS, MARGIN * scene.scale, forward, lens)
+    cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
     drawn_to, labels = [0] * len(recordings), [-1] * len(recordings)
     begun, number = time.perf_counter(), 0
     while number < len(times):
@@ -173,6 +165,7 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
                 look = {"textColorRGB": colour, "textSize": 1.2, "replaceItemUniqueId": labels[k]}
                 labels[k] = p.addUserDebugText(recording.name, above, physicsClientId=client, **look)
                 drawn_to[k] = step
-        point_window(client, cameras[number], seen[number].mean(axis=0))
+        positions = np.stack([recording.state.position[step] for recording, step in now])
+        point_window(client, cameras[number], positions.mean(axis=0))
         number = max(number + 1, int((time.perf_counter() - begun) * FPS))  # frames that come too late are left out
         time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))

@@ -8,17 +8,18 @@ import numpy as np
 
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.envs.rendering.labels import side_by_side, tag_size, with_header, with_tags
 from sb3_quad.envs.rendering.models import span
 from sb3_quad.envs.rendering.picture import Overlay
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.show.episodes import Recording
+from sb3_quad.show.labels import side_by_side, tag_size, with_header, with_tags
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
 AREA, RATIOS = 290_000, (0.7, 1.6)  # of a panel: pixels, width by height
 LARGEST = 6.0  # how much larger than life it is drawn at most
 APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth: so far away, a flight asks for one more
+SIDES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-0.8, -0.8], [0.8, -0.8], [-0.8, 0.8], [0.8, 0.8]])  # of a pose
 NEAR = 0.6  # and with it come those of the other flights at this time that are at least so far from their neighbours
 
 
@@ -68,7 +69,7 @@ def _view(recordings: Sequence[Recording], ends: Sequence[int], size: tuple[int,
     breadth = 2.0 * span(recordings[0].vehicle)
     enlarged = 1.0
     for _ in range(20):  # a larger vehicle needs a camera farther away
-        camera = framing_camera(points, 0.6 * enlarged * breadth, forward, lens)
+        camera = framing_camera(points, 0.8 * enlarged * breadth, forward, lens)
         depth = float(np.median((points - camera.eye) @ camera.axes[0]))
         wanted = VEHICLE_SHARE * 2.0 * lens.slope * depth / breadth
         enlarged = float(np.clip(0.5 * (enlarged + wanted), 1.0, LARGEST))
@@ -127,22 +128,17 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) ->
 
 
 def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
-    """The time of each pose and where it is written: at the first place beside it that is inside the picture and free."""
+    """The time of each pose and where it is written: beside it, on the side with most room, inside the picture."""
     places, breadth = view.project(recording.state.position[list(steps)])
-    # Left of a steep path, above a level one, else around the pose from there.
-    turns = np.radians([0, 30, -30, 60, -60, 90, -90, 120, -120, 150, -150, 180])
-    angles = turns + (np.pi if np.ptp(places[:, 1]) > np.ptp(places[:, 0]) else -np.pi / 2)
-    sides = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    taken = [(place, np.full(2, 0.35 * each)) for place, each in zip(places, breadth, strict=True)]  # centre, half the size
+    taken = [*places]  # what a text keeps away from: poses and the texts before it
     tags = []
     for step, place, reach in zip(steps, places, 0.5 * breadth, strict=True):
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array(tag_size(text, size))
-        around = place + sides * (reach + 0.4 * size + half)
-        free = (around >= half).all(axis=1) & (around <= view.camera.lens[:2] - half).all(axis=1)
-        for centre, other in taken:
-            free &= (np.abs(around - centre) >= half + other).any(axis=1)
-        chosen = around[int(np.argmax(free))]
-        taken.append((chosen, half))
+        around = place + SIDES * (0.8 * reach + half)
+        around = around.clip(half, view.camera.lens[:2] - half)
+        room = np.linalg.norm(around[:, None] - np.stack(taken), axis=2).min(axis=1)
+        chosen = around[int(room.round().argmax())]
+        taken.append(chosen)
         tags.append((text, (float(chosen[0]), float(chosen[1]))))
     return tags
