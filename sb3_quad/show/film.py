@@ -27,7 +27,7 @@ FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s
 MARGIN, AHEAD = 0.9, 2.5  # around the vehicle, and how much of the way to its target is seen, m; for the default vehicle
 PANELS_ABREAST = 3
-FOLLOWING = 0.4  # share of the way by which a camera follows in a frame: smoothly, where a target is replaced
+LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a target that is replaced
 WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
 FORMATS = (".mp4", ".gif")
@@ -93,7 +93,7 @@ def following_cameras(
     :param scale: the vehicles' size, in that of the default one.
     :param forward: where the cameras look, a unit vector, (3,), not vertical.
     """
-    eye = None
+    share, eye = 1.0 - math.exp(-(times[1] - times[0]) / LAG), None
     for seconds in times:
         seen = []
         for recording in recordings:
@@ -101,7 +101,7 @@ def following_cameras(
             way = target - vehicle
             seen += [vehicle, vehicle + way * min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9))]
         camera = framing_camera(np.stack(seen), MARGIN * scale, forward, lens)
-        eye = camera.eye if eye is None else eye + FOLLOWING * (camera.eye - eye)
+        eye = camera.eye if eye is None else eye + share * (camera.eye - eye)
         yield camera._replace(eye=eye)
 
 
