@@ -49,12 +49,12 @@ class BestModel(EveryTimesteps):
     :param best_model: where the best model goes; an existing file is replaced by a model that is better than all in
         ``evaluations``.
     :param evaluations: where the results go; an existing file is continued.
-    :param report: is told of each evaluation in one line.
+    :param report: called with one line for each evaluation.
     :param others: further environments by name, such as those of another task, which are evaluated at the same times. They do
         not decide which model is best; their results go to ``evaluations_<name>.npz`` beside ``evaluations``.
     :param expert: as DAgger takes it; it flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
         is then the model's mean reward minus the expert's.
-    :param should_continue: is asked after each evaluation, with its success rate and mean reward; False ends the training.
+    :param should_continue: called after each evaluation with its success rate and mean reward; False ends the training.
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read or
         flew another number of episodes.
     :raises ExpertError: at the first evaluation, an expert that does not fit the environment.

@@ -38,6 +38,7 @@ def test_a_uuid_keeps_the_number(tmp_path):
     assert claim_run(tmp_path, "dagger", ENV).path.name == f"{ENV}_2"
 
 
+@pytest.mark.slow
 def test_processes_and_threads_never_share_a_folder(tmp_path):
     code = (
         "import sys\nfrom sb3_quad.training.runs import claim_run\n"
@@ -60,12 +61,6 @@ def test_environment_ids_with_slashes_stay_in_their_folder(tmp_path):
     assert run.model.parent == run.path
 
 
-def test_a_folder_that_cannot_be_written_is_named(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ConfigError, match=r"cannot be written.*-f"):
-        claim_run(tmp_path / "file", "dagger", ENV)
-
-
 def test_settings_arguments_and_the_command_come_back(tmp_path, monkeypatch):
     run = claim_run(tmp_path, "dagger", ENV)
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/sb3-quad", "train", "--expert", "my file.zip"])
@@ -76,12 +71,6 @@ def test_settings_arguments_and_the_command_come_back(tmp_path, monkeypatch):
     run.arguments.write_text("- no mapping")
     with pytest.raises(ConfigError, match=r"args\.yml"):
         run.read_yaml()
-
-
-def test_folders_without_a_run_are_refused(tmp_path):
-    for folder in (tmp_path, tmp_path / "missing"):
-        with pytest.raises(ConfigError, match="run folder"):
-            open_run(folder)
 
 
 def test_files_are_replaced_whole(tmp_path, monkeypatch):

@@ -34,7 +34,7 @@ class SnapshotFile(LastGoodModel):
     Where writing takes long, as it does for a large dataset on a slow disk, snapshots are rarer.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
-    :param report: told of a snapshot that cannot be written; the training goes on.
+    :param report: called with one line if a snapshot cannot be written; the training goes on.
     :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
     """
 

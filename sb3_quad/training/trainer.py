@@ -1,4 +1,4 @@
-"""Running a training job: from its settings to a run folder with a model, whatever happens on the way.
+"""Runs a training job: from its settings to a run folder with a model, also after a signal or an error.
 
 A snapshot of a run lies between two rollouts. Where the environments can be restored (the batched one can), the
 resumed run is bit for bit the one that was not interrupted; elsewhere episodes start anew.
@@ -70,9 +70,9 @@ def train(
 ) -> TrainingResult:
     """Train as ``job`` says, in a run folder of its own.
 
-    :param report: told of each event in one line.
-    :param on_start: told of the run folder before the training begins.
-    :param should_continue: asked after each evaluation, with its success rate and mean reward.
+    :param report: called with one line for each event.
+    :param on_start: called with the run folder before the training begins.
+    :param should_continue: called after each evaluation with its success rate and mean reward; False ends the training.
     :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
     """
     config = job.config
