@@ -13,11 +13,9 @@ from sb3_quad.callbacks import FlightMetrics
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 
-SMALL = {"policy_kwargs": {"net_arch": [4]}, "seed": 0, "device": "cpu"}
-
 
 def small():
-    return {**SMALL, "policy_kwargs": dict(SMALL["policy_kwargs"])}
+    return {"policy_kwargs": {"net_arch": [4]}, "seed": 0, "device": "cpu"}
 
 
 def test_flights_of_the_expert_are_measured_as_evaluation_does():

@@ -21,7 +21,7 @@ from sb3_quad.training.algorithms import ALGORITHMS, constructor_parameters, get
 from sb3_quad.training.config import SETTINGS, build_config, check_environment, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline
-from sb3_quad.training.values import convert, qualified_classes, takes_whole
+from sb3_quad.training.values import convert, takes_whole
 
 ENV = "QuadTargetTracking-v0"
 MINIMAL = {"n_timesteps": 1000}
@@ -57,11 +57,8 @@ def test_policy_kwargs_in_every_spelling(given_kwargs):
     "text",
     [
         "__import__('os').system('true')",
-        "dict(a=open('/etc/passwd'))",
-        "[x for x in (1,)]",
-        "dict(**{'a': 1})",
         "dict(a=os.environ)",
-        "(lambda: 1)()",
+        "dict(**{'a': 1})",
         "dict(",
         "nn.Tanh",
         "3",
@@ -138,11 +135,6 @@ def test_unknown_names_come_with_the_nearest():
         load_config("dagger", ENV, "thesis/dager.yml")
     with pytest.raises(ConfigError, match="learns from no expert"):
         build("ppo", expert="pid")
-
-
-def test_other_environments_have_no_batch():
-    assert build("ppo", "Pendulum-v1").vec_env == "dummy"
-    assert build("ppo", ENV).vec_env == "batch"
     with pytest.raises(ConfigError, match="no batched form"):
         build("ppo", "Pendulum-v1", vec_env="batch")
 
@@ -206,7 +198,6 @@ def test_a_value_becomes_what_its_type_says(kind, value, expected):
     ("kind", "value", "message"),
     [
         (type[RolloutBuffer], ReplayBuffer, "must be a subclass of RolloutBuffer"),
-        (dict[str, Any], "abc", "must be a valid dictionary"),
         (Literal["a", "b"], "c", "must be 'a' or 'b'"),
         (float, "inf", "must be finite"),
         (Any, float("nan"), "must be finite"),
@@ -217,15 +208,17 @@ def test_a_value_of_another_type_is_refused(kind, value, message):
         convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
 
 
-@pytest.mark.parametrize("name", SETTINGS.names())
-def test_packaged_files_hold_good_settings(name):
-    content, _ = SETTINGS.read(name)
-    if "stages" in content:
-        pytest.skip("a pipeline")
+@pytest.mark.parametrize("name", [name for name in SETTINGS.names() if not name.endswith(("two_stage.yml", "imitation.yml"))])
+def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of_tasks(name):
     algo = name.rpartition("/")[2].removesuffix(".yml").replace("reference", "ppo_bc")
-    assert algo in ALGORITHMS
-    for env_id in content:
-        assert load_config(algo, env_id, name).n_timesteps > 0
+    assert {*ENVIRONMENTS} <= SETTINGS.read(name)[0].keys()
+    for env_id, task in ENVIRONMENTS.items():
+        config = load_config(algo, env_id, name)
+        flown, line = config.env_kwargs.get("task", task), describe(TrainingJob(config=config))
+        if isinstance(flown, str):
+            assert flown == task and "tasks" not in line
+        else:
+            assert max(flown, key=flown.get) == task and f"tasks {flown[task]:.0%} {task}, " in line
 
 
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
@@ -241,18 +234,6 @@ def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
     for file, expert in {**pipelines, "pid/two_stage.yml": "pid", "thesis/two_stage.yml": "pid"}.items():
         stages = load_pipeline(file).stages
         assert {load_config(each.algo, each.env, each.conf_file, each.settings).expert for each in stages} == {expert}
-
-
-@pytest.mark.parametrize("name", [name for name in SETTINGS.names() if not name.endswith(("two_stage.yml", "imitation.yml"))])
-def test_the_section_of_an_environment_trains_its_task_and_the_first_line_names_a_mixture(name):
-    algo = name.rpartition("/")[2].removesuffix(".yml").replace("reference", "ppo_bc")
-    for env_id, task in ENVIRONMENTS.items():
-        config = load_config(algo, env_id, name)
-        flown, line = config.env_kwargs.get("task", task), describe(TrainingJob(config=config))
-        if isinstance(flown, str):
-            assert flown == task and "tasks" not in line
-        else:
-            assert max(flown, key=flown.get) == task and f"tasks {flown[task]:.0%} {task}, " in line
 
 
 def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
@@ -281,13 +262,3 @@ def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
     reward = TASKS["state_recovery"]
     assert (reward.position_cost, reward.tilt_cost, reward.body_rates_cost) == (0.003, 0.002, 0.0005)
     assert (reward.collision_cost, reward.out_of_range_cost) == (15.0, 15.0)
-
-
-def test_classes_in_every_form_of_rl_zoo():
-    forms = ["a.B", {"a.B": {"x": "1e-3"}}, ["a.B", {"c.D": None}]]
-    assert [qualified_classes(form, "callback") for form in forms] == [
-        [("a.B", {})],
-        [("a.B", {"x": 1e-3})],
-        [("a.B", {}), ("c.D", {})],
-    ]
-    assert qualified_classes(None, "callback") == []
