@@ -3,7 +3,6 @@
 import inspect
 import pkgutil
 import typing
-from types import SimpleNamespace
 from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -36,24 +35,17 @@ def get_algorithm(name: str) -> type[BaseAlgorithm]:
 def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
     """What an algorithm's settings may give: its constructor's keywords, less those that a training job sets.
 
-    The annotation of each is a type; Any where there is none, or where its names cannot be resolved.
+    The annotation of each is a type; Any where there is none, or where a name in the annotations cannot be resolved.
     """
-    constructor = inspect.unwrap(algorithm.__init__)
+    try:
+        types = typing.get_type_hints(algorithm.__init__)
+    except NameError:
+        types = {}
     return {
-        name: parameter.replace(annotation=_resolve(parameter.annotation, constructor.__globals__))
-        for name, parameter in inspect.signature(constructor).parameters.items()
+        name: parameter.replace(annotation=types.get(name, Any))
+        for name, parameter in inspect.signature(algorithm.__init__).parameters.items()
         if name not in _SET_BY_JOB and not name.startswith("_") and parameter.kind is not parameter.VAR_KEYWORD
     }
-
-
-def _resolve(annotation: Any, names: dict[str, Any]) -> Any:
-    if annotation is inspect.Parameter.empty:
-        return Any
-    alone = SimpleNamespace(__annotations__={"value": annotation})  # a name that is missing spoils all others otherwise
-    try:
-        return typing.get_type_hints(alone, names)["value"]
-    except Exception:  # an annotation is any expression, and fails as it likes
-        return Any
 
 
 def is_off_policy(algorithm: type[BaseAlgorithm]) -> bool:

@@ -181,7 +181,7 @@ class TrainingConfig(Frozen):
         if self.vec_env == "batch" and self.task is None:
             raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
         if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
-            raise ConfigError(f"train_freq {self.keyword('train_freq')}: episodes are counted with n_envs 1 only; give steps")
+            raise ConfigError(f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; give steps")
         if self.noise_type is not None and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
         if (self.expert or self.eval_expert) and not takes_expert(get_algorithm(self.algo)):
