@@ -1,1 +1,1 @@
-"""Flying controllers over fresh episodes, and the figures and tables that come of it."""
+"""Flying controllers over fresh episodes, and the metrics and tables that come of it."""

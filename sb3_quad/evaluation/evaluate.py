@@ -120,6 +120,8 @@ def evaluate(
         evaluation = _digest(jobs)
         done = {} if overwrite else _interrupted(place, evaluation, jobs)
         missing = [job for job in jobs if job.name not in done]
+        if before is not None and len(kept) < len(before.entries):  # what is flown anew is no result any more
+            write_results(place, _joined(before, suite, records.values(), [*kept, *done.values()], failures))
         try:
             progress(len(done), len(jobs), "")
             alone = executor == "local" and min(workers, len(missing)) <= 1

@@ -35,18 +35,19 @@ def time_row(tolerance: float | str) -> Row:
 
 def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
     """Everything that was measured of a controller in a scenario."""
-    cells = {SURVIVAL: _share(metrics.survival), REWARD: _mean(metrics.reward), FLOWN: _mean(metrics.flown)}
-    if metrics.success is not None:
-        cells[SUCCESS] = _share(metrics.success)
-    for arrival in metrics.arrivals:
-        cells[time_row(arrival.tolerance)] = _moment(arrival)
-    cells[PATH] = _mean(metrics.path)
-    cells[MEDIAN] = Cell(metrics.final_error_median, decimals=3, words="–")
-    cells[QUANTILE] = replace(_mean(metrics.final_error_95), decimals=3)
+    cells = {
+        SUCCESS: _share(metrics.success),
+        SURVIVAL: _share(metrics.survival),
+        REWARD: _mean(metrics.reward),
+        FLOWN: _mean(metrics.flown),
+        **{time_row(arrival.tolerance): _moment(arrival) for arrival in metrics.arrivals},
+        PATH: _mean(metrics.path),
+        MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
+        QUANTILE: replace(_mean(metrics.final_error_95), decimals=3),
+        STABLE: _moment(metrics.stabilised, "are"),
+    }
     if metrics.sideways is not None:
         cells[SIDEWAYS] = _mean(metrics.sideways)
-    if metrics.stabilised is not None:
-        cells[STABLE] = _moment(metrics.stabilised, "are")
     if metrics.course is not None:
         cells[REACHED], cells[COMPLETED] = _mean(metrics.course.reached), _share(metrics.course.completed)
         cells[COURSE_TIME] = _mean(metrics.course.time, "never")
@@ -63,12 +64,12 @@ def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cel
 
 def reference_cells(reference: Reference) -> Cells:
     """Others' metrics."""
-    given = {REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error, FLOWN: reference.flown}
-    given |= {STABLE: reference.stabilised}
-    cells = {row: _given(value) for row, value in given.items() if value is not None}
+    values = {REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error, FLOWN: reference.flown}
+    values |= {STABLE: reference.stabilised}
+    cells = {row: _printed(value) for row, value in values.items() if value is not None}
     shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
-    cells |= {row: replace(_given(share, 100.0), note=reference.note) for row, share in shares.items() if share is not None}
-    return cells | {time_row(tolerance): _given(time) for tolerance, time in reference.time_to.items()}
+    cells |= {row: replace(_printed(share, 100.0), note=reference.note) for row, share in shares.items() if share is not None}
+    return cells | {time_row(tolerance): _printed(time) for tolerance, time in reference.time_to.items()}
 
 
 def metric_rows(
@@ -187,7 +188,7 @@ def _limit(limit: HitLimit) -> tuple[Cell, Cell]:
     return Cell(factor, (limit.low, float("inf") if limit.high is None else limit.high)), Cell(words=size)
 
 
-def _given(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
+def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
     """A number as its source prints it; a pair is a range, None a time that never came."""
     if value is None:
         return Cell(words="never")

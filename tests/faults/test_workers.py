@@ -31,6 +31,7 @@ class KillLastWorker(BaseCallback):
         return True
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(100)
 def test_a_training_whose_worker_dies_ends_saves_and_leaves_none_behind(tmp_path, capsys):
     (tmp_path / "settings.yml").write_text(
@@ -91,6 +92,7 @@ def test_a_controller_that_ends_its_process_is_a_failure_and_the_others_fly(tmp_
     assert {name for line in lines for name, message in bad.items() if name in line and message in line} == {*bad}
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(200)
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_the_evaluation_that_started_them(tmp_path, number):
