@@ -10,8 +10,6 @@ from sb3_quad.base.validate import Frozen, validate
 
 
 class Rotor(Frozen):
-    other_keys = ("speed",)
-
     thrust: float = Field(description="N")
 
 
@@ -58,7 +56,7 @@ def test_data_become_a_frozen_model():
             "(valid: by_name, count, fault, length, mass, rotors, saved, second)",
         ),
         ({"mass": 1, "rotors": [{"thrust": 1}, {"thrust": "x"}]}, "x: rotors.1.thrust: 'x' must be a number alone"),
-        ({"mass": 1, "rotors": [{"thrust": 1, "sped": 2}]}, "x: rotors.0: unknown key 'sped': did you mean 'speed'?"),
+        ({"mass": 1, "rotors": [{"thrust": 1, "thurst": 2}]}, "x: rotors.0: unknown key 'thurst': did you mean 'thrust'?"),
         ({"mass": 1, "by_name": {"left": {"thurst": 1}}}, "x: by_name.thrust: is missing (N); by_name: unknown key 'thurst'"),
         ({"mass": 1, "saved": {}}, "x: saved.thrust: is missing (N)"),
         ({"mass": 1, "length": [1]}, "x: length: Input should be a valid number"),

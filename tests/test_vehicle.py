@@ -158,9 +158,9 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give only one"),
-        ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise.* N"),
-        ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits: must be two numbers .*rad/s"),
+        ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give exactly one"),
+        ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise"),
+        ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits.*number.*rad/s"),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: is missing"),
         ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),
         ({"mas": 1.0}, "'mas': did you mean 'mass'"),

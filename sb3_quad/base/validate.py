@@ -4,7 +4,7 @@ import json
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
@@ -19,9 +19,6 @@ class Frozen(BaseModel):
     """A record: frozen, with finite numbers and no unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-    other_keys: ClassVar[tuple[str, ...]] = ()
-    """Further keys that a validator of the model understands; messages about unknown keys list them."""
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
@@ -59,7 +56,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
         inside, names, meaning = _walk(model, item["loc"])
         key = ".".join(names)
         if item["type"] == "extra_forbidden":
-            text = unknown("key", item["loc"][-1], [*_fields(inside), *getattr(inside, "other_keys", ())])
+            text = unknown("key", item["loc"][-1], _fields(inside))
         else:
             text = _message(item) + (f" ({meaning})" if meaning else "")
         found.setdefault(key, text if text.startswith(key) else f"{key}: {text}")  # of a union only the first alternative

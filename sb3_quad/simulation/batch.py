@@ -91,7 +91,8 @@ class QuadcopterBatch:
         self.max_steps = _steps_of_rows(settings, n)
         self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
         self.state = np.zeros((STATE_SIZE, n))
-        self.queue = np.zeros((max(self.randomize.longest_delay, *(each.delay for each in vehicles), 0), 4, n))
+        longest = int(self.randomize.delay.high) if self.randomize.delay else 0  # delay, control steps
+        self.queue = np.zeros((max(longest, *(each.delay for each in vehicles)), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
         # One column serves all rows until rows are set apart.

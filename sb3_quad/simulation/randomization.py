@@ -52,7 +52,9 @@ class RandomVector(Frozen):
     unit: Literal["SI", "weight"] = Field(
         default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
     )
-    frame: Literal["world", "body"] = Field(description="the axes it keeps to")
+    frame: Literal["world", "body"] | None = Field(
+        default=None, description="the axes it keeps to; left out: a force to the world's, a torque to the body's"
+    )
     direction: Vector | None = Field(default=None, description="where to; left out: uniformly random")
     axes: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
         default=(1.0, 1.0, 1.0), description="factor of each component, such as [1, 1, 0] for a horizontal one"
@@ -70,23 +72,11 @@ class RandomVector(Frozen):
             raise ValueError("direction must not be zero")
         return value
 
-    def numbers(self) -> list[float]:
-        """Numbers in the order of ``VECTOR``."""
+    def numbers(self, frame: str) -> list[float]:
+        """Numbers in the order of ``VECTOR``; ``frame`` holds if none is given."""
         direction = np.zeros(3) if self.direction is None else np.array(self.direction) / np.linalg.norm(self.direction)
-        marks = float(self.unit == "weight"), float(self.frame == "body")
+        marks = float(self.unit == "weight"), float((self.frame or frame) == "body")
         return [*self.magnitude.numbers(), *marks, *direction, *self.axes]
-
-
-class Force(RandomVector):
-    """A :class:`RandomVector` that keeps to the world's axes unless it says otherwise."""
-
-    frame: Literal["world", "body"] = Field(default="world", description="the axes it keeps to")
-
-
-class Torque(RandomVector):
-    """A :class:`RandomVector` that keeps to the body's axes unless it says otherwise."""
-
-    frame: Literal["world", "body"] = Field(default="body", description="the axes it keeps to")
 
 
 class Gusts(Frozen):
@@ -125,10 +115,8 @@ class Randomization(Frozen):
         description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
     )
     wrench_share: Share = Field(default=1.0, description="share of the episodes with force, torque and gusts")
-    force: Force | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, world frame, N")
-    torque: Torque | None = Field(
-        default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, body frame, N m"
-    )
+    force: RandomVector | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, N")
+    torque: RandomVector | None = Field(default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, N m")
     gusts: Gusts | None = Field(default=None, description="a force that wanders, such as {std: [0, 1], time_constant: 1}")
 
     @model_validator(mode="after")
@@ -154,11 +142,6 @@ class Randomization(Frozen):
         """Whether an episode begins with a wrench of its own, none included."""
         return self.force is not None or self.torque is not None
 
-    @property
-    def longest_delay(self) -> int:
-        """Control steps that a command may take, 0 unless the delay varies."""
-        return 0 if self.delay is None else int(self.delay.high)
-
     def check(self, vehicle: Vehicle) -> None:
         """Refuse what this vehicle cannot be flown with.
 
@@ -183,8 +166,8 @@ class Randomization(Frozen):
         numbers = [self.share if self.sets_vehicle else 0.0, self.wrench_share]
         for each in ranges:
             numbers += FIXED_NUMBERS if each is None else each.numbers()
-        for vector in (self.force, self.torque):
-            numbers += [*FIXED_NUMBERS, *[0.0] * 8] if vector is None else vector.numbers()
+        for vector, frame in ((self.force, "world"), (self.torque, "body")):
+            numbers += [*FIXED_NUMBERS, *[0.0] * 8] if vector is None else vector.numbers(frame)
         if self.gusts is None:
             return np.array([*numbers, *FIXED_NUMBERS, 0.0, 0.0])
         keeps = math.exp(-control_step / self.gusts.time_constant)

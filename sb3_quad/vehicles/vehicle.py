@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import Field, ModelWrapValidatorHandler, NonNegativeFloat, PositiveFloat, model_validator
+from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import CannotHover, ConfigError
@@ -26,24 +26,20 @@ PARAMETER_NAMES = (
 )
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 LAYOUT_ANGLE = math.radians(20.0)  # by which rotors in the same place may differ, seen from the centre of mass
-OTHER_LIMITS = {
-    "rotor_thrust_limits": "least and greatest thrust of one rotor, N",
-    "rotor_speed_limits": "least and greatest speed of one rotor, rad/s",
-}
+Limits = tuple[NonNegativeFloat, PositiveFloat]
+LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 
 
 class Vehicle(Frozen):
     """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
 
     The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover thrusts,
-    ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. They become ``thrust_limits``, which a copy with another
-    mass keeps.
+    ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. These become ``thrust_limits``, which a copy with another
+    mass keeps, and are None.
 
     Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises :class:`ConfigError`
     through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
     """
-
-    other_keys = tuple(OTHER_LIMITS)
 
     name: str = Field(
         pattern=NAME, description="what the vehicle is called; up to 100 characters, none of / \\ < > or control"
@@ -60,9 +56,11 @@ class Vehicle(Frozen):
     thrust_coefficient: PositiveFloat = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
     motor_gain: PositiveFloat = Field(description="k_m, 1/s (Eq. 4.1)")
     gravity: PositiveFloat = Field(default=9.81, description="g, m/s^2")
-    thrust_limits: tuple[NonNegativeFloat, PositiveFloat] = Field(
-        description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
+    thrust_limits: Limits = Field(
+        default=(0.0, 0.0), description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
     )
+    rotor_thrust_limits: Limits | None = Field(default=None, exclude=True, description="the same in N")
+    rotor_speed_limits: Limits | None = Field(default=None, exclude=True, description="the same as rotor speeds, rad/s")
     physics_step: PositiveFloat = Field(default=0.0025, description="s")
     control_step: PositiveFloat = Field(default=0.01, description="s; a whole number of physics steps")
     delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
@@ -71,28 +69,22 @@ class Vehicle(Frozen):
         default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
     )
 
-    @model_validator(mode="wrap")
-    @classmethod
-    def _limits_as_published(cls, data: Any, handler: ModelWrapValidatorHandler["Vehicle"]) -> "Vehicle":
+    @model_validator(mode="after")
+    def _limits_as_published(self) -> "Vehicle":
         """``rotor_thrust_limits`` or ``rotor_speed_limits`` as ``thrust_limits`` (F = kF ω²)."""
-        given = [key for key in ("thrust_limits", *OTHER_LIMITS) if isinstance(data, Mapping) and key in data]
-        if len(given) > 1:
-            raise ValueError(f"{' and '.join(given)}: give only one of them")
-        if not given or given == ["thrust_limits"]:
-            return handler(data)
-        (name,) = given
-        others = {key: value for key, value in data.items() if key != name}
-        pair = data[name] if isinstance(data[name], (list, tuple)) else ()
-        try:
-            least, most = (float(limit) for limit in pair)
-        except (TypeError, ValueError):
-            raise ValueError(f"{name}: must be two numbers ({OTHER_LIMITS[name]})") from None
-        if not 0.0 <= least < most < math.inf:
-            raise ValueError(f"{name} [{least:g}, {most:g}]: must rise, from at least 0 ({OTHER_LIMITS[name]})")
-        vehicle = handler({**others, "thrust_limits": (0.0, 2.0)})  # hover is possible; any other key may be wrong
-        if name == "rotor_speed_limits":
-            least, most = vehicle.thrust_coefficient * least**2, vehicle.thrust_coefficient * most**2
-        return handler({**others, "thrust_limits": (least / vehicle.hover_thrust, most / vehicle.hover_thrust)})
+        given = [name for name in LIMITS if name in self.model_fields_set and getattr(self, name) is not None]
+        if len(given) != 1:
+            raise ValueError(f"{' and '.join(given or LIMITS)}: give exactly one of them")
+        low, high = getattr(self, given[0])
+        if given[0] != "thrust_limits":
+            if low >= high:
+                raise ValueError(f"{given[0]} [{low:g}, {high:g}]: must rise")
+            if given[0] == "rotor_speed_limits":
+                low, high = self.thrust_coefficient * low**2, self.thrust_coefficient * high**2
+            own = {"thrust_limits": (low / self.hover_thrust, high / self.hover_thrust), given[0]: None}
+            for name, value in own.items():
+                object.__setattr__(self, name, value)
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> "Vehicle":
@@ -106,11 +98,11 @@ class Vehicle(Frozen):
         if max(ixx, iyy, izz) > (ixx + iyy + izz) / 2 * (1 + 1e-9):
             raise ValueError(f"inertia {list(self.inertia)}: no rigid body has one moment larger than the other two together")
         substeps = self.control_step / self.physics_step
-        if abs(substeps - round(substeps)) > 1e-9 or round(substeps) < 1:
-            raise ValueError(f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step}")
-        if substeps > MAX_SUBSTEPS:
-            found = f"makes {round(substeps)} physics steps of a control step"
-            raise ValueError(f"physics_step {self.physics_step:g}: {found}, at most {MAX_SUBSTEPS} are allowed")
+        if abs(substeps - round(substeps)) > 1e-9 or not 1 <= round(substeps) <= MAX_SUBSTEPS:
+            raise ValueError(
+                f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step},"
+                f" at most {MAX_SUBSTEPS} times"
+            )
         if self.motor_gain * self.physics_step > 1.0:
             raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
         mixer = self.mixer
@@ -131,7 +123,7 @@ class Vehicle(Frozen):
         changes = dict(update or {})
         if changes.keys() - {"name"}:
             changes = {"geometric_gains": None, **changes}
-        own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & OTHER_LIMITS.keys() else None)
+        own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & {*LIMITS} else None)
         return Vehicle.model_validate({**own, **changes})
 
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
