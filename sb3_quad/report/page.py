@@ -47,8 +47,8 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
     folder = Path(folder)
     write_text(folder / MARKDOWN, _markdown(title, sections))
     for plot in (plot for section in sections for plot in section.plots if isinstance(plot, Plot) and with_pictures):
-        write_bytes(folder / PICTURES / f"{plot.name}.png", plot.file("png"))
-        write_bytes(folder / PICTURES / f"{plot.name}.svg", plot.file("svg"))
+        write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
+        write_bytes(folder / PICTURES / f"{plot.name}.svg", plot.svg)
     write_text(folder / PAGE, render(title, facts, sections, PICTURES if with_pictures else ""))
     return folder / PAGE
 

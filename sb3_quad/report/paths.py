@@ -16,8 +16,7 @@ TARGET, START = "#1a9a45", "#8a8f98"
 SHOWN_FLIGHTS = 4  # of a controller, of random episodes
 PATH_POINTS = 150  # that a flight is drawn with, at most
 ARROW = 0.16  # longest force arrow, of the longest side of all flights
-ARROWS = 5  # along a path on which a force lasts throughout
-BRIEF = 10  # samples; a shorter push has one arrow
+ARROWS = 5  # of a force that lasts throughout a flight
 CAMERA = {"eye": {"x": 1.45, "y": -1.95, "z": 0.68}, "center": {"x": 0, "y": 0, "z": -0.17}}
 
 
@@ -74,16 +73,12 @@ def _forces(tracks: Sequence[Track], length: float) -> list[tuple[FloatArray, st
 
 
 def _pushed(track: Track) -> list[int]:
-    """Samples with a force to be shown: one of a short push, several along the way of one that lasts."""
-    pushed = np.flatnonzero(track.wrench[:, :3].any(axis=1))
+    """Samples with a force to be shown: the first of each push, and further ones along the way of one that lasts."""
+    acts = track.wrench[:, :3].any(axis=1)
     chosen: list[int] = []
-    for part in np.split(pushed, np.flatnonzero(np.diff(pushed) > 1) + 1):
-        if part.size < BRIEF:
-            chosen += part[:1].tolist()
-            continue
-        way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(track.position[part], axis=0), axis=1))])
-        number = max(2, round(ARROWS * part.size / len(track.times)))
-        chosen += part[np.searchsorted(way, np.linspace(0.0, way[-1], number))].tolist()
+    for sample in np.flatnonzero(acts).tolist():
+        if sample == 0 or not acts[sample - 1] or sample - chosen[-1] >= len(acts) / ARROWS:
+            chosen.append(sample)
     return chosen
 
 

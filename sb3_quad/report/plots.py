@@ -4,6 +4,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import matplotlib
@@ -60,9 +61,15 @@ class Plot:
     caption: str
     figure: Figure
 
-    def file(self, kind: Literal["png", "svg"]) -> bytes:
-        """The plot as a file."""
-        return picture(self.figure, kind, bbox_inches="tight", metadata=METADATA if kind == "svg" else {}, dpi=DPI)
+    @cached_property
+    def svg(self) -> bytes:
+        """The plot as an SVG file, which is also a part of the page."""
+        return picture(self.figure, "svg", bbox_inches="tight", metadata=METADATA)
+
+    @property
+    def png(self) -> bytes:
+        """The plot as a PNG file."""
+        return picture(self.figure, "png", bbox_inches="tight", dpi=DPI)
 
     @property
     def is_narrow(self) -> bool:
@@ -72,7 +79,7 @@ class Plot:
     @property
     def inline(self) -> str:
         """The plot as a part of the page: an ``svg`` element in the page's colours, which may be dark."""
-        text = self.file("svg").decode("utf-8")
+        text = self.svg.decode("utf-8")
         text = text[text.index("<svg") :]
         for colour, name in ((INK, "ink"), (QUIET, "quiet"), (GRID, "grid"), (PAPER, "paper")):
             text = text.replace(colour, f"var(--{name})")
