@@ -1,5 +1,6 @@
 """The vectorised environment of a job: batched, one process, or one process each; the same learning problem in all."""
 
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -54,11 +55,10 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
                 raise ConfigError("env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy")
             env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs})
         else:
-            in_worker = config.vec_env == "subproc"
-            keywords = [_of_row(config.env_kwargs, row) for row in range(n_envs)]
-            rows = range(n_envs) if staggered else [0] * n_envs
-            make = partial(_make_one, config.env_id, config.env_wrapper, in_worker, n_envs)
-            env = (_Subproc if in_worker else _Dummy)([partial(make, *each) for each in zip(keywords, rows, strict=True)])
+            makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
+                partial(_make_one, config, row, n_envs if staggered else 1) for row in range(n_envs)
+            ]
+            env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
             env.seed(seed)
     except SB3QuadError:
         raise
@@ -71,22 +71,23 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
     return env
 
 
-def _of_row(env_kwargs: dict[str, Any], row: int) -> dict[str, Any]:
-    """The keywords of one row, where lists are counted round."""
-    lists = {name: env_kwargs.get(name) for name in ("vehicle", "max_episode_steps")}
-    own = {name: given[row % len(given)] for name, given in lists.items() if isinstance(given, (list, tuple)) and given}
-    return {**env_kwargs, **own}
+def _make_one(config: TrainingConfig, row: int, phases: int) -> gymnasium.Env[Any, Any]:
+    """The environment of a row; where keywords are lists of what rows fly, they are counted round.
 
-
-def _make_one(
-    env_id: str, wrappers: list[tuple[str, dict[str, Any]]], in_worker: bool, n_envs: int, kwargs: dict[str, Any], row: int
-) -> gymnasium.Env[Any, Any]:
-    if in_worker:
+    :param phases: of this many, evenly spread over an episode, the row begins in its own.
+    """
+    if config.vec_env == "subproc":
         ignore_interrupts()
-    made = gymnasium.make(env_id, **kwargs)
-    limit = (made.spec and made.spec.max_episode_steps) or 0
-    env: gymnasium.Env[Any, Any] = Monitor(_FirstEpisode(made, limit - row * limit // n_envs) if row and limit else made)
-    for path, wrapper_kwargs in wrappers:
+    kwargs = dict(config.env_kwargs)
+    for name in ("vehicle", "max_episode_steps"):
+        if isinstance(given := kwargs.get(name), (list, tuple)) and given:
+            kwargs[name] = given[row % len(given)]
+    env: gymnasium.Env[Any, Any] = gymnasium.make(config.env_id, **kwargs)
+    limit = env.spec and env.spec.max_episode_steps
+    if limit and row % phases:
+        env = _FirstEpisode(env, limit - row * limit // phases)
+    env = Monitor(env)
+    for path, wrapper_kwargs in config.env_wrapper:
         env = instance(path, "env_wrapper", env, **wrapper_kwargs)
     return env
 
