@@ -14,11 +14,14 @@ from optuna.trial import FrozenTrial
 from optuna.visualization.matplotlib import plot_optimization_history, plot_slice
 
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.report.plots import picture
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
 
 BEST, TRIALS = "best.yml", "trials.csv"
+STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
+SHOWN = 5  # trials in the table of the best
 PLOTS: dict[str, Callable[..., Any]] = {"trials.png": plot_slice, "history.png": plot_optimization_history}
 
 
@@ -70,6 +73,33 @@ def in_words(search: Search, trial: FrozenTrial) -> str:
     success, reward = trial.user_attrs[SUCCESS], trial.user_attrs[REWARD]
     rate = "" if search.job.config.task is None else f"success {100 * success:.1f} %, "
     return f"{rate}mean reward {reward:.2f}"
+
+
+def trial_line(search: Search, trial: FrozenTrial) -> str:
+    """One line that says how a trial ended."""
+    seconds = trial.duration.total_seconds() if trial.duration is not None else 0.0
+    values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
+    if trial.state.name == "FAIL":
+        return f"trial {trial.number} failed: {trial.user_attrs[ERROR]} ({values})"
+    pruned = f"pruned after {len(trial.intermediate_values)} evaluations, " if trial.state.name == "PRUNED" else ""
+    mark = " (best so far)" if search.best is not None and search.best.number == trial.number else ""
+    return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
+
+
+def count_trials(search: Search) -> str:
+    """How many trials of the study ended, by how they did."""
+    counts = {word: len(search.trials(state)) for state, word in STATES.items()}
+    return ", ".join(f"{count} {word}" for word, count in counts.items() if count) or "no trial yet"
+
+
+def best_table(search: Search) -> Table:
+    """The best trials: what they reached, and the settings that the search varies."""
+    trials = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
+    rows = [("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in trials))]
+    if search.job.config.task is not None:
+        rows.insert(0, ("success", *(f"{100 * trial.user_attrs[SUCCESS]:.2f} %" for trial in trials)))
+    rows += [(name, *(str(varied(search, trial)[name]) for trial in trials)) for name in search.space.dimensions]
+    return text_table(f"the best of {count_trials(search)}", ("trial", *(str(trial.number) for trial in trials)), rows)
 
 
 def train_command(search: Search) -> str:

@@ -29,8 +29,6 @@ from sb3_quad.cli.parser import Parser, add_common, given, natural, positive, se
 
 JOURNAL = "study.log"
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
-STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
-SHOWN = 5  # trials in the table
 
 
 def add_arguments(parser: Parser) -> None:
@@ -56,19 +54,19 @@ def add_arguments(parser: Parser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     from sb3_quad.cli.output import progress_bar
-    from sb3_quad.tuning.results import write_results
+    from sb3_quad.tuning.results import count_trials, trial_line, write_results
 
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        print(f"study {search.name} in {search.storage}: {_count(search)}; results go to {search.job.log_folder}")
+        print(f"study {search.name} in {search.storage}: {count_trials(search)}; results go to {search.job.log_folder}")
         with progress_bar(options.progress) as show:
             done = count()
             show(next(done), options.n_trials, "trials")
 
             def after_each(trial: Any) -> None:
                 write_results(search)
-                print(_line(search, trial))
+                print(trial_line(search, trial))
                 show(next(done), options.n_trials, "trials")
 
             try:
@@ -145,29 +143,15 @@ def _make_search(options: argparse.Namespace) -> Any:
         raise
 
 
-def _line(search: Any, trial: Any) -> str:
-    """One line that says how a trial ended."""
-    from sb3_quad.tuning.results import in_words, varied
-    from sb3_quad.tuning.search import ERROR
-
-    seconds = trial.duration.total_seconds() if trial.duration is not None else 0.0
-    values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
-    if trial.state.name == "FAIL":
-        return f"trial {trial.number} failed: {trial.user_attrs[ERROR]} ({values})"
-    pruned = f"pruned after {len(trial.intermediate_values)} evaluations, " if trial.state.name == "PRUNED" else ""
-    mark = " (best so far)" if search.best is not None and search.best.number == trial.number else ""
-    return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
-
-
 def _print_results(search: Any) -> None:
     """Print the best trials, the best agent on fresh episodes, and where everything is."""
-    from sb3_quad.tuning.results import BEST, PLOTS, TRIALS, train_command, write_plots
+    from sb3_quad.tuning.results import BEST, PLOTS, TRIALS, count_trials, train_command, write_plots
 
     if search.best is not None:
         write_plots(search)
         _print_best(search, search.best)
     written = [TRIALS] if search.best is None else [TRIALS, BEST, *PLOTS]
-    print(f"{_count(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
+    print(f"{count_trials(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
     print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
     if search.best is not None:
         print(f"to train: {train_command(search)}")
@@ -178,25 +162,14 @@ def _print_best(search: Any, best: Any) -> None:
     from sb3_quad.cli.closing import agent_and_expert
     from sb3_quad.cli.output import console
     from sb3_quad.controllers.zips import load_model
-    from sb3_quad.evaluation.tables import text_table
     from sb3_quad.training.config import build_config
     from sb3_quad.training.runs import open_run
-    from sb3_quad.tuning.results import settings_of, varied
-    from sb3_quad.tuning.search import REWARD, RUN, SUCCESS
+    from sb3_quad.tuning.results import best_table, settings_of
+    from sb3_quad.tuning.search import RUN
 
     known, path = search.job.config, Path(best.user_attrs[RUN])
-    trials = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
-    rows = [("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in trials))]
-    if known.task is not None:
-        rows.insert(0, ("success", *(f"{100 * trial.user_attrs[SUCCESS]:.2f} %" for trial in trials)))
-    rows += [(name, *(str(varied(search, trial)[name]) for trial in trials)) for name in search.space.dimensions]
-    console().print(text_table(f"the best of {_count(search)}", ("trial", *(str(trial.number) for trial in trials)), rows))
+    console().print(best_table(search))
     if known.task is not None and path.is_dir():
         run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
         console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
         print(f"agent: {run.model}")
-
-
-def _count(search: Any) -> str:
-    counts = {word: len(search.trials(state)) for state, word in STATES.items()}
-    return ", ".join(f"{count} {word}" for word, count in counts.items() if count) or "no trial yet"
