@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.arrays import BoolArray, FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import Space
@@ -74,7 +74,7 @@ def _forces(tracks: Sequence[Track], length: float) -> list[tuple[FloatArray, st
 
 def _pushed(track: Track) -> list[int]:
     """Samples with a force to be shown: the first of each push, and further ones along the way of one that lasts."""
-    acts = track.wrench[:, :3].any(axis=1)
+    acts: BoolArray = np.asarray(track.wrench[:, :3].any(axis=1))
     chosen: list[int] = []
     for sample in np.flatnonzero(acts).tolist():
         if sample == 0 or not acts[sample - 1] or sample - chosen[-1] >= len(acts) / ARROWS:
