@@ -89,7 +89,7 @@ def installed(wheel, tmp_path_factory):
     venv.create(folder, with_pip=False, symlinks=os.name != "nt")
     paths = {name: Path(path) for name, path in sysconfig.get_paths("venv", {"base": folder}).items()}
     # A line in a .pth file lends the packages there, but not the link to this checkout, which is a .pth file itself.
-    lent = [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
+    lent = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     (paths["purelib"] / "lent.pth").write_text("\n".join(lent))
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", paths["scripts"] / "python")
     run(*pip, "install", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
