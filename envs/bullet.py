@@ -15,8 +15,20 @@ from sb3_quad.envs.rendering.camera import ChaseCamera
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import disconnect, has_display, open_window, point_window, start_drawing
-from sb3_quad.simulation.rotors import write_body
-from sb3_quad.simulation.state import POSITION, ROTOR_SPEEDS, STATE_SIZE, TARGET, P, QuadcopterState
+from sb3_quad.simulation.physics import rotation_rows
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    FORCE_WORLD,
+    POSITION,
+    QUATERNION,
+    ROTOR_SPEEDS,
+    STATE_SIZE,
+    TARGET,
+    TORQUE_WORLD,
+    VELOCITY,
+    P,
+    QuadcopterState,
+)
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
@@ -71,16 +83,17 @@ class BulletBody:
         p.resetBasePositionAndOrientation(self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
         p.resetBaseVelocity(self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
 
-    def fly(self, wrenches: FloatArray, world: FloatArray | None = None) -> None:
+    def fly(self, wrenches: FloatArray, wrench: FloatArray) -> None:
         """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame.
 
-        :param world: a force and a torque in the world frame that act besides, (2, 3); None: none.
+        :param wrench: (WRENCH_SIZE,), of which the world-frame parts act besides.
         """
         client, body = self.client, self.body
         push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
-        world_force, world_torque = ((), ()) if world is None else world.tolist()
+        world_force, world_torque = wrench[FORCE_WORLD].tolist(), wrench[TORQUE_WORLD].tolist()
+        is_pushed = any(world_force) or any(world_torque)
         for force, torque in wrenches.tolist():
-            if world is not None:
+            if is_pushed:
                 # A world-frame force acts at a point of the world: the centre of mass, where it is now.
                 position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
                 push(body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client)
@@ -93,7 +106,9 @@ class BulletBody:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
         position, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
         velocity, angular_velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
-        write_body(state, position, quaternion, velocity, angular_velocity)
+        x, y, z, w = quaternion
+        state[POSITION, 0], state[QUATERNION, 0], state[VELOCITY, 0] = position, (w, x, y, z), velocity
+        state[BODY_RATES, 0] = np.array(angular_velocity) @ np.array(rotation_rows(w, x, y, z))  # from the world's axes
 
     def save(self) -> bytes:
         """The whole simulation, to the bit: poses that PyBullet gives and takes are rounded."""

@@ -13,9 +13,7 @@ from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.envs.reset_options import fixed_rows
 from sb3_quad.simulation.checks import check_size
-from sb3_quad.simulation.rotors import NOT_FINITE, WORLD_FRAME_TOO, rotor_wrenches
 from sb3_quad.simulation.settings import ENDLESS
-from sb3_quad.simulation.state import FORCE_WORLD, TORQUE_WORLD
 from sb3_quad.simulation.tasks import TaskSpec
 
 
@@ -170,7 +168,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         # One row of the batched environment, whose body PyBullet moves; Gymnasium's TimeLimit truncates.
         keywords = {"task": task, "task_kwargs": task_kwargs, "max_episode_steps": ENDLESS, **keywords}
         self._make_batch(1, seed, n_threads=1, autoreset=False, **keywords)
-        self._wrenches = np.zeros((self.vehicle.substeps, 2, 3))
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
@@ -223,15 +220,11 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        batch, wrenches = self.batch, self._wrenches
-        step = self.vehicle.physics_step
+        if not np.isfinite(array).all():
+            raise ValueError(f"action {array.tolist()}: every number must be finite")
+        batch = self.batch
         with batch.lock:
-            wrench = batch.total_wrench()
-            kind = rotor_wrenches(batch.state, batch.queue, array, wrench, batch.vehicles, step, wrenches)
-            if kind == NOT_FINITE:
-                raise ValueError(f"action {array.tolist()}: every number must be finite")
-            world = np.stack([wrench[FORCE_WORLD, 0], wrench[TORQUE_WORLD, 0]]) if kind == WORLD_FRAME_TOO else None
-            self._body.fly(wrenches, world)
+            self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0])
             self._body.read(batch.state)
             observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":

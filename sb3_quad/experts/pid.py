@@ -8,7 +8,7 @@ import numpy.typing as npt
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 

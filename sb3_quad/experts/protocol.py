@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from sb3_quad.base.errors import ExpertError
+from sb3_quad.experts.rotation import nearest_rotation, quaternion_from_rotation
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.rotation import nearest_rotation, quaternion_from_rotation
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 

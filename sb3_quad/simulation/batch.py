@@ -12,8 +12,9 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
+from sb3_quad.simulation.compiled import first_call
 from sb3_quad.simulation.frames import PositionIntegral, new_frames
-from sb3_quad.simulation.kernel import ARRAYS, FLY, LOOK, OUTCOME, SCORE, StepArrays, check_arrays, new_jobs, step_arrays
+from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, Step, rotor_wrenches, step
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
@@ -22,13 +23,13 @@ from sb3_quad.simulation.sampling import GUST_FORCE, GUST_SIZE
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
-from sb3_quad.simulation.threads import batch_lock, first_run, run
+from sb3_quad.simulation.threads import batch_lock, share_out
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Rows: TypeAlias = "int | slice | Iterable[int] | npt.NDArray[Any] | None"
 MAX_ROWS, MAX_THREADS = 2**20, 2**16
-COLUMNS = {"vehicle": "vehicles", "base": "base_vehicles", "gust": "gust", "scaling": "mean"}
+_NO_ACTIONS, _NO_REWARDS = np.zeros((0, 4), np.float32), np.zeros(0, np.float32)  # of a look
 _KEPT = (  # all that future flight depends on
     *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
     *("vehicles", "gust", "frames", "integral"),
@@ -46,9 +47,7 @@ class QuadcopterBatch:
     :raises ConfigError: an argument that does not fit; a vehicle that cannot fly as the settings say.
     """
 
-    _bound: Arrays
-    _sizes: dict[str, float]
-    _jobs: list[IntArray]
+    _arrays: BatchArrays
 
     def __init__(
         self,
@@ -105,7 +104,7 @@ class QuadcopterBatch:
         self._bind()
         self.set_noise(settings.noise)
         self.set_observation_scaling(settings.observation_mean, settings.observation_std)
-        with first_run():
+        with first_call(step):
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
 
@@ -115,7 +114,7 @@ class QuadcopterBatch:
 
     def reset(self, rows: Rows = None) -> Float32Array:
         """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, size)."""
-        return self._run(LOOK, self.rows(rows)).observations
+        return self._look(self.rows(rows))
 
     def stagger(self) -> None:
         """Truncate the present episodes at times spread evenly over ``max_episode_steps``; those that follow, after it."""
@@ -123,7 +122,7 @@ class QuadcopterBatch:
 
     def observe(self) -> Float32Array:
         """The present observations, float32 (n, size), of ``observation.size``; the same numbers until the next step."""
-        return self._run(LOOK).observations
+        return self._look([])
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         """One control step of every row.
@@ -147,11 +146,34 @@ class QuadcopterBatch:
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
-        arrays = step_arrays(self.n, self.observation.size, array)
-        if not self._do(mode, arrays):
+        out = np.empty((self.n, self.observation.size), np.float32), np.empty(self.n, np.float32), np.empty(self.n, np.bool_)
+        if not self._step(mode, Step(array, *out)):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
-        return arrays.observations, arrays.rewards, arrays.dones
+        return out
+
+    def _look(self, resetting: Any) -> Float32Array:
+        observations, dones = np.empty((self.n, self.observation.size), np.float32), np.zeros(self.n, np.bool_)
+        dones[resetting] = True
+        self._step(LOOK, Step(_NO_ACTIONS, observations, _NO_REWARDS, dones))
+        return observations
+
+    def _step(self, mode: int, arrays: Step) -> bool:
+        chunks = min(self.threads, self.n // CHUNK)
+        with self.lock:
+            return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
+
+    def turn_rotors(self, actions: npt.NDArray[Any]) -> FloatArray:
+        """The rotors' part of a control step of row 0, for another simulator, whose part :meth:`score` judges.
+
+        :param actions: (n, 4), clipped to [-1, 1].
+        :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame, (substeps, 2, 3); what the
+            wrench has in the world frame acts besides.
+        """
+        wrenches = np.empty((self.vehicle_list[0].substeps, 2, 3))
+        with self.lock:
+            rotor_wrenches(actions, wrenches, *self._arrays)
+        return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
         """Of rows that have just begun an episode: nothing has ended, and the distance is that of the start."""
@@ -159,17 +181,6 @@ class QuadcopterBatch:
         self.outcome[chosen] = 0
         self.outcome["truncated"][chosen] = True
         self.outcome["distance"][chosen] = QuadcopterState(self.state[:, chosen]).distance
-
-    def _run(self, mode: int, resetting: IntArray | None = None) -> StepArrays:
-        arrays = step_arrays(self.n, self.observation.size)
-        if resetting is not None:
-            arrays.dones[resetting] = True
-        self._do(mode, arrays)
-        return arrays
-
-    def _do(self, mode: int, arrays: StepArrays) -> bool:
-        with self.lock:
-            return run(self._jobs[mode], self.threads, arrays)
 
     def rows(self, rows: Rows) -> IntArray:
         """Row numbers from None (all), a number, a slice or a sequence."""
@@ -205,15 +216,13 @@ class QuadcopterBatch:
         :raises ConfigError: the snapshot is of other environments.
         """
         with self.lock:
-            other = sorted(set(snapshot) - set(_KEPT))
-            try:
-                if other:
-                    raise ConfigError(f"{other[0]}: not part of it")
-                check_arrays({**self._bound, **snapshot}, self._sizes)
-            except ConfigError as error:
-                raise ConfigError(
-                    f"the saved state of the environments does not fit these ({error}); use the run's own settings"
-                ) from None
+            for name, array in snapshot.items():
+                own = getattr(self, name) if name in _KEPT else np.empty(0)
+                if (array.dtype, array.shape) != (own.dtype, own.shape):
+                    raise ConfigError(
+                        "the saved state of the environments does not fit these "
+                        f"({name}: {array.dtype} of shape {array.shape}); use the run's own settings"
+                    )
             for name, array in snapshot.items():
                 getattr(self, name)[...] = array
 
@@ -299,34 +308,24 @@ class QuadcopterBatch:
         return self.rows(rows)
 
     def _bind(self, **replaced: Any) -> None:
-        """Replace attributes, and write down for the compiled step where all arrays are: all of it at once, or nothing."""
+        """Replace attributes, and note all arrays for the compiled step: all of it at once, or nothing."""
         with self.lock:
             values = {**vars(self), **replaced}
             first, table = values["vehicle_list"][0], values["tasks"]
-            bound = {"task_parameters": table.parameters, "task_weights": table.weights}
-            bound = {name: bound[name] if name in bound else values[name] for name in ARRAYS}
-            sizes = {
-                "n": self.n,
-                "delay": len(self.queue),
-                "substeps": first.substeps,
+            values |= {
+                "task_parameters": table.parameters,
+                "task_weights": table.weights,
                 "physics_step": first.physics_step,
-                "tasks": table.weights.size,
-                **{f"{name}_columns": values[array].shape[1] for name, array in COLUMNS.items()},
-                "mixed_delays": self.randomize.delay is not None
-                or bool((self.base_vehicles[P.delay] != len(self.queue)).any()),
+                "substeps": first.substeps,
+                "own_delays": self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any()),
                 "own_arms": self.base_vehicles.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
-                "width": self.observation.size,
-                **dict(zip(("depth", "frame"), self.frames.shape[1:], strict=True)),
-                "ages": self.ages.size,
-                "integrals": len(self.integral),
-                "autoreset": self.autoreset,
             }
-            vars(self).update(replaced, _bound=bound, _sizes=sizes, _jobs=new_jobs(bound, sizes))
+            vars(self).update(replaced, _arrays=BatchArrays(*(values[name] for name in BatchArrays._fields)))
 
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle is made of: arrays of its own."""
         with self.lock:
-            values = {name: value for name, value in vars(self).items() if name not in ("lock", "_bound", "_jobs")}
+            values = {name: value for name, value in vars(self).items() if name not in ("lock", "_arrays")}
             return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in values.items()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:

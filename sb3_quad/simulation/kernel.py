@@ -1,47 +1,33 @@
-"""One control step of a whole batch, in one pass over its blocks, shared out between threads.
+"""One control step of a batch, block by block: a block goes through all of it while it is in the first cache.
 
-``work`` is all that the threads run. A job holds sizes and the addresses of arrays; the control array says which job is
-under way and how many of its blocks are not taken yet. Whoever comes takes the next block: a thread that is late, or never
-comes, costs time but changes nothing, since each row has a stream of its own and each block its own memory.
+A block is ``LANES`` neighbouring rows with all that a control step needs of them in one piece of memory. Its arrays have
+constant shapes and places: LLVM then knows each distance between two rows, needs no test for overlap, and vectorises the loops
+over lanes. Lanes behind the last row repeat it, so that every loop runs over all lanes: a row's numbers then never depend on
+how many others fly, or on where in the batch it stands.
 """
 
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import carray, int64
 
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.block import (
-    MEMORY,
-    block_in,
-    load_commands,
-    load_rows,
-    load_scaling,
-    load_scored,
-    load_vehicles,
-    store_observations,
-    store_state,
-)
-from sb3_quad.simulation.compiled import LANES, atomic_add, atomic_get, atomic_set, compiled, give_way, pointer
+from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.episodes import count_episode, start_episode
 from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
-from sb3_quad.simulation.layout import first_rows
-from sb3_quad.simulation.observation import OBSERVATION_SIZE, observe
-from sb3_quad.simulation.physics import fly_block
+from sb3_quad.simulation.observation import NORMALS, OBSERVATION_SIZE, WORDS, observe
+from sb3_quad.simulation.physics import command_rotors, fly, moment, turn_rotors
 from sb3_quad.simulation.random import STEP
-from sb3_quad.simulation.randomization import RANDOMIZATION
 from sb3_quad.simulation.reward import score, succeeds
-from sb3_quad.simulation.sampling import GUST_SIZE, add_gusts, advance_gusts, sample_episode
-from sb3_quad.simulation.state import STATE_SIZE, WRENCH_SIZE
-from sb3_quad.simulation.tasks import TASK, S
-from sb3_quad.simulation.vehicle_distribution import DISTRIBUTION_NUMBERS
+from sb3_quad.simulation.sampling import add_gusts, advance_gusts, sample_episode
+from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE, P, W, X
+from sb3_quad.simulation.tasks import SCORED, S, T
+from sb3_quad.simulation.threads import DONE, LEFT, finish
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
+CHUNK = 4 * LANES  # rows that a thread takes at once
 LOOK, SCORE, FLY = range(3)
-"""What a job does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a control
-step that another simulator has flown; it flies and scores one."""
+"""What :func:`step` does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a
+control step that another simulator has flown; it flies and scores one."""
 
 OUTCOME = np.dtype(
     [
@@ -58,280 +44,377 @@ OUTCOME = np.dtype(
 )
 """How the last episode of a row ended."""
 
-# Columns of vehicles and scaling: n, or 1 if all rows share the values; of gusts: n, or 0 without gusts. Control steps of an
-# episode: limits of the present ones, max_steps of those that follow. Numbers in an observation: width.
-SIZES = (
-    *("n", "delay", "substeps", "tasks", "vehicle_columns", "base_columns", "gust_columns", "scaling_columns"),
-    *("mixed_delays", "own_arms", "width", "depth", "frame", "ages", "integrals", "mode", "autoreset"),
-)
-_PARAMETERS, _COLUMNS = len(PARAMETER_NAMES), sum(TASK.values())
-_DISTRIBUTION, _RANDOMIZATION = sum(DISTRIBUTION_NUMBERS.values()), sum(RANDOMIZATION.values())
-ARRAYS: dict[str, tuple[Any, tuple[int | str, ...]]] = {  # kind of numbers, and shape, of which a name is one of the sizes
-    "state": ("f8", (STATE_SIZE, "n")),
-    "queue": ("f8", ("delay", 4, "n")),
-    "wrench": ("f8", (WRENCH_SIZE, "n")),
-    "vehicles": ("f8", (_PARAMETERS, "vehicle_columns")),  # that fly
-    "base_vehicles": ("f8", (_PARAMETERS, "base_columns")),  # before anything is random
-    "distribution_numbers": ("f8", (_DISTRIBUTION,)),
-    "randomize_numbers": ("f8", (_RANDOMIZATION,)),
-    "gust": ("f8", (GUST_SIZE, "gust_columns")),
-    "frames": ("f4", ("n", "depth", "frame")),
-    "ages": ("i8", ("ages",)),
-    "integral": ("f8", ("integrals", "n")),
-    "integral_numbers": ("f8", (4,)),
-    "streams": ("u4", (4, "n")),
-    "mean": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
-    "std": ("f8", (OBSERVATION_SIZE, "scaling_columns")),
-    "noise_level": ("f8", ("scaling_columns",)),
-    "additive_level": ("f8", ("scaling_columns",)),
-    "task_index": ("i8", ("n",)),
-    "task_parameters": ("f8", ("tasks", _COLUMNS)),
-    "task_weights": ("f8", ("tasks",)),
-    "returns": ("f8", ("n",)),
-    "limits": ("i8", ("n",)),
-    "max_steps": ("i8", ("n",)),
-    "outcome": (OUTCOME, ("n",)),
-    "last_observations": ("f4", ("n", "width")),  # of the episodes that outcome tells of
+_SCORED = tuple(getattr(T, name) for name in SCORED)
+# Of every lane: the kind of numbers, and how many or of what shape.
+_CONTENTS: dict[str, tuple[str, Any]] = {
+    "row": ("i8", ()),  # of the batch
+    "state": ("f8", STATE_SIZE),  # all its rows
+    "command": ("f8", 4),  # action, then the rotor speed it commands
+    "wanted_speeds": ("f8", 4),  # rotor speeds to be reached in this control step
+    "wrench": ("f8", WRENCH_SIZE),
+    "motor": ("f8", ()),  # km dt
+    "lift": ("f8", ()),  # kF
+    "fall": ("f8", ()),  # g dt
+    "push": ("f8", ()),  # dt / m
+    "twist": ("f8", 3),  # dt / I
+    "gyro": ("f8", 3),  # Izz - Iyy, Ixx - Izz, Iyy - Ixx
+    "thrust_middle": ("f8", ()),  # divided by kF, as is the next
+    "thrust_half_range": ("f8", ()),
+    "radius": ("f8", ()),  # of the collision sphere
+    "arm": ("f8", (3, 4)),  # moment per thrust, by axis and rotor
+    "delay": ("f8", ()),  # control steps
+    "vehicle": ("f8", len(PARAMETER_NAMES)),
+    "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
+    "reward": ("f8", ()),
+    "distance": ("f8", ()),
+    "work": ("f8", 4),
+    "mean": ("f4", OBSERVATION_SIZE),  # μ of Eq. 3.16
+    "inverse_std": ("f4", OBSERVATION_SIZE),  # 1 / σ
+    "noise_level": ("f4", ()),  # relative
+    "additive": ("f4", ()),  # level of the noise that is added, in σ
+    "noise": ("f4", NORMALS),
+    "feature": ("f4", OBSERVATION_SIZE),
+    "word": ("u4", WORDS),  # random
+    "stream": ("u4", 4),
 }
-STEP_ARRAYS = ("actions", "observations", "rewards", "dones")  # of one step
-_ADDRESSES = tuple(f"{name}_at" for name in (*ARRAYS, *STEP_ARRAYS))
-JOB = np.dtype([("physics_step", "f8"), *((name, "i8") for name in SIZES + _ADDRESSES)])
-
-# The control array, each number on a cache line of its own. Taken: whether a job is under way. From AWAKE on: whether worker k
-# is looking for blocks.
-LINE = 16
-_CONTROL = first_rows(dict.fromkeys(("left", "done", "job", "serial", "taken", "awake"), 1))
-LEFT, DONE, NOW, SERIAL, TAKEN, AWAKE = (LINE * k for k in _CONTROL)
-NOT_FINITE, BUSY, LATE, IN_TIME = range(4)
-"""What came of a job: nothing, since an action is not finite, or since another job is under way; or all is done, late if the
-last block kept the thread that brought the job waiting."""
+_WHOLE = np.dtype([(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()])
+_FIELDS: Any = dict(_WHOLE.fields or {})
+for _whole, _parts, _first in (("state", STATE, X), ("wrench", WRENCH, W)):  # each part under its name, too
+    for _name, _size in _parts.items():
+        _place = _FIELDS[_whole][1] + 8 * LANES * getattr(_first, _name)
+        _FIELDS[_name] = np.dtype(("f8", (_size, LANES))), _place
+BLOCK = np.dtype(_FIELDS)
 
 
-class StepArrays(NamedTuple):
-    """What a step is given and gives: actions (n, 4), observations (n, width), rewards (n,), dones (n,)."""
+class BatchArrays(NamedTuple):
+    """What control steps of n rows read and write. Where a shape says 1 or n, one column may serve all rows."""
 
-    actions: Float32Array
-    observations: Float32Array
-    rewards: Float32Array
-    dones: BoolArray
+    state: FloatArray  # (STATE_SIZE, n), see STATE
+    queue: FloatArray  # (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s
+    wrench: FloatArray  # (WRENCH_SIZE, n), see WRENCH
+    vehicles: FloatArray  # (parameters, 1 or n), that fly
+    base_vehicles: FloatArray  # (parameters, 1 or n), before anything is random
+    distribution_numbers: FloatArray  # VehicleDistribution.numbers()
+    randomize_numbers: FloatArray  # Randomization.numbers()
+    gust: FloatArray  # (GUST_SIZE, 0 or n)
+    frames: Float32Array  # (n, depth, frame size), depth 0 where an observation is the present features
+    ages: IntArray  # (ages,), of the frames in an observation, control steps
+    integral: FloatArray  # (0 or 3, n), of the position
+    integral_numbers: FloatArray  # (4,), see PositionIntegral
+    streams: Any  # uint32 (4, n), see random.py
+    mean: FloatArray  # (OBSERVATION_SIZE, 1 or n), μ of Eq. 3.16
+    std: FloatArray  # (OBSERVATION_SIZE, 1 or n), σ
+    noise_level: FloatArray  # (1 or n,), relative
+    additive_level: FloatArray  # (1 or n,), in σ
+    task_index: IntArray  # (n,), of the episodes under way
+    task_parameters: FloatArray  # (tasks, columns), see TASK
+    task_weights: FloatArray  # (tasks,), cumulative
+    returns: FloatArray  # (n,), of the episodes so far
+    limits: IntArray  # (n,), control steps of the episodes under way
+    max_steps: IntArray  # (n,), of those that follow
+    outcome: Any  # OUTCOME (n,)
+    last_observations: Float32Array  # (n, size), of the episodes that outcome tells of
+    physics_step: float  # s
+    substeps: int  # physics steps in a control step
+    own_delays: bool  # whether delays differ by row
+    own_arms: bool  # whether rotor positions do
+    autoreset: bool  # whether a row that ends begins its next episode within the same step
 
 
-def step_arrays(n: int, width: int, actions: Float32Array | None = None) -> StepArrays:
-    """Arrays for a step: dones are False, actions zero unless given; observations and rewards hold anything."""
-    observations = np.empty((n, width), dtype=np.float32)
-    given = np.zeros((n, 4), np.float32) if actions is None else actions
-    return StepArrays(given, observations, np.empty(n, np.float32), np.zeros(n, np.bool_))
+class Step(NamedTuple):
+    """What a control step of n rows is given and returns."""
+
+    actions: Float32Array  # (n, 4)
+    observations: Float32Array  # (n, size)
+    rewards: Float32Array  # (n,)
+    dones: BoolArray  # (n,)
 
 
-def check_arrays(arrays: Arrays, sizes: Mapping[str, float]) -> None:
-    """Refuse what compiled code, which checks no index, would read or write outside of.
+@compiled
+def step(control, leads, mode, actions, observations, rewards, dones, *arrays):
+    """A control step of all rows, of which this thread takes as many as others leave it; see :func:`.threads.share_out`.
 
-    :param arrays: each of ``ARRAYS``.
-    :param sizes: each of ``SIZES`` but the mode, and the physics step.
-    :raises ConfigError: an array of another type, shape or order in memory, or a row of a task that does not exist.
+    :param leads: whether this is the thread that returns to the batch.
+    :return: False if an action is not finite, and then nothing has happened.
     """
-    for name, (kind, shape) in ARRAYS.items():
-        array, wanted = arrays[name], tuple(int(sizes[size]) if isinstance(size, str) else size for size in shape)
-        if array.dtype != kind or array.shape != wanted or not array.flags.carray:
-            raise ConfigError(f"{name}: {array.dtype} of shape {array.shape}; needed is {np.dtype(kind)} of shape {wanted}")
-    for name in (size for size in SIZES if size.endswith("_columns")):
-        if sizes[name] not in (1, sizes["n"]) and not (sizes[name] == 0 and name == "gust_columns"):
-            raise ConfigError(f"{name} {sizes[name]}: must be 1, or one for each of {sizes['n']} rows")
-    if not ((arrays["task_index"] >= 0) & (arrays["task_index"] < sizes["tasks"])).all():
-        raise ConfigError(f"task_index: every number must be one of the {sizes['tasks']} tasks, counted from 0")
+    if leads and mode != LOOK and not _finite(actions):
+        return False
+    io = Step(actions, observations, rewards, dones)
+    _work(control, leads, mode, io, BatchArrays(*arrays), np.empty(1, BLOCK))
+    return True
 
 
-def new_jobs(arrays: Arrays, sizes: Mapping[str, float]) -> list[IntArray]:
-    """A job for each mode, a ``JOB`` viewed as int64, of arrays that must live as long; see :func:`check_arrays`."""
-    check_arrays(arrays, sizes)
-    jobs = np.zeros(3, dtype=JOB)
-    for name, value in {**sizes, **{f"{name}_at": arrays[name].ctypes.data for name in ARRAYS}}.items():
-        jobs[name] = value
-    jobs["mode"] = LOOK, SCORE, FLY
-    return [*jobs.view(np.int64).reshape(3, -1)]
-
-
-@compiled(inline="always")
-def run_block(job, number, b, fresh):
-    """One block of a job, see the modes; rows that end leave their outcome and, with ``autoreset``, begin their next episode.
-
-    What is the same for all rows is in the block already unless it is ``fresh``.
-    """
-    n = job.n
-    state = carray(pointer(job.state_at), (STATE_SIZE, n), np.float64)
-    streams = carray(pointer(job.streams_at), (4, n), np.uint32)
-    task_index = carray(pointer(job.task_index_at), (n,), np.int64)
-    tasks = carray(pointer(job.task_parameters_at), (job.tasks, _COLUMNS), np.float64)
-    vehicles = carray(pointer(job.vehicles_at), (_PARAMETERS, job.vehicle_columns), np.float64)
-    queue = carray(pointer(job.queue_at), (job.delay, 4, n), np.float64)
-    gust = carray(pointer(job.gust_at), (GUST_SIZE, job.gust_columns), np.float64)
-    wrench = carray(pointer(job.wrench_at), (WRENCH_SIZE, n), np.float64)
-    frames = carray(pointer(job.frames_at), (n, job.depth, job.frame), np.float32)
-    integral = carray(pointer(job.integral_at), (job.integrals, n), np.float64)
-    ages = carray(pointer(job.ages_at), (job.ages,), np.int64)
-    returns = carray(pointer(job.returns_at), (n,), np.float64)
-    limits = carray(pointer(job.limits_at), (n,), np.int64)
-    observations = carray(pointer(job.observations_at), (n, job.width), np.float32)
-    dones = carray(pointer(job.dones_at), (n,), np.bool_)
-    first = number * LANES
-    count = min(LANES, n - first)
-
-    if fresh or job.scaling_columns > 1:
-        scaling = job.scaling_columns
-        mean = carray(pointer(job.mean_at), (OBSERVATION_SIZE, scaling), np.float64)
-        std = carray(pointer(job.std_at), (OBSERVATION_SIZE, scaling), np.float64)
-        relative = carray(pointer(job.noise_level_at), (scaling,), np.float64)
-        additive = carray(pointer(job.additive_level_at), (scaling,), np.float64)
-        load_scaling(b, mean, std, relative, additive, first, count)
-    if job.mode > LOOK:
-        load_rows(state, first, count, b.state)
-        if fresh or job.vehicle_columns > 1:
-            load_vehicles(b, vehicles, first, count, job.physics_step, fresh or job.own_arms)
-        if fresh or job.tasks > 1:
-            load_scored(b, task_index, tasks, first, count)
-        actions = carray(pointer(job.actions_at), (n, 4), np.float32)
-        if job.mode == FLY:
-            load_rows(wrench, first, count, b.wrench)
-            if job.gust_columns > 0:
-                add_gusts(b, gust, first, count)
-            load_commands(b, actions, queue, job.mixed_delays, first, count)
-            fly_block(b, job.physics_step, job.substeps)
-            store_state(b, state, first, count)
-        score(b)
-        for lane in range(count):
-            streams[STEP, first + lane] += np.uint32(1)
-        load_rows(streams, first, count, b.stream)
-        observe(b)
-        if job.gust_columns > 0:
-            advance_gusts(b, gust, first, count)
-        if job.depth > 0:
-            numbers = carray(pointer(job.integral_numbers_at), (4,), np.float64)
-            for lane in range(count):
-                i = first + lane
-                step = int64(streams[STEP, i])
-                store_action(i, step, actions[i], frames)
-                if job.integrals > 0:
-                    integrate_position(i, b.feature, lane, b.mean, b.inverse_std, numbers, integral)
-                observe_frames(i, step, b.feature, lane, b.inverse_std, integral, ages, frames, observations)
-        else:
-            store_observations(b, observations, first, count)
-
-        rewards = carray(pointer(job.rewards_at), (n,), np.float32)
-        height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
-        ended = 0
-        for lane in range(count):
-            i = first + lane
-            returns[i] += b.reward[lane]
-            rewards[i] = b.reward[lane]
-            lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
-            dones[i] = lost | (streams[STEP, i] >= limits[i])
-            ended += dones[i]
-        if ended == 0 and job.autoreset:
-            return
-        outcome = carray(pointer(job.outcome_at), (n,), OUTCOME)
-        last = carray(pointer(job.last_observations_at), (n, job.width), np.float32)
-        for lane in range(count):
-            i = first + lane
-            if dones[i] or not job.autoreset:
-                outcome[i].collision = height[lane] <= radius[lane]
-                outcome[i].out_of_range = distance[lane] > scored[S.max_distance, lane]
-                outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
-                outcome[i].success = outcome[i].truncated and succeeds(b, lane)
-                outcome[i].distance = distance[lane]
-                outcome[i].total, outcome[i].reward = returns[i], b.reward[lane]
-                outcome[i].length = streams[STEP, i]
-                for k in range(job.width):
-                    last[i, k] = observations[i, k]
-        if not job.autoreset:
-            return
-
-    max_steps = carray(pointer(job.max_steps_at), (n,), np.int64)
-    weights = carray(pointer(job.task_weights_at), (job.tasks,), np.float64)
-    base = carray(pointer(job.base_vehicles_at), (_PARAMETERS, job.base_columns), np.float64)
-    distribution = carray(pointer(job.distribution_numbers_at), (_DISTRIBUTION,), np.float64)
-    randomization = carray(pointer(job.randomize_numbers_at), (_RANDOMIZATION,), np.float64)
-    for i in range(first, first + count):
-        if dones[i]:
-            returns[i], limits[i] = 0.0, max_steps[i]
-            count_episode(i, streams)
-            sample_episode(i, streams, base, distribution, randomization, vehicles, wrench, gust)
-            start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights)
-            if job.depth > 0:
-                clear_frames(i, frames, integral)
-    load_rows(state, first, count, b.state)
-    load_rows(streams, first, count, b.stream)
-    observe(b)
-    if job.depth > 0:
-        for lane in range(count):
-            i = first + lane
-            observe_frames(i, int64(streams[STEP, i]), b.feature, lane, b.inverse_std, integral, ages, frames, observations)
-    else:
-        store_observations(b, observations, first, count)
+@compiled
+def _work(control, leads, mode, io, a, blocks):
+    """As :func:`step`, whose actions are finite; ``blocks``: room for one, which the caller keeps."""
+    n, b = a.state.shape[1], blocks[0]
+    chunks = (n + CHUNK - 1) // CHUNK
+    if leads:
+        control[LEFT] = chunks
+    rows, found, taken = np.empty(n, np.int64), 0, 0  # those whose observations are due
+    while True:
+        left = atomic_add(control, LEFT, -1)
+        if left <= 0:
+            break
+        first = (chunks - left) * CHUNK
+        for start in range(first, min(first + CHUNK, n), LANES):
+            count = min(LANES, n - start)
+            if mode == LOOK:
+                for i in range(start, start + count):
+                    rows[found] = i
+                    found += 1
+            else:
+                found = _step_block(a, io, b, start, count, mode, taken == 0 and start == first, rows, found)
+        taken += 1
+    _look(a, io, b, rows[:found], mode == LOOK)
+    atomic_add(control, DONE, taken)
+    if leads:
+        finish(control, chunks)
 
 
 @compiled
 def _finite(actions):
     # By their bits: code compiled with fastmath may take it that no NaN exists.
-    count = 4 * actions.shape[0]
-    bits = carray(pointer(actions.ctypes.data), (count,), np.int32)
     wrong = 0
-    for i in range(count):
-        wrong += (bits[i] & 0x7F800000) == 0x7F800000
+    for bits in actions.view(np.int32).flat:
+        wrong += (bits & 0x7F800000) == 0x7F800000
     return wrong == 0
 
 
 @compiled
-def work(control, worker, patience, job, actions, observations, rewards, dones):
-    """The loop of every thread.
+def _step_block(a, io, b, first, count, mode, fresh, rows, found):
+    """One control step of a block; rows that begin their next episode are added to the ``found`` in ``rows``.
 
-    :param control: int64, see this module's constants; shared by all threads.
-    :param worker: number of a worker thread, which returns after ``patience`` looks without a block; -1 for the thread that
-        brings the job, which returns when the job is done: no interrupt, which Python sees to between two calls, leaves a
-        worker with a block. After ``patience`` looks at a block that a worker still has, it lets that have the core.
-    :param job: of the dtype ``JOB``, (1,), viewed as int64, which numba tells apart sooner; unused by workers, as are the
-        :class:`StepArrays`.
-    :return: ``NOT_FINITE``, ``BUSY``, ``LATE`` or ``IN_TIME``.
+    What is the same for all rows is in the block already unless it is ``fresh``.
     """
-    memory = np.empty(MEMORY, np.uint8)
-    blocks = int64(0)
-    if worker >= 0:
-        atomic_set(control, AWAKE + LINE * worker, 1)
-    else:
-        if not _finite(actions):
-            return NOT_FINITE
-        if atomic_set(control, TAKEN, 1) == 1:
-            return BUSY
-        own = carray(pointer(job.ctypes.data), 1, JOB)[0]
-        own.actions_at, own.observations_at = actions.ctypes.data, observations.ctypes.data
-        own.rewards_at, own.dones_at = rewards.ctypes.data, dones.ctypes.data
-        blocks = (own.n + LANES - 1) // LANES
-        atomic_set(control, DONE, 0)
-        atomic_set(control, NOW, job.ctypes.data)
-        atomic_add(control, SERIAL, 1)
-        atomic_set(control, LEFT, blocks)
-    idle = 0
-    known = int64(-1)  # the job whose common numbers lie in this thread's block
-    while True:
-        b = block_in(memory)  # in the loop: numba frees what is not used again
-        if atomic_get(control, LEFT) > 0:
-            number = atomic_add(control, LEFT, -1) - 1
-            if number >= 0:
-                # Whoever holds a block keeps its job under way, so what is read from here on belongs together.
-                address, serial = atomic_get(control, NOW), atomic_get(control, SERIAL)
-                run_block(carray(pointer(address), 1, JOB)[0], number, b, serial != known)
-                known = serial
-                atomic_add(control, DONE, 1)
-                idle = 0
-        elif worker < 0 and atomic_get(control, DONE) == blocks:
-            atomic_set(control, TAKEN, 0)
-            return LATE if idle > patience else IN_TIME
-        idle += 1
-        if idle > patience:
-            if worker < 0:
-                give_way()
-                continue
-            atomic_set(control, AWAKE + LINE * worker, 0)
-            if atomic_get(control, LEFT) <= 0:
-                return IN_TIME
-            atomic_set(control, AWAKE + LINE * worker, 1)
-            idle = 0
+    for lane in range(LANES):
+        b.row[lane] = first + min(lane, count - 1)
+    if fresh or a.mean.shape[1] > 1:
+        _load_scaling(a, b)
+    _load_rows(a.state, first, count, b.state)
+    if fresh or a.vehicles.shape[1] > 1:
+        _load_vehicles(a, b, first, count, fresh or a.own_arms)
+    if fresh or a.task_weights.shape[0] > 1:
+        _load_scored(a, b)
+    if mode == FLY:
+        _load_rows(a.wrench, first, count, b.wrench)
+        if a.gust.shape[1] > 0:
+            add_gusts(b, a.gust, first, count)
+        _load_commands(io.actions, a.queue, a.own_delays, b, first, count)
+        fly(b, a.physics_step, a.substeps)
+        for k in range(X.target):
+            for lane in range(count):
+                a.state[k, first + lane] = b.state[k, lane]
+    score(b)
+    for lane in range(count):
+        a.streams[STEP, first + lane] += np.uint32(1)
+    _load_rows(a.streams, first, count, b.stream)
+    observe(b)
+    if a.gust.shape[1] > 0:
+        advance_gusts(b, a.gust, first, count)
+    if a.frames.shape[1] > 0:
+        for lane in range(count):
+            i = first + lane
+            store_action(i, np.int64(b.stream[STEP, lane]), io.actions[i], a.frames)
+            if a.integral.shape[0] > 0:
+                integrate_position(i, b.feature, lane, b.mean, b.inverse_std, a.integral_numbers, a.integral)
+    _write_observations(a, b, count, io.observations)
+    return _end(a, io, b, first, count, rows, found)
+
+
+@compiled
+def _end(a, io, b, first, count, rows, found):
+    """The rewards of a block, and which rows have ended and how."""
+    height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
+    ends = 0
+    for lane in range(count):
+        i = first + lane
+        a.returns[i] += b.reward[lane]
+        io.rewards[i] = b.reward[lane]
+        lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
+        io.dones[i] = lost | (b.stream[STEP, lane] >= a.limits[i])
+        ends += io.dones[i]
+    if ends == 0 and a.autoreset:
+        return found
+    for lane in range(count):
+        i = first + lane
+        if io.dones[i] or not a.autoreset:
+            outcome = a.outcome[i]
+            outcome.collision = height[lane] <= radius[lane]
+            outcome.out_of_range = distance[lane] > scored[S.max_distance, lane]
+            outcome.truncated = not (outcome.collision or outcome.out_of_range)
+            outcome.success = outcome.truncated and succeeds(b, lane)
+            outcome.distance = distance[lane]
+            outcome.total, outcome.reward = a.returns[i], b.reward[lane]
+            outcome.length = b.stream[STEP, lane]
+            for k in range(io.observations.shape[1]):
+                a.last_observations[i, k] = io.observations[i, k]
+            if a.autoreset:
+                rows[found] = i
+                found += 1
+    return found
+
+
+@compiled
+def _look(a, io, b, rows, fresh):
+    """Observations of some rows, after those that are done have begun their next episode; ``fresh``: see above."""
+    for first in range(0, len(rows), LANES):
+        count = min(LANES, len(rows) - first)
+        for lane in range(LANES):
+            b.row[lane] = rows[first + min(lane, count - 1)]
+        for lane in range(count):
+            if io.dones[b.row[lane]]:
+                _begin(a, b.row[lane])
+        if fresh or a.mean.shape[1] > 1:
+            _load_scaling(a, b)
+        for lane in range(LANES):
+            for k in range(STATE_SIZE):
+                b.state[k, lane] = a.state[k, b.row[lane]]
+            for k in range(4):
+                b.stream[k, lane] = a.streams[k, b.row[lane]]
+        observe(b)
+        _write_observations(a, b, count, io.observations)
+
+
+@compiled
+def _begin(a, i):
+    """Begin the next episode of row i."""
+    a.returns[i], a.limits[i] = 0.0, a.max_steps[i]
+    count_episode(i, a.streams)
+    sample_episode(i, a.streams, a.base_vehicles, a.distribution_numbers, a.randomize_numbers, a.vehicles, a.wrench, a.gust)
+    start_episode(i, a.state, a.queue, a.streams, a.task_index, a.vehicles, a.task_parameters, a.task_weights)
+    if a.frames.shape[1] > 0:
+        clear_frames(i, a.frames, a.integral)
+
+
+@compiled
+def _write_observations(a, b, count, out):
+    """The observations of a block to its rows of ``out``, float32 (n, size)."""
+    for lane in range(count):
+        i = b.row[lane]
+        if a.frames.shape[1] > 0:
+            observe_frames(
+                i, np.int64(b.stream[STEP, lane]), b.feature, lane, b.inverse_std, a.integral, a.ages, a.frames, out
+            )
+        else:
+            for k in range(OBSERVATION_SIZE):
+                out[i, k] = b.feature[k, lane]
+
+
+@compiled
+def _load_rows(source, first, count, target):
+    """Some columns of a (rows, n) array to a block, or one column for all lanes."""
+    for k in range(target.shape[0]):
+        if source.shape[1] == 1:
+            for lane in range(LANES):
+                target[k, lane] = source[k, 0]
+        elif count == LANES:
+            for lane in range(LANES):
+                target[k, lane] = source[k, first + lane]
+        else:
+            for lane in range(LANES):
+                target[k, lane] = source[k, first + min(lane, count - 1)]
+
+
+@compiled
+def _load_vehicles(a, b, first, count, arms):
+    """What the control step needs of the vehicles of a block, with the divisions done; without ``arms`` those stay."""
+    _load_rows(a.vehicles, first, count, b.vehicle)
+    v, dt = b.vehicle, a.physics_step
+    for lane in range(LANES):
+        ixx, iyy, izz, lift = v[P.ixx, lane], v[P.iyy, lane], v[P.izz, lane], v[P.thrust_coefficient, lane]
+        b.motor[lane], b.push[lane] = v[P.motor_gain, lane] * dt, dt / v[P.mass, lane]
+        b.fall[lane], b.lift[lane] = v[P.gravity, lane] * dt, lift
+        b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
+        b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
+        b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
+        b.thrust_half_range[lane] = v[P.thrust_half_range, lane] / lift
+        b.radius[lane], b.delay[lane] = v[P.collision_radius, lane], v[P.delay, lane]
+    if arms:
+        for axis in range(3):
+            for rotor in range(4):
+                for lane in range(LANES):
+                    b.arm[axis, rotor, lane] = v[P.roll_arm_0 + 4 * axis + rotor, lane]
+
+
+@compiled
+def _load_commands(actions, queue, own_delays, b, first, count):
+    """Actions into the delay's end, or where delays differ the row's own, and what leaves it into the wanted speeds."""
+    command, wanted, own = b.command, b.wanted_speeds, b.delay
+    delay = queue.shape[0]
+    for lane in range(LANES):
+        for k in range(4):
+            command[k, lane] = actions[b.row[lane], k]
+    command_rotors(b)
+    if delay == 0:
+        for k in range(4):
+            for lane in range(LANES):
+                wanted[k, lane] = command[k, lane]
+        return
+    for k in range(4):
+        for lane in range(LANES):
+            wanted[k, lane] = queue[0, k, b.row[lane]]
+        for late in range(delay - 1):
+            here, behind = queue[late, k, first : first + count], queue[late + 1, k, first : first + count]
+            for lane in range(count):
+                # Both are read whichever is taken, and the rows are views: else the loop is not vectorised.
+                new, old = command[k, lane], behind[lane]
+                here[lane] = new if own_delays and own[lane] == late + 1.0 else old
+        if own_delays:
+            for lane in range(LANES):
+                new, old = command[k, lane], wanted[k, lane]
+                wanted[k, lane] = new if own[lane] == 0.0 else old
+        for lane in range(count):
+            queue[delay - 1, k, first + lane] = command[k, lane]
+
+
+@compiled
+def _load_scored(a, b):
+    """Limits and costs of the tasks that the rows of a block are flying."""
+    for lane in range(LANES):
+        task = 0 if a.task_weights.shape[0] == 1 else a.task_index[b.row[lane]]
+        for k in range(len(_SCORED)):
+            b.scored[k, lane] = a.task_parameters[task, _SCORED[k]]
+
+
+@compiled
+def _load_scaling(a, b):
+    """μ, 1/σ and the noise levels of a block, in float32."""
+    for lane in range(LANES):
+        i = 0 if a.mean.shape[1] == 1 else b.row[lane]
+        b.noise_level[lane], b.additive[lane] = a.noise_level[i], a.additive_level[i]
+        for k in range(OBSERVATION_SIZE):
+            b.mean[k, lane] = a.mean[k, i]
+            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(a.std[k, i])
+
+
+@compiled
+def rotor_wrenches(actions, out, *arrays):
+    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body itself.
+
+    Motors do not feel the body, so that all physics steps of a control step can be worked out before it moves.
+
+    :param actions: float32 (n, 4), clipped to [-1, 1].
+    :param out: (substeps, 2, 3): what rotors and wrench do in each physics step, force (N) and torque (N m), body frame.
+    """
+    _turn_rotors(actions, out, BatchArrays(*arrays), np.empty(1, BLOCK))
+
+
+@compiled
+def _turn_rotors(actions, out, a, blocks):
+    b = blocks[0]
+    b.row[:] = 0
+    _load_rows(a.state, 0, 1, b.state)
+    _load_rows(a.wrench, 0, 1, b.wrench)
+    if a.gust.shape[1] > 0:
+        add_gusts(b, a.gust, 0, 1)
+    _load_vehicles(a, b, 0, 1, True)
+    _load_commands(actions, a.queue, a.own_delays, b, 0, 1)
+    for each in range(len(out)):
+        f0, f1, f2, f3 = turn_rotors(b, 0)
+        for axis in range(3):
+            out[each, 0, axis] = b.force_body[axis, 0]
+            out[each, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0, f0, f1, f2, f3)
+        out[each, 0, 2] += (f0 + f1) + (f2 + f3)
+    for rotor in range(4):
+        a.state[X.rotor_speeds + rotor, 0] = b.rotor_speeds[rotor, 0]

@@ -11,8 +11,8 @@ from numba import float32
 
 from sb3_quad.simulation.compiled import LANES, compiled
 from sb3_quad.simulation.layout import first_rows, row_slices
+from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.simulation.random import random_words, standard_normals
-from sb3_quad.simulation.rotation import rotation_rows
 
 
 class Feature(NamedTuple):
@@ -44,6 +44,7 @@ FEATURE_NAMES = tuple(f"{feature.each}_{part}" for feature in FEATURES for part 
 OBSERVATION_SIZE = len(FEATURE_NAMES)
 NORMALS = -(-OBSERVATION_SIZE // 2) * 2  # of the noise, each from a random word
 GUST_WORDS = NORMALS  # where the two random words of a gust begin, behind those
+WORDS = -(-(GUST_WORDS + 2) // 4) * 4  # random words of a control step
 DEFAULT_MEAN = np.zeros(OBSERVATION_SIZE)
 DEFAULT_STD = np.concatenate([np.full(len(feature.parts), feature.std) for feature in FEATURES])
 
@@ -81,11 +82,11 @@ def _disturb_and_scale(b):
     for k in range(OBSERVATION_SIZE):
         for lane in range(LANES):
             relative = b.noise_level[lane] * feature[k, lane]
-            if added == float32(0.0):
-                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
-            else:
+            noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+            if added > float32(0.0):
                 fixed = b.additive[lane] / inverse_std[k, lane]
-                noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
+                both = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
+                noisy = noisy if b.additive[lane] == float32(0.0) else both
             feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
 
 

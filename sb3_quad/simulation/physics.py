@@ -1,5 +1,7 @@
 """The physics of one control step of a block: the rotors (Eq. 4.1), the external wrench, and PyBullet's integrator.
 
+The rotors are the same where PyBullet moves the body.
+
 Per physics step, as PyBullet does it for the floating base of a multibody: v += dt F/m and ω += dt I⁻¹(τ - ω×Iω), explicit;
 world components of v and ω cut at 100; then position and attitude by the new velocities, the attitude by the exact
 exponential of ω dt with dt |ω| cut at π/4. Against PyBullet the difference is rounding (1e-12 over 400 control steps).
@@ -10,46 +12,74 @@ The body rates stay in the body frame: a rotation about ω leaves ω as it is, s
 import math
 
 from sb3_quad.simulation.compiled import LANES, compiled
-from sb3_quad.simulation.rotation import rotation_rows
-from sb3_quad.simulation.state import W
 
 MAX_COORDINATE_VELOCITY = 100.0  # btMultiBody's m_maxCoordinateVelocity, m/s and rad/s
 MAX_HALF_ANGLE = math.pi / 8.0  # btMultiBody's ANGULAR_MOTION_THRESHOLD, halved
 SMALL_STEP = 0.0025  # s; up to here half of dt |ω| stays below 0.2166, whatever ω the cut at 100 lets through
 
 
+@compiled(inline="always")
+def rotation_rows(qw, qx, qy, qz):
+    """The rotation matrix of a unit quaternion, body to world, row by row."""
+    return (
+        (1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)),
+        (2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)),
+        (2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)),
+    )
+
+
+@compiled(fastmath=True)
+def command_rotors(b):
+    """``b.command``: rotor speeds from actions (Eqs. 3.18 and 2.4), in place."""
+    for lane in range(LANES):
+        for k in range(4):
+            action = min(max(b.command[k, lane], -1.0), 1.0)
+            b.command[k, lane] = math.sqrt(b.thrust_middle[lane] + b.thrust_half_range[lane] * action)
+
+
+@compiled(inline="always")
+def turn_rotors(b, lane):
+    """The rotor speeds of a lane one physics step later (Eq. 4.1), in place; their thrusts, N (Eq. 2.4)."""
+    s, wanted, motor = b.rotor_speeds, b.wanted_speeds, b.motor[lane]
+    s0 = s[0, lane] + motor * (wanted[0, lane] - s[0, lane])
+    s1 = s[1, lane] + motor * (wanted[1, lane] - s[1, lane])
+    s2 = s[2, lane] + motor * (wanted[2, lane] - s[2, lane])
+    s3 = s[3, lane] + motor * (wanted[3, lane] - s[3, lane])
+    s[0, lane], s[1, lane], s[2, lane], s[3, lane] = s0, s1, s2, s3
+    lift = b.lift[lane]
+    return lift * s0 * s0, lift * s1 * s1, lift * s2 * s2, lift * s3 * s3
+
+
+@compiled(inline="always")
+def moment(b, axis, lane, f0, f1, f2, f3):
+    """The moment of rotor thrusts about a body axis, N m (Eq. 2.7, any layout)."""
+    arm = b.arm
+    return (arm[axis, 0, lane] * f0 + arm[axis, 1, lane] * f1) + (arm[axis, 2, lane] * f2 + arm[axis, 3, lane] * f3)
+
+
 @compiled(fastmath=True)
 def accelerate(b):
     """Rotor speeds, velocities and body rates after one physics step; whether some may exceed PyBullet's cut."""
-    s, wanted, q, v, w, wrench, arm = b.rotor_speeds, b.wanted_speeds, b.quaternion, b.velocity, b.body_rates, b.wrench, b.arm
-    gyro, twist, largest = b.gyro, b.twist, b.work[0]
+    q, v, w, gyro, twist, largest = b.quaternion, b.velocity, b.body_rates, b.gyro, b.twist, b.work[0]
+    force_world, force_body, torque_world, torque_body = b.force_world, b.force_body, b.torque_world, b.torque_body
     for lane in range(LANES):
-        motor = b.motor[lane]
-        s0 = s[0, lane] + motor * (wanted[0, lane] - s[0, lane])
-        s1 = s[1, lane] + motor * (wanted[1, lane] - s[1, lane])
-        s2 = s[2, lane] + motor * (wanted[2, lane] - s[2, lane])
-        s3 = s[3, lane] + motor * (wanted[3, lane] - s[3, lane])
-        s[0, lane], s[1, lane], s[2, lane], s[3, lane] = s0, s1, s2, s3
-        lift = b.lift[lane]
-        f0, f1, f2, f3 = lift * s0 * s0, lift * s1 * s1, lift * s2 * s2, lift * s3 * s3
-
+        f0, f1, f2, f3 = turn_rotors(b, lane)
         (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(q[0, lane], q[1, lane], q[2, lane], q[3, lane])
-        fx, fy = wrench[W.force_body, lane], wrench[W.force_body + 1, lane]
-        fz = wrench[W.force_body + 2, lane] + ((f0 + f1) + (f2 + f3))
+        fx, fy, fz = force_body[0, lane], force_body[1, lane], force_body[2, lane] + ((f0 + f1) + (f2 + f3))
         push = b.push[lane]
-        vx = v[0, lane] + push * (wrench[W.force_world, lane] + r00 * fx + r01 * fy + r02 * fz)
-        vy = v[1, lane] + push * (wrench[W.force_world + 1, lane] + r10 * fx + r11 * fy + r12 * fz)
-        vz = v[2, lane] + push * (wrench[W.force_world + 2, lane] + r20 * fx + r21 * fy + r22 * fz) - b.fall[lane]
+        vx = v[0, lane] + push * (force_world[0, lane] + r00 * fx + r01 * fy + r02 * fz)
+        vy = v[1, lane] + push * (force_world[1, lane] + r10 * fx + r11 * fy + r12 * fz)
+        vz = v[2, lane] + push * (force_world[2, lane] + r20 * fx + r21 * fy + r22 * fz) - b.fall[lane]
         v[0, lane], v[1, lane], v[2, lane] = vx, vy, vz
 
-        gx, gy, gz = wrench[W.torque_world, lane], wrench[W.torque_world + 1, lane], wrench[W.torque_world + 2, lane]
+        gx, gy, gz = torque_world[0, lane], torque_world[1, lane], torque_world[2, lane]
         wx, wy, wz = w[0, lane], w[1, lane], w[2, lane]
-        tx = wrench[W.torque_body, lane] + r00 * gx + r10 * gy + r20 * gz - gyro[0, lane] * wy * wz
-        ty = wrench[W.torque_body + 1, lane] + r01 * gx + r11 * gy + r21 * gz - gyro[1, lane] * wz * wx
-        tz = wrench[W.torque_body + 2, lane] + r02 * gx + r12 * gy + r22 * gz - gyro[2, lane] * wx * wy
-        tx += (arm[0, 0, lane] * f0 + arm[0, 1, lane] * f1) + (arm[0, 2, lane] * f2 + arm[0, 3, lane] * f3)
-        ty += (arm[1, 0, lane] * f0 + arm[1, 1, lane] * f1) + (arm[1, 2, lane] * f2 + arm[1, 3, lane] * f3)
-        tz += (arm[2, 0, lane] * f0 + arm[2, 1, lane] * f1) + (arm[2, 2, lane] * f2 + arm[2, 3, lane] * f3)
+        tx = torque_body[0, lane] + r00 * gx + r10 * gy + r20 * gz - gyro[0, lane] * wy * wz
+        ty = torque_body[1, lane] + r01 * gx + r11 * gy + r21 * gz - gyro[1, lane] * wz * wx
+        tz = torque_body[2, lane] + r02 * gx + r12 * gy + r22 * gz - gyro[2, lane] * wx * wy
+        tx += moment(b, 0, lane, f0, f1, f2, f3)
+        ty += moment(b, 1, lane, f0, f1, f2, f3)
+        tz += moment(b, 2, lane, f0, f1, f2, f3)
         wx += twist[0, lane] * tx
         wy += twist[1, lane] * ty
         wz += twist[2, lane] * tz
@@ -148,7 +178,7 @@ def move_far(b, dt):
 
 
 @compiled(inline="always")
-def fly_block(b, physics_step, substeps):
+def fly(b, physics_step, substeps):
     """The physics steps of one control step of a loaded block, in place."""
     for _ in range(substeps):
         if accelerate(b):

@@ -17,7 +17,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.layout import first_rows, row_slices
-from sb3_quad.simulation.rotation import rotation_rows
+from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
 STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}

@@ -1,128 +1,93 @@
-"""The threads that share a batch's work, and the line that says that numba compiles.
+"""Threads that share a compiled function's work in chunks, and the locks of batches.
 
-Numba's own thread pools do not suit small batches: one sleeps and takes tens of microseconds to start, another spins
-between calls, fights torch for the cores and forbids fork. Here a worker looks for blocks for some microseconds after its
-last one, then sleeps; nobody waits for it unless it holds a block.
+Whoever comes takes the next chunk: a thread that is late, or never comes, costs time but changes nothing. Numba's own pools do
+not suit: one spins between calls and fights torch for the cores, and forbids fork.
 """
 
 import os
-import sys
+import queue
 import threading
 import weakref
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
-from numba.core import event
 
-from sb3_quad.base.arrays import IntArray
-from sb3_quad.base.cores import available_cpus
-from sb3_quad.simulation.cache import compiled_by_one
-from sb3_quad.simulation.compiled import LANES
-from sb3_quad.simulation.kernel import AWAKE, BUSY, JOB, LATE, LINE, NOT_FINITE, StepArrays, step_arrays, work
+from sb3_quad.simulation.compiled import atomic_add, compiled, give_way
 
-PATIENCE = 20_000  # looks for a block before a worker sleeps: some 30 microseconds
-WORTHWHILE = 3  # blocks; fewer are done before a worker has woken
-REST = 100  # jobs done without workers after one kept a job waiting: its core is busy with something else
-MOST = 64  # workers
+LEFT, DONE, LATE, CONTROL = 0, 16, 32, 48  # places in a control array, each on a cache line of its own, and its size
+SPIN = 20_000  # looks at a chunk that another thread still has, before that gets the core: some 30 microseconds
+PATIENCE = 5_000  # looks after that, with which the call counts as late: longer than a chunk takes
+REST = 100  # calls without other threads after a late one: their core is busy with something else
 
 
-class Workers:
-    """Threads that take blocks of whatever job is under way; one job at a time."""
+@compiled
+def finish(control, chunks):
+    """Wait for the chunks that other threads still have, and note in ``control[LATE]`` whether one has lost its core."""
+    looks = 0
+    while atomic_add(control, DONE, 0) < chunks:
+        looks += 1
+        if looks > SPIN:
+            give_way()
+    control[LATE] = looks > SPIN + PATIENCE
+
+
+class _Pool:
+    """Threads that sleep until there is a call to take chunks of."""
 
     def __init__(self) -> None:
-        self.control = np.zeros(AWAKE + LINE * max(available_cpus(), MOST), dtype=np.int64)
-        self.resting = 0
-        self._lock = threading.Lock()
-        self._asleep: list[threading.Lock] = []  # a worker sleeps by locking its own twice
+        self.begun = self.resting = 0
+        self.calls: queue.SimpleQueue[tuple[Callable[..., Any], Any]] = queue.SimpleQueue()
 
-    def wake(self, count: int) -> None:
-        """Have ``count`` workers look for blocks."""
-        with self._lock:
-            for number in range(len(self._asleep), count):
-                asleep = threading.Lock()
-                threading.Thread(
-                    target=_loop, args=(self.control, number, asleep), daemon=True, name="sb3_quad worker"
-                ).start()
-                self._asleep.append(asleep)
-            for k in range(count):
-                if not self.control[AWAKE + LINE * k] and self._asleep[k].locked():
-                    self._asleep[k].release()
+    def help(self) -> None:
+        while True:
+            function, arguments = self.calls.get()
+            function(*arguments)
+            del function, arguments  # nothing stays alive while this thread sleeps
 
 
-def _loop(control: IntArray, number: int, asleep: threading.Lock) -> None:
-    nothing = np.zeros(1, dtype=JOB).view(np.int64), *step_arrays(1, 1)
-    while True:
-        asleep.acquire()
-        work(control, number, PATIENCE, *nothing)
+_pool = _Pool()
+_locks: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
-_workers = Workers()
-_batch_locks: weakref.WeakSet[Any] = weakref.WeakSet()
+def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> Any:
+    """``function(control, True, *arguments)``, while up to so many threads call it with False; what it returns here.
+
+    :param function: a compiled one. With True it sets ``control[LEFT]`` to the number of chunks first, and at its end calls
+        :func:`finish`. In all threads it takes chunks by ``atomic_add(control, LEFT, -1)`` and counts those done in
+        ``control[DONE]``. It is one call, since an interrupt, which Python sees to between two calls, must leave nothing half
+        done.
+    """
+    pool = _pool
+    control = np.zeros(CONTROL, dtype=np.int64)
+    if pool.resting > 0:
+        pool.resting -= 1
+        helpers = 0
+    while pool.begun < helpers:
+        threading.Thread(target=pool.help, daemon=True, name="sb3_quad").start()
+        pool.begun += 1
+    for _ in range(helpers):
+        pool.calls.put((function, (control, False, *arguments)))
+    result = function(control, True, *arguments)
+    if control[LATE]:
+        pool.resting = REST
+    return result
 
 
 def batch_lock() -> AbstractContextManager[Any]:
     """A lock for a batch, which one thread may take several times; free in a forked child, whatever the parent was at."""
     lock = threading.RLock()
-    _batch_locks.add(lock)
+    _locks.add(lock)
     return lock
 
 
 def _renew() -> None:
-    global _workers
-    _workers = Workers()  # a forked child has no threads but the one that forked
-    for lock in _batch_locks:
+    global _pool
+    _pool = _Pool()  # a forked child has no threads but the one that forked
+    for lock in _locks:
         lock._at_fork_reinit()
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_renew)
-
-
-def run(job: IntArray, threads: int, arrays: StepArrays) -> bool:
-    """Do a job, see :func:`~.work.work`, by up to ``threads`` threads.
-
-    :return: False if an action is not finite, and then nothing has happened.
-    """
-    workers = _workers
-    blocks = -(-len(arrays.dones) // LANES)
-    count = min(threads, blocks, MOST) - 1 if blocks >= WORTHWHILE else 0
-    if count > 0 and workers.resting > 0:
-        workers.resting -= 1
-        count = 0
-    outcome = BUSY
-    if count > 0:
-        workers.wake(count)
-        outcome = work(workers.control, -1, PATIENCE, job, *arrays)
-        if outcome == LATE:
-            workers.resting = REST
-    if outcome == BUSY:
-        alone = np.zeros(AWAKE, dtype=np.int64)  # a control array that no worker looks at
-        outcome = work(alone, -1, PATIENCE, job, *arrays)
-    return bool(outcome != NOT_FINITE)
-
-
-@contextmanager
-def first_run() -> Iterator[None]:
-    """Around a :func:`run` that may compile: of processes that start together one does, and says so, the others wait."""
-    with compilation_notice(), compiled_by_one(work):
-        yield
-
-
-def compilation_notice() -> AbstractContextManager[None]:
-    """Say on stderr, once, that numba compiles something meanwhile; what it finds in its cache is not compiled."""
-    notice: AbstractContextManager[None] = event.install_listener("numba:compile", _Notice())
-    return notice
-
-
-class _Notice(event.Listener):
-    told = False
-
-    def on_start(self, event: event.Event) -> None:
-        if not self.told:
-            sys.stderr.write("sb3_quad: compiling the simulation, once; it is kept for later runs (about 15 s)\n")
-        self.told = True
-
-    def on_end(self, event: event.Event) -> None:
-        pass

@@ -3,17 +3,6 @@
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.simulation.compiled import compiled
-
-
-@compiled(inline="always")
-def rotation_rows(qw, qx, qy, qz):
-    """The rotation matrix of a unit quaternion, row by row; for compiled code."""
-    return (
-        (1.0 - 2.0 * (qy * qy + qz * qz), 2.0 * (qx * qy - qw * qz), 2.0 * (qx * qz + qw * qy)),
-        (2.0 * (qx * qy + qw * qz), 1.0 - 2.0 * (qx * qx + qz * qz), 2.0 * (qy * qz - qw * qx)),
-        (2.0 * (qx * qz - qw * qy), 2.0 * (qy * qz + qw * qx), 1.0 - 2.0 * (qx * qx + qy * qy)),
-    )
 
 
 def nearest_rotation(matrices: FloatArray) -> FloatArray:
