@@ -14,7 +14,7 @@ from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import first_call
 from sb3_quad.simulation.frames import PositionIntegral, new_frames
-from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, Step, rotor_wrenches, step
+from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, rotor_wrenches, step
 from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
@@ -147,7 +147,7 @@ class QuadcopterBatch:
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
         out = np.empty((self.n, self.observation.size), np.float32), np.empty(self.n, np.float32), np.empty(self.n, np.bool_)
-        if not self._step(mode, Step(array, *out)):
+        if not self._step(mode, array, *out):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
         return out
@@ -155,10 +155,10 @@ class QuadcopterBatch:
     def _look(self, resetting: Any) -> Float32Array:
         observations, dones = np.empty((self.n, self.observation.size), np.float32), np.zeros(self.n, np.bool_)
         dones[resetting] = True
-        self._step(LOOK, Step(_NO_ACTIONS, observations, _NO_REWARDS, dones))
+        self._step(LOOK, _NO_ACTIONS, observations, _NO_REWARDS, dones)
         return observations
 
-    def _step(self, mode: int, arrays: Step) -> bool:
+    def _step(self, mode: int, *arrays: npt.NDArray[Any]) -> bool:
         chunks = min(self.threads, self.n // CHUNK)
         with self.lock:
             return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
@@ -172,7 +172,8 @@ class QuadcopterBatch:
         """
         wrenches = np.empty((self.vehicle_list[0].substeps, 2, 3))
         with self.lock:
-            rotor_wrenches(actions, wrenches, *self._arrays)
+            a = self._arrays
+            rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, a.physics_step, a.own_delays)
         return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
+from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.episodes import count_episode, start_episode
 from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
@@ -84,6 +84,7 @@ for _whole, _parts, _first in (("state", STATE, X), ("wrench", WRENCH, W)):  # e
         _place = _FIELDS[_whole][1] + 8 * LANES * getattr(_first, _name)
         _FIELDS[_name] = np.dtype(("f8", (_size, LANES))), _place
 BLOCK = np.dtype(_FIELDS)
+_SIZE = BLOCK.itemsize
 
 
 class BatchArrays(NamedTuple):
@@ -121,55 +122,174 @@ class BatchArrays(NamedTuple):
     autoreset: bool  # whether a row that ends begins its next episode within the same step
 
 
-class Step(NamedTuple):
-    """What a control step of n rows is given and returns."""
-
-    actions: Float32Array  # (n, 4)
-    observations: Float32Array  # (n, size)
-    rewards: Float32Array  # (n,)
-    dones: BoolArray  # (n,)
-
-
 @compiled
-def step(control, leads, mode, actions, observations, rewards, dones, *arrays):
+def step(
+    control, leads, mode, actions, observations, rewards, dones,
+    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers, gust,
+    frames, ages, integral, integral_numbers, streams, mean, std, noise_level, additive_level,
+    task_index, task_parameters, task_weights, returns, limits, max_steps, outcome, last_observations,
+    physics_step, substeps, own_delays, own_arms, autoreset,
+):  # fmt: skip
     """A control step of all rows, of which this thread takes as many as others leave it; see :func:`.threads.share_out`.
 
+    Arrays as flat arguments: with them in a named tuple numba took twice as long to compile, and each block a tenth longer.
+
     :param leads: whether this is the thread that returns to the batch.
+    :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and ``dones`` bool (n,) are
+        written; the others are :class:`BatchArrays`.
     :return: False if an action is not finite, and then nothing has happened.
     """
-    if leads and mode != LOOK and not _finite(actions):
-        return False
-    io = Step(actions, observations, rewards, dones)
-    _work(control, leads, mode, io, BatchArrays(*arrays), np.empty(1, BLOCK))
-    return True
-
-
-@compiled
-def _work(control, leads, mode, io, a, blocks):
-    """As :func:`step`, whose actions are finite; ``blocks``: room for one, which the caller keeps."""
-    n, b = a.state.shape[1], blocks[0]
+    n = state.shape[1]
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
+        if mode != LOOK and not _finite(actions):
+            return False
         control[LEFT] = chunks
-    rows, found, taken = np.empty(n, np.int64), 0, 0  # those whose observations are due
+    blocks = _new_block()
+    rows, found, taken, fresh = np.empty(n, np.int64), 0, 0, True  # rows whose observations are due
     while True:
         left = atomic_add(control, LEFT, -1)
         if left <= 0:
             break
-        first = (chunks - left) * CHUNK
-        for start in range(first, min(first + CHUNK, n), LANES):
-            count = min(LANES, n - start)
-            if mode == LOOK:
-                for i in range(start, start + count):
+        taken += 1
+        chunk = (chunks - left) * CHUNK
+        if mode == LOOK:
+            for i in range(chunk, min(chunk + CHUNK, n)):
+                rows[found] = i
+                found += 1
+            continue
+        for first in range(chunk, min(chunk + CHUNK, n), LANES):
+            b = blocks[0]  # here: numba frees an array after its last use, whatever points into it
+            count = min(LANES, n - first)
+            # What is the same for all rows is in the block already unless it is fresh.
+            for lane in range(LANES):
+                b.row[lane] = first + min(lane, count - 1)
+            if fresh or mean.shape[1] > 1:
+                _load_scaling(b, mean, std, noise_level, additive_level)
+            if fresh or vehicles.shape[1] > 1:
+                _load_vehicles(b, vehicles, first, count, physics_step, fresh or own_arms)
+            if fresh or task_weights.shape[0] > 1:
+                _load_scored(b, task_index, task_parameters)
+            fresh = False
+            _load_rows(state, first, count, b.state)
+            if mode == FLY:
+                _load_rows(wrench, first, count, b.wrench)
+                if gust.shape[1] > 0:
+                    add_gusts(b, gust, first, count)
+                _load_commands(actions, queue, own_delays, b, first, count)
+                fly(b, physics_step, substeps)
+                for k in range(X.target):
+                    for lane in range(count):
+                        state[k, first + lane] = b.state[k, lane]
+            score(b)
+            for lane in range(count):
+                streams[STEP, first + lane] += np.uint32(1)
+            _load_rows(streams, first, count, b.stream)
+            observe(b)
+            if gust.shape[1] > 0:
+                advance_gusts(b, gust, first, count)
+            if frames.shape[1] > 0:
+                for lane in range(count):
+                    i = first + lane
+                    store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
+                    if integral.shape[0] > 0:
+                        integrate_position(i, b.feature, lane, b.mean, b.inverse_std, integral_numbers, integral)
+            _write_observations(b, count, integral, ages, frames, observations)
+
+            height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
+            ends = 0
+            for lane in range(count):
+                i = first + lane
+                returns[i] += b.reward[lane]
+                rewards[i] = b.reward[lane]
+                lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
+                dones[i] = lost | (b.stream[STEP, lane] >= limits[i])
+                ends += dones[i]
+            if ends == 0 and autoreset:
+                continue
+            for lane in range(count):
+                i = first + lane
+                if not dones[i] and autoreset:
+                    continue
+                outcome[i].collision = height[lane] <= radius[lane]
+                outcome[i].out_of_range = distance[lane] > scored[S.max_distance, lane]
+                outcome[i].truncated = not (outcome[i].collision or outcome[i].out_of_range)
+                outcome[i].success = outcome[i].truncated and succeeds(b, lane)
+                outcome[i].distance = distance[lane]
+                outcome[i].total, outcome[i].reward = returns[i], b.reward[lane]
+                outcome[i].length = b.stream[STEP, lane]
+                for k in range(observations.shape[1]):
+                    last_observations[i, k] = observations[i, k]
+                if autoreset:
                     rows[found] = i
                     found += 1
-            else:
-                found = _step_block(a, io, b, start, count, mode, taken == 0 and start == first, rows, found)
-        taken += 1
-    _look(a, io, b, rows[:found], mode == LOOK)
+
+    for first in range(0, found, LANES):
+        b = blocks[0]
+        count = min(LANES, found - first)
+        for lane in range(LANES):
+            b.row[lane] = rows[first + min(lane, count - 1)]
+        for lane in range(count):
+            i = b.row[lane]
+            if not dones[i]:
+                continue
+            returns[i], limits[i] = 0.0, max_steps[i]
+            count_episode(i, streams)
+            sample_episode(i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles, wrench, gust)
+            start_episode(i, state, queue, streams, task_index, vehicles, task_parameters, task_weights)
+            if frames.shape[1] > 0:
+                clear_frames(i, frames, integral)
+        if fresh or mean.shape[1] > 1:
+            _load_scaling(b, mean, std, noise_level, additive_level)
+        fresh = False
+        for lane in range(LANES):
+            for k in range(STATE_SIZE):
+                b.state[k, lane] = state[k, b.row[lane]]
+            for k in range(4):
+                b.stream[k, lane] = streams[k, b.row[lane]]
+        observe(b)
+        _write_observations(b, count, integral, ages, frames, observations)
     atomic_add(control, DONE, taken)
     if leads:
         finish(control, chunks)
+    return True
+
+
+@compiled
+def rotor_wrenches(actions, out, state, queue, wrench, vehicles, gust, physics_step, own_delays):
+    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body itself.
+
+    Motors do not feel the body, so that all physics steps of a control step can be worked out before it moves.
+
+    :param actions: float32 (n, 4), clipped to [-1, 1].
+    :param out: (substeps, 2, 3): what rotors and wrench do in each physics step, force (N) and torque (N m), body frame.
+    """
+    blocks = _new_block()
+    for each in range(len(out)):
+        b = blocks[0]
+        if each == 0:
+            b.row[:] = 0
+            _load_rows(state, 0, 1, b.state)
+            _load_rows(wrench, 0, 1, b.wrench)
+            if gust.shape[1] > 0:
+                add_gusts(b, gust, 0, 1)
+            _load_vehicles(b, vehicles, 0, 1, physics_step, True)
+            _load_commands(actions, queue, own_delays, b, 0, 1)
+        f0, f1, f2, f3 = turn_rotors(b, 0)
+        for axis in range(3):
+            out[each, 0, axis] = b.force_body[axis, 0]
+            out[each, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0, f0, f1, f2, f3)
+        out[each, 0, 2] += (f0 + f1) + (f2 + f3)
+        for rotor in range(4):
+            state[X.rotor_speeds + rotor, 0] = b.rotor_speeds[rotor, 0]
+
+
+@compiled
+def _new_block():
+    """Room for a block, (1,), which begins with a cache line: vectors that straddle two take a third longer."""
+    room = np.empty(_SIZE + 64, np.uint8)
+    start = -room.ctypes.data % 64
+    return room[start : start + _SIZE].view(BLOCK)
 
 
 @compiled
@@ -182,123 +302,17 @@ def _finite(actions):
 
 
 @compiled
-def _step_block(a, io, b, first, count, mode, fresh, rows, found):
-    """One control step of a block; rows that begin their next episode are added to the ``found`` in ``rows``.
-
-    What is the same for all rows is in the block already unless it is ``fresh``.
-    """
-    for lane in range(LANES):
-        b.row[lane] = first + min(lane, count - 1)
-    if fresh or a.mean.shape[1] > 1:
-        _load_scaling(a, b)
-    _load_rows(a.state, first, count, b.state)
-    if fresh or a.vehicles.shape[1] > 1:
-        _load_vehicles(a, b, first, count, fresh or a.own_arms)
-    if fresh or a.task_weights.shape[0] > 1:
-        _load_scored(a, b)
-    if mode == FLY:
-        _load_rows(a.wrench, first, count, b.wrench)
-        if a.gust.shape[1] > 0:
-            add_gusts(b, a.gust, first, count)
-        _load_commands(io.actions, a.queue, a.own_delays, b, first, count)
-        fly(b, a.physics_step, a.substeps)
-        for k in range(X.target):
-            for lane in range(count):
-                a.state[k, first + lane] = b.state[k, lane]
-    score(b)
-    for lane in range(count):
-        a.streams[STEP, first + lane] += np.uint32(1)
-    _load_rows(a.streams, first, count, b.stream)
-    observe(b)
-    if a.gust.shape[1] > 0:
-        advance_gusts(b, a.gust, first, count)
-    if a.frames.shape[1] > 0:
-        for lane in range(count):
-            i = first + lane
-            store_action(i, np.int64(b.stream[STEP, lane]), io.actions[i], a.frames)
-            if a.integral.shape[0] > 0:
-                integrate_position(i, b.feature, lane, b.mean, b.inverse_std, a.integral_numbers, a.integral)
-    _write_observations(a, b, count, io.observations)
-    return _end(a, io, b, first, count, rows, found)
-
-
-@compiled
-def _end(a, io, b, first, count, rows, found):
-    """The rewards of a block, and which rows have ended and how."""
-    height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
-    ends = 0
-    for lane in range(count):
-        i = first + lane
-        a.returns[i] += b.reward[lane]
-        io.rewards[i] = b.reward[lane]
-        lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
-        io.dones[i] = lost | (b.stream[STEP, lane] >= a.limits[i])
-        ends += io.dones[i]
-    if ends == 0 and a.autoreset:
-        return found
-    for lane in range(count):
-        i = first + lane
-        if io.dones[i] or not a.autoreset:
-            outcome = a.outcome[i]
-            outcome.collision = height[lane] <= radius[lane]
-            outcome.out_of_range = distance[lane] > scored[S.max_distance, lane]
-            outcome.truncated = not (outcome.collision or outcome.out_of_range)
-            outcome.success = outcome.truncated and succeeds(b, lane)
-            outcome.distance = distance[lane]
-            outcome.total, outcome.reward = a.returns[i], b.reward[lane]
-            outcome.length = b.stream[STEP, lane]
-            for k in range(io.observations.shape[1]):
-                a.last_observations[i, k] = io.observations[i, k]
-            if a.autoreset:
-                rows[found] = i
-                found += 1
-    return found
-
-
-@compiled
-def _look(a, io, b, rows, fresh):
-    """Observations of some rows, after those that are done have begun their next episode; ``fresh``: see above."""
-    for first in range(0, len(rows), LANES):
-        count = min(LANES, len(rows) - first)
-        for lane in range(LANES):
-            b.row[lane] = rows[first + min(lane, count - 1)]
-        for lane in range(count):
-            if io.dones[b.row[lane]]:
-                _begin(a, b.row[lane])
-        if fresh or a.mean.shape[1] > 1:
-            _load_scaling(a, b)
-        for lane in range(LANES):
-            for k in range(STATE_SIZE):
-                b.state[k, lane] = a.state[k, b.row[lane]]
-            for k in range(4):
-                b.stream[k, lane] = a.streams[k, b.row[lane]]
-        observe(b)
-        _write_observations(a, b, count, io.observations)
-
-
-@compiled
-def _begin(a, i):
-    """Begin the next episode of row i."""
-    a.returns[i], a.limits[i] = 0.0, a.max_steps[i]
-    count_episode(i, a.streams)
-    sample_episode(i, a.streams, a.base_vehicles, a.distribution_numbers, a.randomize_numbers, a.vehicles, a.wrench, a.gust)
-    start_episode(i, a.state, a.queue, a.streams, a.task_index, a.vehicles, a.task_parameters, a.task_weights)
-    if a.frames.shape[1] > 0:
-        clear_frames(i, a.frames, a.integral)
-
-
-@compiled
-def _write_observations(a, b, count, out):
+def _write_observations(b, count, integral, ages, frames, out):
     """The observations of a block to its rows of ``out``, float32 (n, size)."""
-    for lane in range(count):
-        i = b.row[lane]
-        if a.frames.shape[1] > 0:
-            observe_frames(
-                i, np.int64(b.stream[STEP, lane]), b.feature, lane, b.inverse_std, a.integral, a.ages, a.frames, out
-            )
-        else:
+    if frames.shape[1] == 0:
+        for lane in range(count):
+            i = b.row[lane]
             for k in range(OBSERVATION_SIZE):
                 out[i, k] = b.feature[k, lane]
+        return
+    for lane in range(count):
+        since = np.int64(b.stream[STEP, lane])
+        observe_frames(b.row[lane], since, b.feature, lane, b.inverse_std, integral, ages, frames, out)
 
 
 @compiled
@@ -317,10 +331,10 @@ def _load_rows(source, first, count, target):
 
 
 @compiled
-def _load_vehicles(a, b, first, count, arms):
+def _load_vehicles(b, vehicles, first, count, dt, arms):
     """What the control step needs of the vehicles of a block, with the divisions done; without ``arms`` those stay."""
-    _load_rows(a.vehicles, first, count, b.vehicle)
-    v, dt = b.vehicle, a.physics_step
+    _load_rows(vehicles, first, count, b.vehicle)
+    v = b.vehicle
     for lane in range(LANES):
         ixx, iyy, izz, lift = v[P.ixx, lane], v[P.iyy, lane], v[P.izz, lane], v[P.thrust_coefficient, lane]
         b.motor[lane], b.push[lane] = v[P.motor_gain, lane] * dt, dt / v[P.mass, lane]
@@ -343,8 +357,9 @@ def _load_commands(actions, queue, own_delays, b, first, count):
     command, wanted, own = b.command, b.wanted_speeds, b.delay
     delay = queue.shape[0]
     for lane in range(LANES):
+        i = first + min(lane, count - 1)
         for k in range(4):
-            command[k, lane] = actions[b.row[lane], k]
+            command[k, lane] = actions[i, k]
     command_rotors(b)
     if delay == 0:
         for k in range(4):
@@ -353,7 +368,7 @@ def _load_commands(actions, queue, own_delays, b, first, count):
         return
     for k in range(4):
         for lane in range(LANES):
-            wanted[k, lane] = queue[0, k, b.row[lane]]
+            wanted[k, lane] = queue[0, k, first + min(lane, count - 1)]
         for late in range(delay - 1):
             here, behind = queue[late, k, first : first + count], queue[late + 1, k, first : first + count]
             for lane in range(count):
@@ -369,52 +384,20 @@ def _load_commands(actions, queue, own_delays, b, first, count):
 
 
 @compiled
-def _load_scored(a, b):
+def _load_scored(b, index, parameters):
     """Limits and costs of the tasks that the rows of a block are flying."""
     for lane in range(LANES):
-        task = 0 if a.task_weights.shape[0] == 1 else a.task_index[b.row[lane]]
+        task = 0 if parameters.shape[0] == 1 else index[b.row[lane]]
         for k in range(len(_SCORED)):
-            b.scored[k, lane] = a.task_parameters[task, _SCORED[k]]
+            b.scored[k, lane] = parameters[task, _SCORED[k]]
 
 
 @compiled
-def _load_scaling(a, b):
+def _load_scaling(b, mean, std, relative, additive):
     """μ, 1/σ and the noise levels of a block, in float32."""
     for lane in range(LANES):
-        i = 0 if a.mean.shape[1] == 1 else b.row[lane]
-        b.noise_level[lane], b.additive[lane] = a.noise_level[i], a.additive_level[i]
+        i = 0 if mean.shape[1] == 1 else b.row[lane]
+        b.noise_level[lane], b.additive[lane] = relative[i], additive[i]
         for k in range(OBSERVATION_SIZE):
-            b.mean[k, lane] = a.mean[k, i]
-            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(a.std[k, i])
-
-
-@compiled
-def rotor_wrenches(actions, out, *arrays):
-    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body itself.
-
-    Motors do not feel the body, so that all physics steps of a control step can be worked out before it moves.
-
-    :param actions: float32 (n, 4), clipped to [-1, 1].
-    :param out: (substeps, 2, 3): what rotors and wrench do in each physics step, force (N) and torque (N m), body frame.
-    """
-    _turn_rotors(actions, out, BatchArrays(*arrays), np.empty(1, BLOCK))
-
-
-@compiled
-def _turn_rotors(actions, out, a, blocks):
-    b = blocks[0]
-    b.row[:] = 0
-    _load_rows(a.state, 0, 1, b.state)
-    _load_rows(a.wrench, 0, 1, b.wrench)
-    if a.gust.shape[1] > 0:
-        add_gusts(b, a.gust, 0, 1)
-    _load_vehicles(a, b, 0, 1, True)
-    _load_commands(actions, a.queue, a.own_delays, b, 0, 1)
-    for each in range(len(out)):
-        f0, f1, f2, f3 = turn_rotors(b, 0)
-        for axis in range(3):
-            out[each, 0, axis] = b.force_body[axis, 0]
-            out[each, 1, axis] = b.torque_body[axis, 0] + moment(b, axis, 0, f0, f1, f2, f3)
-        out[each, 0, 2] += (f0 + f1) + (f2 + f3)
-    for rotor in range(4):
-        a.state[X.rotor_speeds + rotor, 0] = b.rotor_speeds[rotor, 0]
+            b.mean[k, lane] = mean[k, i]
+            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(std[k, i])
