@@ -82,17 +82,16 @@ def _disturb_and_scale(b):
     if added == float32(0.0):
         for k in range(OBSERVATION_SIZE):
             for lane in range(LANES):
-                feature[k, lane] *= float32(1.0) + b.noise_level[lane] * noise[k, lane]
-    else:
-        for k in range(OBSERVATION_SIZE):
-            for lane in range(LANES):
-                relative, fixed = b.noise_level[lane] * feature[k, lane], b.additive[lane] / inverse_std[k, lane]
-                noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
-                # As above where nothing is added: a row's numbers do not depend on its neighbours.
-                feature[k, lane] = noisy if fixed > float32(0.0) else feature[k, lane] + relative * noise[k, lane]
+                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+                feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
+        return
     for k in range(OBSERVATION_SIZE):
         for lane in range(LANES):
-            feature[k, lane] = (feature[k, lane] - mean[k, lane]) * inverse_std[k, lane]
+            relative, fixed = b.noise_level[lane] * feature[k, lane], b.additive[lane] / inverse_std[k, lane]
+            noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
+            if fixed == float32(0.0):  # as above: a row's numbers do not depend on its neighbours
+                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+            feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
 
 
 @compiled(inline="always")
