@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from llvmlite import ir
 from numba import types
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
@@ -134,16 +133,6 @@ def atomic_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
         return builder.atomic_rmw("add", builder.gep(data, [args[1]]), args[2], "seq_cst")
 
     return types.int64(array, types.int64, types.int64), codegen
-
-
-@intrinsic
-def pointer(typing_context: Any, address: Any) -> Any:
-    """A pointer from an address (int64)."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        return builder.inttoptr(args[0], ir.PointerType(ir.IntType(8)))
-
-    return types.voidptr(types.int64), codegen
 
 
 give_way = types.ExternalFunction("sched_yield", types.int32())
