@@ -219,7 +219,8 @@ class QuadcopterBatch:
         with self.lock:
             for name, array in snapshot.items():
                 own = getattr(self, name) if name in _KEPT else np.empty(0)
-                if (array.dtype, array.shape) != (own.dtype, own.shape):
+                fits = (array.dtype, array.shape) == (own.dtype, own.shape)
+                if not fits or (name == "task_index" and (array >= self.tasks.weights.size).any()):
                     raise ConfigError(
                         "the saved state of the environments does not fit these "
                         f"({name}: {array.dtype} of shape {array.shape}); use the run's own settings"

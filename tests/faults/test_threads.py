@@ -20,11 +20,10 @@ import random, signal, sys
 import numpy as np
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation import threads as workers
+from sb3_quad.simulation import threads
 
-workers.PATIENCE = 1  # so that every job waits for its workers
-workers.REST = 0
-rows = 640
+threads.REST = 0  # so that no step does without its threads
+rows = 1280
 random.seed(0)
 actions = np.random.default_rng(0).uniform(-1.0, 1.0, (rows, 4)).astype(np.float32)
 batch = QuadcopterBatch(rows, FlightSettings(max_episode_steps=200), seed=1, n_threads=8)
@@ -76,9 +75,9 @@ def test_interrupted_steps_leave_nothing_behind():
 
 @pytest.mark.parametrize("make", [QuadcopterVecEnv, QuadcopterVectorEnv])
 def test_one_environment_is_stepped_from_several_threads(make):
-    env = make(300, TASK, seed=0, n_threads=3, max_episode_steps=50)
+    env = make(1000, TASK, seed=0, n_threads=3, max_episode_steps=50)
     env.reset()
-    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (300, 4)).astype(np.float32)
+    actions = np.random.default_rng(0).uniform(-1.0, 1.0, (1000, 4)).astype(np.float32)
     kept = []
 
     def fly():
@@ -87,7 +86,7 @@ def test_one_environment_is_stepped_from_several_threads(make):
             kept.append((observations, observations.copy(), rewards, rewards.copy()))
             if k % 20 == 0:
                 batch = getattr(env, "batch", env)
-                batch.set_noise(np.full(300, 0.01))
+                batch.set_noise(np.full(1000, 0.01))
                 batch.set_task(TASK if k % 40 else "state_recovery")
 
     assert from_threads(fly) == []
