@@ -79,18 +79,14 @@ def _disturb_and_scale(b):
     added = float32(0.0)
     for lane in range(LANES):
         added = max(added, b.additive[lane])
-    if added == float32(0.0):
-        for k in range(OBSERVATION_SIZE):
-            for lane in range(LANES):
-                noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
-                feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
-        return
     for k in range(OBSERVATION_SIZE):
         for lane in range(LANES):
-            relative, fixed = b.noise_level[lane] * feature[k, lane], b.additive[lane] / inverse_std[k, lane]
-            noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
-            if fixed == float32(0.0):  # as above: a row's numbers do not depend on its neighbours
+            relative = b.noise_level[lane] * feature[k, lane]
+            if added == float32(0.0):
                 noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
+            else:
+                fixed = b.additive[lane] / inverse_std[k, lane]
+                noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
             feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
 
 
