@@ -1,8 +1,6 @@
 """The controllers of an evaluation, from what a command line names: labels, records, and what is ready to fly."""
 
 import hashlib
-import importlib
-import typing
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +16,8 @@ from sb3_quad.evaluation.results import ControllerRecord, Scaling, file_name
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+
+SCALINGS = ("none", "adaptive", "both")
 
 
 @dataclass(frozen=True)
@@ -68,18 +68,17 @@ class ControllerSpec:
 def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[ControllerSpec]:
     """Controllers from ``spec`` or ``label=spec``; a label left out is as short as tells them apart.
 
-    :param scaling: of all but the experts, ``none`` or ``adaptive``.
+    :param scaling: of all but the experts, ``none`` or ``adaptive``; ``both``: each of them once plain and once adaptive.
     :raises ConfigError: an unknown scaling, or two controllers of the same label.
     """
-    if scaling not in typing.get_args(Scaling):
-        raise ConfigError(unknown("scaling", scaling, typing.get_args(Scaling)))
+    if scaling not in SCALINGS:
+        raise ConfigError(unknown("scaling", scaling, SCALINGS))
     named = [_label_and_spec(text) for text in texts]
     zips = [spec for label, spec in named if not label and spec.endswith(".zip")]
-    found = []
-    for label, spec in named:
-        name = label or (_short(spec, zips) if spec.endswith(".zip") else spec)
-        adapted = scaling == "adaptive" and spec not in EXPERTS
-        found.append(ControllerSpec(f"{name} (adaptive)", spec, "adaptive") if adapted else ControllerSpec(name, spec))
+    named = [(label or (_short(spec, zips) if spec.endswith(".zip") else spec), spec) for label, spec in named]
+    plain = [ControllerSpec(label, spec) for label, spec in named if scaling != "adaptive" or spec in EXPERTS]
+    adapted = [(f"{label} (adaptive)", spec) for label, spec in named if scaling != "none" and spec not in EXPERTS]
+    found = plain + [ControllerSpec(*each, "adaptive") for each in adapted]
     files = [file_name(entry.label) for entry in found]
     for file, entry in zip(files, found, strict=True):
         if files.count(file) > 1:
@@ -96,12 +95,11 @@ def describe(spec: ControllerSpec, vehicle: str | Vehicle) -> ControllerRecord:
     """
     path = Path(spec.spec)
     if spec.is_zip:
-        record = ControllerRecord(
-            label=spec.label, spec=path.name, kind="model", algorithm=saved_algorithm(path), content=_digest(path.read_bytes())
-        )
+        algorithm, content = saved_algorithm(path), hashlib.sha256(path.read_bytes()).hexdigest()
+        record = ControllerRecord(label=spec.label, spec=path.name, kind="model", algorithm=algorithm, content=content)
     else:
-        content, kind = _digest(_source(EXPERTS.get(spec.spec, spec.spec))), "expert" if spec.spec in EXPERTS else "factory"
-        record = ControllerRecord(label=spec.label, spec=spec.spec, kind=kind, content=content)  # type: ignore[arg-type]
+        import_factory(spec.spec, "controller")  # says what is wrong
+        record = ControllerRecord(label=spec.label, spec=spec.spec, kind="expert" if spec.spec in EXPERTS else "factory")
     if spec.scaling == "adaptive":
         controller = build(spec, vehicle)
         if isinstance(controller, AdaptiveScaling):
@@ -145,17 +143,3 @@ def _short(path: str, paths: Sequence[str]) -> str:
         if not any(other[-count:] == parts[-count:] for other in others):
             return "/".join(parts[-count:])
     return "/".join(parts)
-
-
-def _source(location: str) -> bytes:
-    """The source of the module that holds an expert or factory.
-
-    :raises ConfigError: it cannot be imported.
-    """
-    import_factory(location, "controller")  # says what is wrong
-    file = getattr(importlib.import_module(location.partition(":")[0]), "__file__", None)  # None: it is built in
-    return location.encode() + (Path(file).read_bytes() if file is not None else b"")
-
-
-def _digest(content: bytes) -> str:
-    return hashlib.sha256(content).hexdigest()

@@ -1,19 +1,18 @@
-"""A suite for any number of controllers: scenario by scenario flown, summed up and written."""
+"""A suite for any number of controllers: scenario by scenario flown, summed up and written into a folder of its own."""
 
 import hashlib
-import itertools
+import shutil
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import as_completed
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
-from sb3_quad.base.files import locked, write_arrays
-from sb3_quad.base.validate import read_record
+from sb3_quad.base.files import locked, write_arrays, write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
@@ -21,17 +20,16 @@ from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import episode_arrays
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
+    FLIGHTS,
     RESULTS,
-    UNFINISHED,
+    WRITTEN,
     ControllerRecord,
     Entry,
     Failure,
     Results,
-    Unfinished,
     flights_path,
     load_results,
-    write_record,
-    write_results,
+    write_episodes,
 )
 from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
@@ -39,7 +37,6 @@ from sb3_quad.executors import Executor, start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
-_TEXTS = {"title", "description", "reference", "group", "cell"}  # fields of a scenario that change no flight
 
 
 @dataclass(frozen=True)
@@ -57,13 +54,6 @@ class Job:
         return self.scenario.name, self.record.label
 
 
-class Outcome(NamedTuple):
-    """A job that is done, and the arrays of its flights (``flightlog.py``)."""
-
-    entry: Entry
-    arrays: Arrays
-
-
 def evaluate(
     suite: Suite,
     controllers: Sequence[ControllerSpec],
@@ -78,26 +68,22 @@ def evaluate(
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
-    A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the others fly on. Results of other
-    controllers and scenarios in the folder are kept. An interrupted call goes on when it is repeated, but for factories, whose
-    code may have changed.
+    A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the others fly on. An interrupted
+    call goes on when it is repeated, but for factories, whose code may have changed.
 
-    :param folder: of the results.
+    :param folder: of the results; where no controller can be loaded, it is not made.
     :param workers: that fly side by side; with one, and no Ray, this process flies.
-    :param overwrite: replace results of other controllers or scenarios of these names, instead of refusing; begin anew.
+    :param overwrite: remove the results that the folder holds, instead of refusing it; begin anew.
     :param report: gets a line for each agent that flies another vehicle than it was trained on, or does not say on which.
     :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is ``address``.
-    :return: all results in the folder; where nothing has been flown, it is not written.
-    :raises ConfigError: an unknown backend; other controllers or scenarios of these names in the folder; a folder that
-        cannot be written, or that another process is writing to.
+    :raises ConfigError: an unknown backend; a folder that holds results of another call, that cannot be written, or that
+        another process is writing to.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
-    if Path(folder).is_file():
-        raise ConfigError(f"{folder}: is a file; the results need a folder, give another with -o")
-    failures: list[Failure] = []
+    place, failures = Path(folder), list[Failure]()
     records: dict[ControllerSpec, ControllerRecord] = {}
     for spec in controllers:
         try:
@@ -109,41 +95,49 @@ def evaluate(
             failures.append(_failure(spec.label, None, error))
     _report_vehicles(suite, list(records), report)
     jobs = [Job(spec, record, each, backend) for each in suite.scenarios for spec, record in records.items()]
-    with _claimed(Path(folder), make=bool(jobs)) as place:
-        before = load_results(place) if (place / RESULTS).is_file() else None
-        kept = [] if before is None else _kept(place, before, jobs, overwrite)
-        asked = {
-            (scenario, spec.label) for spec in controllers for scenario in (None, *(each.name for each in suite.scenarios))
-        }
-        earlier = [] if before is None else before.failures
-        failures[:0] = [each for each in earlier if (each.scenario, each.controller) not in asked]
-        evaluation = _digest(jobs)
-        done = {} if overwrite else _interrupted(place, evaluation, jobs)
+    digest, done = _digest(jobs), dict[tuple[str, str], Entry]()
+
+    def results(unfinished: str | None) -> Results:
+        return Results(
+            suite=suite.name,
+            description=suite.description,
+            source=suite.source,
+            package_version=__version__,
+            controllers=list(records.values()),
+            scenarios=list(suite.scenarios),
+            entries=[done[job.name] for job in jobs if job.name in done],
+            failures=failures,
+            unfinished=unfinished,
+        )
+
+    if not jobs:
+        return results(None)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    with locked(place, "folder"):
+        done |= _begin(place, digest, jobs, overwrite)
         missing = [job for job in jobs if job.name not in done]
-        if before is not None and len(kept) < len(before.entries):  # what is flown anew is no result any more
-            write_results(place, _joined(before, suite, records.values(), [*kept, *done.values()], failures))
-        try:
-            progress(len(done), len(jobs), "")
-            alone = executor == "local" and min(workers, len(missing)) <= 1
-            with nullcontext() if alone else start_executor(executor, workers, address) as working:
-                for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
-                    if isinstance(outcome, Failure):
-                        failures.append(outcome)
-                    else:
-                        write_arrays(place / outcome.entry.flights, compressed=True, **outcome.arrays)
-                        done[job.name] = outcome.entry
-                        write_record(place / UNFINISHED, Unfinished(evaluation=evaluation, entries=list(done.values())))
-                    progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
-            (place / UNFINISHED).unlink(missing_ok=True)
-        finally:  # an interrupt, too, leaves what is done in order
-            results = _joined(before, suite, records.values(), [*kept, *done.values()], failures)
-            if results.entries or before is not None:
-                write_results(place, results)
-    return results
+        progress(len(done), len(jobs), "")
+        alone = executor == "local" and min(workers, len(missing)) <= 1
+        with nullcontext() if alone else start_executor(executor, workers, address) as working:
+            for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
+                if isinstance(outcome, Failure):
+                    failures.append(outcome)
+                else:
+                    done[job.name], arrays = outcome
+                    write_arrays(place / done[job.name].flights, compressed=True, **arrays)
+                    write_text(place / RESULTS, results(digest).model_dump_json(indent=2))
+                progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+        if done:
+            write_episodes(place, done.values())
+            write_text(place / RESULTS, results(None).model_dump_json(indent=2))
+    return results(None)
 
 
-def fly_job(job: Job) -> Outcome | Failure:
-    """Fly and sum up; of a controller that fails, its :class:`Failure`."""
+def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
+    """Fly and sum up; the arrays are those of the flights (``flightlog.py``). Of a controller that fails, its Failure."""
     start = time.perf_counter()
     try:
         scenario, seen = job.scenario.flown_by(job.spec.own and job.spec.own.vehicle), job.spec.observed
@@ -163,10 +157,10 @@ def fly_job(job: Job) -> Outcome | Failure:
         hit_limit=limit,
         flights=flights_path(job.record.label, scenario.name),
     )
-    return Outcome(entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories})
+    return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}
 
 
-def _fly_jobs(jobs: Sequence[Job], executor: Executor | None) -> Iterator[tuple[Job, Outcome | Failure]]:
+def _fly_jobs(jobs: Sequence[Job], executor: Executor | None) -> Iterator[tuple[Job, Any]]:
     """Fly jobs, and hand out each as it is done: one after another here, or side by side in an executor's workers.
 
     A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.
@@ -200,85 +194,23 @@ def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Call
         report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
 
 
-@contextmanager
-def _claimed(folder: Path, make: bool) -> Iterator[Path]:
-    """A folder for this process alone, made if it is to be written to; one that stays empty is removed again.
+def _begin(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> dict[tuple[str, str], Entry]:
+    """What an interrupted evaluation of the same digest has flown, but for factories, whose code may have changed.
 
-    :raises ConfigError: another process has it; it cannot be made.
+    :raises ConfigError: the folder holds other results, and they are not to be overwritten; or damaged ones.
     """
-    new = make and not folder.exists()
-    if new:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"{folder}: cannot be written ({error.strerror or error})") from None
-    try:
-        with locked(folder, "folder") if folder.is_dir() else nullcontext():
-            yield folder
-    finally:
-        if new:
-            with suppress(OSError):
-                folder.rmdir()
-
-
-def _kept(folder: Path, before: Results, jobs: Sequence[Job], overwrite: bool) -> list[Entry]:
-    """The entries in a folder that stay beside those of some jobs.
-
-    :raises ConfigError: another controller or scenario of the same name is there.
-    """
-    records, scenarios = {job.record.label: job.record for job in jobs}, {job.scenario.name: job for job in jobs}
-    kept = []
-    for entry in before.entries:
-        record, job = records.get(entry.controller), scenarios.get(entry.scenario)
-        other = ""
-        if job is not None and _flown(job.scenario, job.backend) != _flown(before.scenario(entry.scenario), entry.backend):
-            other = f"of {entry.controller} in {entry.scenario} with other seeds, numbers or another scenario"
-        elif record is not None and not record.is_same(before.controller(entry.controller)):
-            other = f"of another controller called {entry.controller} (name={record.spec} calls this one otherwise)"
-        if other and not (overwrite and record is not None):
-            way_out = "give another folder with -o" + ("" if record is None else ", or replace them with --overwrite")
-            raise ConfigError(f"{folder}: holds flights {other}; {way_out}")
-        if not other and (record is None or job is None):
-            kept.append(entry)
-    return kept
-
-
-def _flown(scenario: Scenario, backend: str) -> tuple[Any, str]:
-    """What the episodes of a scenario depend on."""
-    return scenario.model_dump(exclude=_TEXTS), backend
-
-
-def _joined(
-    before: Results | None,
-    suite: Suite,
-    records: Iterable[ControllerRecord],
-    entries: Iterable[Entry],
-    failures: Sequence[Failure],
-) -> Results:
-    """All that the folder holds by now; what was there before comes first."""
-    scenarios = {each.name: each for each in [*(before.scenarios if before else []), *suite.scenarios]}
-    controllers = {each.label: each for each in [*(before.controllers if before else []), *records]}
-    flown = {entry.name: entry for entry in entries}
-    return Results(
-        suite=suite.name,
-        description=suite.description,
-        source=suite.source,
-        package_version=__version__,
-        controllers=list(controllers.values()),
-        scenarios=list(scenarios.values()),
-        entries=[flown[name] for name in itertools.product(scenarios, controllers) if name in flown],
-        failures=list(failures),
-    )
-
-
-def _interrupted(folder: Path, evaluation: str, jobs: Sequence[Job]) -> dict[tuple[str, str], Entry]:
-    """What an interrupted evaluation of the same digest has flown, but for factories, whose code may have changed."""
-    path = folder / UNFINISHED
-    unfinished = read_record(path, Unfinished) if path.is_file() else None
-    if unfinished is None or unfinished.evaluation != evaluation:
+    if not (folder / RESULTS).is_file():
         return {}
-    certain = {job.name for job in jobs if job.record.kind != "factory"}
-    return {entry.name: entry for entry in unfinished.entries if entry.name in certain}
+    before = load_results(folder)
+    if before.unfinished == digest and not overwrite:
+        certain = {job.name for job in jobs if job.record.kind != "factory"}
+        return {entry.name: entry for entry in before.entries if entry.name in certain}
+    if not overwrite:
+        raise ConfigError(f"{folder}: holds results already; give another folder with -o, or remove them with --overwrite")
+    for name in WRITTEN:
+        (folder / name).unlink(missing_ok=True)
+    shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
+    return {}
 
 
 def _digest(jobs: Sequence[Job]) -> str:

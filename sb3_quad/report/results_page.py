@@ -109,7 +109,7 @@ def _controller_table(records: Sequence[ControllerRecord]) -> Table:
     for record in records:
         scaled = "Eq. 4.10" if record.scaling == "adaptive" else ""
         offset = "" if record.offset is None else f", offset μ = ({', '.join(f'{x:.4f}' for x in record.offset)}) m"
-        zip_hash = record.content[:12] if record.algorithm else ""
+        zip_hash = (record.content or "")[:12]
         rows.append((record.label, record.spec, record.algorithm or "", zip_hash, scaled + offset))
     return text_table("", ("name", "controller", "algorithm", "SHA-256", "observation scaled by"), rows, align="left")
 
