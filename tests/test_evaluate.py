@@ -27,7 +27,6 @@ from sb3_quad.evaluation.scaling import measure_mean
 from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
-from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.simulation.settings import FlightSettings
 
 SUITE = """
