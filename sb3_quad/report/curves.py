@@ -56,7 +56,7 @@ def plot_curves(
             if value in at:
                 style = ("--", ":", "-.")[number % 3]
                 panel.axhline(at[value] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
-    legend(figure, panels, side="lower")
+    legend(figure)
     figure.suptitle(title)
     return figure
 

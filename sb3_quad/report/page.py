@@ -33,30 +33,27 @@ class Section:
     facts: str = ""
 
 
-def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section], with_pictures: bool = True) -> Path:
-    """Write ``report.md`` with the tables, ``figures/`` with each flat plot as PNG and SVG, and the page, ``report.html``.
+def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section]) -> Path:
+    """Write ``report.md`` with the tables, ``figures/`` with each flat plot as PNG, and the page, ``report.html``.
 
     The page needs no other file and no network. Files that are there are replaced.
 
     :param facts: a paragraph below the title.
-    :param with_pictures: also write the plots as files.
     :return: the page.
     :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
         not be written, since Jinja2 or Plotly is not installed.
     """
     folder = Path(folder)
     write_text(folder / MARKDOWN, _markdown(title, sections))
-    for plot in (plot for section in sections for plot in section.plots if isinstance(plot, Plot) and with_pictures):
+    for plot in (plot for section in sections for plot in section.plots if isinstance(plot, Plot)):
         write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
-        write_bytes(folder / PICTURES / f"{plot.name}.svg", plot.svg)
-    write_text(folder / PAGE, render(title, facts, sections, PICTURES if with_pictures else ""))
+    write_text(folder / PAGE, render(title, facts, sections))
     return folder / PAGE
 
 
-def render(title: str, facts: str, sections: Sequence[Section], pictures: str = "") -> str:
-    """The page as text.
+def render(title: str, facts: str, sections: Sequence[Section]) -> str:
+    """The page as text, which expects its plots as files in ``figures/``.
 
-    :param pictures: the folder beside the page that holds its plots as files; empty: there is none.
     :raises MissingExtra: Jinja2 is not installed, or Plotly, where there are flights in space.
     """
     jinja2 = require("jinja2", "report", PAGE)
@@ -70,7 +67,7 @@ def render(title: str, facts: str, sections: Sequence[Section], pictures: str = 
             title=title,
             facts=facts,
             sections=sections,
-            pictures=pictures,
+            pictures=PICTURES,
             spaces=_for_script(spaces),
             plotly=_packed(require("plotly.offline", "report", PAGE).get_plotlyjs()) if spaces else "",
         )

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from sb3_quad.base.arrays import BoolArray, FloatArray
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import Space
@@ -15,9 +15,8 @@ from sb3_quad.report.scenario_plots import FORCE, ControllerFlights
 TARGET, START = "#1a9a45", "#8a8f98"
 SHOWN_FLIGHTS = 4  # of a controller, of random episodes
 PATH_POINTS = 150  # that a flight is drawn with, at most
-ARROW = 0.16  # longest force arrow, of the longest side of all flights
-ARROWS = 5  # of a force that lasts throughout a flight
-CAMERA = {"eye": {"x": 1.45, "y": -1.95, "z": 0.68}, "center": {"x": 0, "y": 0, "z": -0.17}}
+LINE = 0.16  # length of a force's line, of the longest side of all flights
+FORCES = 5  # shown of one that lasts throughout a flight
 
 
 def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Space:
@@ -34,10 +33,14 @@ def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Spac
     targets = np.unique(np.round(np.concatenate([track.targets for _, track in shown]), 6), axis=0)
     data.append(_trace("target", TARGET, targets, data, "diamond"))
     data.append(_trace("start", START, shown[0][1].position[:1], data, "circle-open"))
-    for points, text in _forces([each.tracks[0] for each in flights], ARROW * size):
-        data.append(_trace("force", FORCE, points, data, text=text))
+    for track, sample in ((each.tracks[0], sample) for each in flights for sample in _pushed(each.tracks[0])):
+        force, start = track.wrench[sample, :3], track.position[sample]
+        newtons = float(np.linalg.norm(force))
+        text = f"{newtons:.3g} N at {track.times[sample]:.2f} s"
+        ends = np.stack([start, start + LINE * size / newtons * force])
+        data.append(_trace("force", FORCE, ends, data, text=text))
     what = "The first flight of each controller" if count == 1 else f"The first {count} flights of each controller"
-    caption = f"{what}; a cross marks where one is lost. Red arrows: the external force, if there is one."
+    caption = f"{what}; a cross marks where one is lost. Red: the external force, if there is one."
     return Space(f"{scenario.name}_paths", caption, {"data": data, "layout": _layout(data)})
 
 
@@ -56,43 +59,22 @@ def _trace(
     return {"type": "scatter3d", "mode": "markers" if symbol else "lines", **look, **names, **hover, **axes}
 
 
-def _forces(tracks: Sequence[Track], length: float) -> list[tuple[FloatArray, str]]:
-    """Arrows of the forces met, (5, 3), the greatest of that length (m), each with what it stands for."""
-    found = [(track, k, track.wrench[k, :3]) for track in tracks for k in _pushed(track)]
-    greatest = max((float(np.linalg.norm(force)) for _, _, force in found), default=1.0)
-    arrows = []
-    for track, k, force in found:
-        arrow, at = force * length / greatest, track.position[k]
-        axis = np.eye(3)[np.argmin(np.abs(arrow))]
-        across = axis - (axis @ arrow) / (arrow @ arrow) * arrow  # upright for a horizontal force
-        across *= 0.1 * np.linalg.norm(arrow) / np.linalg.norm(across)
-        tip, barb = at + arrow, at + 0.7 * arrow
-        text = f"{np.linalg.norm(force):.3g} N at {track.times[k]:.2f} s"
-        arrows.append((np.stack([at, tip, barb + across, tip, barb - across]), text))
-    return arrows
-
-
 def _pushed(track: Track) -> list[int]:
     """Samples with a force to be shown: the first of each push, and further ones along the way of one that lasts."""
-    acts: BoolArray = np.asarray(track.wrench[:, :3].any(axis=1))
-    chosen: list[int] = []
-    for sample in np.flatnonzero(acts).tolist():
-        if sample == 0 or not acts[sample - 1] or sample - chosen[-1] >= len(acts) / ARROWS:
-            chosen.append(sample)
-    return chosen
+    acts = np.asarray(track.wrench[:, :3].any(axis=1))
+    begins = acts & ~np.roll(acts, 1)
+    begins[:: -(-len(acts) // FORCES)] = True
+    return np.flatnonzero(acts & begins).tolist()
 
 
 def _layout(data: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Plotly's layout, with equal scales, and with no side of the space much shorter than the longest."""
+    """Plotly's layout: a cube around everything, so that all scales are equal."""
     points = np.concatenate([np.array([trace[name] for name in "xyz"], dtype=np.float64) for trace in data], axis=1)
     low, high = points.min(axis=1), points.max(axis=1)
-    half = 0.53 * (high - low)
-    half = np.maximum(half, max(0.3 * float(half.max()), 0.5))
-    axes: dict[str, Any] = {
-        f"{name}axis": {"title": {"text": f"{name} (m)"}, "range": ends, "showbackground": False, "zeroline": False}
-        for name, *ends in zip("xyz", (0.5 * (low + high) - half).tolist(), (0.5 * (low + high) + half).tolist(), strict=True)
-    }
-    ratio = dict(zip("xyz", (1.3 * half / half.max()).tolist(), strict=True))
-    scene = {**axes, "aspectmode": "manual", "aspectratio": ratio, "camera": CAMERA, "dragmode": "turntable"}
+    half = max(0.53 * float((high - low).max()), 0.5)
+    scene: dict[str, Any] = {"aspectmode": "cube"}
+    for name, middle in zip("xyz", (0.5 * (low + high)).tolist(), strict=True):
+        ends = [middle - half, middle + half]
+        scene[f"{name}axis"] = {"title": {"text": f"{name} (m)"}, "range": ends, "showbackground": False, "zeroline": False}
     legend = {"orientation": "h", "x": 0, "y": 0, "yanchor": "top"}  # Plotly's buttons are at the top
     return {"scene": scene, "margin": {"l": 0, "r": 0, "t": 30, "b": 0}, "legend": legend}

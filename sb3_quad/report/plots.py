@@ -4,8 +4,7 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -18,6 +17,7 @@ from sb3_quad.evaluation.statistics import Estimate
 INK, QUIET, GRID, PAPER = "#1c2430", "#5c6672", "#dfe3e8", "#ffffff"  # of text, small print, grid and background
 WIDTH, HEIGHT = 5.0, 3.3  # inches: two stand side by side in the page, and one can be read on a telephone
 DPI = 150
+LETTERS = 13  # of a legend, per inch
 POINTS: Any = {"marker": "o", "markersize": 3.5}  # on curves through few of them
 STYLE: Any = {
     "font.size": 9,
@@ -61,25 +61,15 @@ class Plot:
     caption: str
     figure: Figure
 
-    @cached_property
-    def svg(self) -> bytes:
-        """The plot as an SVG file, which is also a part of the page."""
-        return picture(self.figure, "svg", bbox_inches="tight", metadata=METADATA)
-
     @property
     def png(self) -> bytes:
         """The plot as a PNG file."""
         return picture(self.figure, "png", bbox_inches="tight", dpi=DPI)
 
     @property
-    def is_narrow(self) -> bool:
-        """Whether two of its kind stand side by side in the page."""
-        return self.figure.get_figwidth() <= WIDTH
-
-    @property
     def inline(self) -> str:
         """The plot as a part of the page: an ``svg`` element in the page's colours, which may be dark."""
-        text = self.svg.decode("utf-8")
+        text = picture(self.figure, "svg", bbox_inches="tight", metadata=METADATA).decode("utf-8")
         text = text[text.index("<svg") :]
         for colour, name in ((INK, "ink"), (QUIET, "quiet"), (GRID, "grid"), (PAPER, "paper")):
             text = text.replace(colour, f"var(--{name})")
@@ -95,16 +85,12 @@ def picture(figure: Figure, kind: str, **options: Any) -> bytes:
     return buffer.getvalue()
 
 
-def legend(figure: Figure, axes: Any, side: Literal["upper", "lower"] = "upper") -> None:
-    """Every name of ``axes``, one or several, once outside, in as many columns as have room."""
-    pairs = [zip(*each.get_legend_handles_labels(), strict=True) for each in np.ravel(axes)]
+def legend(figure: Figure) -> None:
+    """Every name in the figure, once outside of its axes, in as many columns as have room."""
+    pairs = [zip(*axes.get_legend_handles_labels(), strict=True) for axes in figure.axes]
     found = {name: handle for pair in pairs for handle, name in pair}
-    place: Any = f"outside {side} left"
-    for columns in range(len(found), 0, -1):
-        made = figure.legend([*found.values()], [*found], loc=place, ncols=columns)
-        if columns == 1 or made.get_window_extent().width <= figure.bbox.width:
-            break
-        made.remove()
+    room = LETTERS * figure.get_figwidth() / (max(map(len, found), default=0) + 8)  # 8: the mark before a name
+    figure.legend([*found.values()], [*found], loc="outside upper left", ncols=max(1, int(room)))
 
 
 def new_axes(x_label: str, y_label: str) -> tuple[Figure, Axes]:

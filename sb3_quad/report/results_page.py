@@ -23,8 +23,7 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, Section, write_page
 from sb3_quad.report.paths import paths_plot
 from sb3_quad.report.plots import Plot, Space
-from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, hits_plot
-from sb3_quad.report.varied import families_plot, group_plots
+from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, hits_plot
 from sb3_quad.simulation.noise import in_words
 
 OVERVIEW = (
@@ -38,11 +37,10 @@ SMALL_PRINT = (
 )
 
 
-def write_report(folder: str | Path, overwrite: bool = False, with_pictures: bool = True) -> Path:
+def write_report(folder: str | Path, overwrite: bool = False) -> Path:
     """Write the report of a folder of results: ``report.html``, its tables as ``report.md``, its plots as files.
 
     :param overwrite: replace a report that is there.
-    :param with_pictures: also write every plot as PNG and SVG, into ``figures/``.
     :return: the page.
     :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written;
         :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could not be written.
@@ -51,7 +49,7 @@ def write_report(folder: str | Path, overwrite: bool = False, with_pictures: boo
     if not results.entries:
         raise ConfigError(f"{folder}: holds no flights, only failures; there is nothing to report")
     refuse_existing(Path(folder) / PAGE, overwrite)
-    return write_page(folder, f"Suite {results.suite}", facts(results), sections(results, folder), with_pictures)
+    return write_page(folder, f"Suite {results.suite}", facts(results), sections(results, folder))
 
 
 def facts(results: Results) -> str:
@@ -75,8 +73,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     colours = colours_of([record.label for record in results.controllers])
     groups = scenario_groups(results)
     shares = [_share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)]
-    tables, families = [table for table in shares if table.rows], families_plot(results, groups, colours)
-    parts = [Section("overview", "Success and survival", OVERVIEW, tables, families)]
+    parts = [Section("overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows])]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:

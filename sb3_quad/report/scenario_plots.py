@@ -1,17 +1,19 @@
-"""The plots of one scenario: times to its target, distances from it, and how large a hit is survived."""
+"""The plots of a scenario: times to its target, distances from it, how large a hit is survived, what ``vary`` changes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
-from sb3_quad.evaluation.results import Entry
+from sb3_quad.evaluation.results import Entry, Results
+from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import INK, PAPER, POINTS, Plot, band, interval_ends, legend, new_axes, styled
 
 FORCE = "#db1a24"
+LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
 LINE_POINTS = 200  # that a flight is drawn with, at most
 
 
@@ -38,10 +40,6 @@ def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights], sour
         spread, middle = np.stack([value - low, high - value]), places + (number - 0.5 * (len(flights) - 1)) * width
         whiskers = {"ecolor": INK, "elinewidth": 0.9, "capsize": 2}
         axes.bar(middle, value, 0.92 * width, color=each.colour, label=each.label, yerr=spread, error_kw=whiskers)
-        for x, y, arrival in zip(middle, high, arrivals, strict=True):
-            if arrival.time is not None and arrival.share.value < 1.0:
-                note = f"{100 * arrival.share.value:.3g} %"
-                axes.annotate(note, (x, y), (0, 3), textcoords="offset points", rotation=90, ha="center", fontsize=6.5)
     for (name, reference), marker in zip(scenario.reference.items(), "Dos^" * len(scenario.reference), strict=False):
         given = {float(key): float(np.mean(time)) for key, time in reference.time_to.items() if time is not None}
         if given.keys() & set(scenario.tolerances):
@@ -50,11 +48,8 @@ def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights], sour
             axes.plot(places, heights, marker, label=f"{source}: {name}", **style)
     axes.set_xticks(places, [f"{tolerance:g}" for tolerance in scenario.tolerances])
     axes.grid(axis="x", visible=False)
-    legend(figure, axes)
-    caption = (
-        "Mean time until the vehicle is first within a tolerance of its target, over the flights that get there; "
-        "their share, if not all, stands above."
-    )
+    legend(figure)
+    caption = "Mean time until the vehicle is first within a tolerance of its target, over the flights that get there."
     return Plot(f"{scenario.name}_times", caption, figure)
 
 
@@ -63,28 +58,19 @@ def errors_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plo
     """Distances from the target over time, of controllers with recorded flights."""
     figure, axes = new_axes("time (s)", "distance from target (m)")
     for each in flights:
-        x, ends = _quantiles(each.tracks)
-        if scenario.is_fixed:
-            band(axes, each.colour, each.label, x, ends)
-            continue
-        for track in each.tracks:
-            axes.plot(track.times[:: _stride(track)], track.error[:: _stride(track)], each.colour, linewidth=0.6, alpha=0.45)
-        axes.plot(x, ends[0], color=each.colour, label=each.label, linewidth=1.8)
+        band(axes, each.colour, each.label, *_quantiles(each.tracks))
     for wrench in scenario.wrenches:
         if wrench.duration is not None and wrench.start + wrench.duration < scenario.duration:
             axes.axvspan(wrench.start, wrench.start + wrench.duration, facecolor=FORCE, edgecolor=FORCE, alpha=0.16)
             style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "va": "top"}
             axes.annotate("push", (wrench.start, 1.0), (2, -2), **style)
     axes.set_ylim(bottom=0.0)
-    legend(figure, axes)
-    count = len(flights[0].tracks)
-    spread = f"band: least to greatest of {count}" if scenario.is_fixed else f"thin: {count}"
-    caption = f"Thick: median, {spread} flights. A lost flight counts as infinitely far: a median ends where half are lost."
+    legend(figure)
+    caption = (
+        f"Median and band from least to greatest of {len(flights[0].tracks)} flights. A lost flight counts as infinitely"
+        " far: a median ends where half are lost."
+    )
     return Plot(f"{scenario.name}_error", caption, figure)
-
-
-def _stride(track: Track) -> int:
-    return -(-len(track.times) // LINE_POINTS)
 
 
 def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
@@ -93,8 +79,9 @@ def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
     errors = np.full((len(tracks), len(longest.times)), np.inf)
     for row, track in zip(errors, tracks, strict=True):
         row[: len(track.times)] = track.error
-    ends = np.quantile(errors[:, :: _stride(longest)], (0.5, 0.0, 1.0), axis=0, method="higher")
-    return longest.times[:: _stride(longest)], np.where(np.isfinite(ends), ends, np.nan)
+    chosen = slice(None, None, -(-len(longest.times) // LINE_POINTS))
+    ends = np.quantile(errors[:, chosen], (0.5, 0.0, 1.0), axis=0, method="higher")
+    return longest.times[chosen], np.where(np.isfinite(ends), ends, np.nan)
 
 
 @styled
@@ -109,6 +96,45 @@ def hits_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
     axes.set_xscale("log", base=2)
     axes.set_ylim(-3.0, 103.0)
     axes.xaxis.set_major_formatter("{x:g}")
-    legend(figure, axes)
+    legend(figure)
     caption = "Flights that survive when force and torque are scaled by a factor, with 95 % intervals."
     return Plot(f"{scenario.name}_limit", caption, figure)
+
+
+@styled
+def group_plots(results: Results, scenarios: Sequence[Scenario], colours: Mapping[str, str]) -> list[Plot]:
+    """The plots of the cells that ``vary`` makes of a scenario: success over each quantity, the final error over a single one.
+
+    :param colours: by the labels of the controllers.
+    """
+    group, cell, plots = scenarios[0].group, scenarios[0].cell, []
+    found = [(label, each, results.entry(label, each.name)) for label in colours for each in scenarios]
+    flown = [(label, each.cell, entry.metrics) for label, each, entry in found if entry is not None]
+    for number, key in enumerate(cell):
+        name = axis_label(key, scenarios[0])
+        figure, axes = new_axes(name, "success (%)")
+        for label in dict.fromkeys(each[0] for each in flown):
+            metrics = [(at[key], metrics) for who, at, metrics in flown if who == label]
+            values = sorted({at for at, _ in metrics})
+            rows = [interval_ends([m.success or m.survival for at, m in metrics if at == x], 100.0) for x in values]
+            # Of one quantity the interval; of several the least and the greatest share over the others.
+            ends = [row[:, 0] if len(cell) == 1 else (row[0].mean(), row[0].min(), row[0].max()) for row in rows]
+            band(axes, colours[label], label, np.array(values), np.transpose(ends), **POINTS)
+        axes.set_ylim(-3.0, 103.0)
+        legend(figure)
+        spread = "with 95 % intervals" if len(cell) == 1 else "mean, least and greatest over the other quantities"
+        ending = "success" if len(cell) == 1 else f"{number}_success"
+        plots.append(Plot(f"{group}_{ending}", f"Success, {spread}.", figure))
+    if len(cell) == 1:
+        figure, axes = new_axes(name, "final error (m)")
+        for label in dict.fromkeys(each[0] for each in flown):
+            cells = [(at[key], m.final_error_median) for who, at, m in flown if who == label and m.survival.value >= 0.5]
+            if cells:
+                x, errors = np.array(cells, dtype=np.float64).T
+                axes.plot(x, np.maximum(errors, LEAST_ERROR), color=colours[label], label=label, **POINTS)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        legend(figure)
+        caption = "Median final error of the flights that were not lost, unless these are fewer than half; 1 mm at least."
+        plots.append(Plot(f"{group}_error", caption, figure))
+    return plots

@@ -72,7 +72,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and flown:
         try:
-            report(folder, overwrite=True, pictures=True)
+            report(folder, overwrite=True)
         except MissingExtra as error:
             print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
     failures = [failure for failure in results.failures if failure.controller in asked]

@@ -3,7 +3,6 @@
 examples:
   sb3-quad report evaluations/thesis
   sb3-quad report evaluations/thesis --overwrite      again, after adding controllers
-  sb3-quad report evaluations/thesis --no-pictures    only the page, and its tables as report.md
 
 Needs: pip install '.[report]' from a clone.
 """
@@ -11,23 +10,21 @@ Needs: pip install '.[report]' from a clone.
 import argparse
 from pathlib import Path
 
-from sb3_quad.cli.parser import YES_OR_NO, Parser, add_common
+from sb3_quad.cli.parser import Parser, add_common
 
 
 def add_arguments(parser: Parser) -> None:
-    add = parser.add_argument
-    add("folder", metavar="FOLDER", help="results folder of evaluate")
-    add("--pictures", default=True, help="also write each plot as PNG and SVG (yes)", **YES_OR_NO)
+    parser.add_argument("folder", metavar="FOLDER", help="results folder of evaluate")
     add_common(parser, "overwrite")
 
 
 def run(options: argparse.Namespace) -> int:
     """Write the page, print where it is. Returns the exit code."""
-    report(options.folder, options.overwrite, options.pictures)
+    report(options.folder, options.overwrite)
     return 0
 
 
-def report(folder: str | Path, overwrite: bool, pictures: bool) -> None:
+def report(folder: str | Path, overwrite: bool) -> None:
     """Write the page of a folder of results, with a spinner in a terminal; print where it is.
 
     :raises ConfigError: see :func:`sb3_quad.report.results_page.write_report`.
@@ -37,5 +34,5 @@ def report(folder: str | Path, overwrite: bool, pictures: bool) -> None:
     from sb3_quad.report.results_page import write_report
 
     with console().status("report"):
-        page = write_report(folder, overwrite, pictures)
-    print(f"saved {page}" + (f", its plots as PNG and SVG in {page.parent / PICTURES}" if pictures else ""))
+        page = write_report(folder, overwrite)
+    print(f"saved {page}, its plots in {page.parent / PICTURES}")
