@@ -84,11 +84,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # as in `sb3-quad train --help | head`
         sys.stderr.close()
         return 0
-    except SystemExit as leaving:
-        return _refuse(
-            f"a module that was called left with sys.exit({leaving.code!r}); what the command was to do is not done"
-        )
-    except Exception as error:  # a wrapper's, an environment's or a callback's of the user, a full disk, or a fault of ours
+    except (Exception, SystemExit) as error:  # of a user's wrapper, environment or callback, a full disk, or a fault of ours
         if sys.flags.dev_mode:
             raise
         return _refuse(_unexpected(error))
@@ -100,8 +96,8 @@ def _refuse(message: str) -> int:
     return 2
 
 
-def _unexpected(error: Exception) -> str:
-    """What an exception says that no check foresaw, and where it was raised."""
+def _unexpected(error: BaseException) -> str:
+    """The message of an exception that no check foresaw, and where it was raised."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
     told = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())])

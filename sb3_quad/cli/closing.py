@@ -1,7 +1,6 @@
 """What a command prints at its end: agents and experts on the same fresh episodes, where everything is, what to type next."""
 
 import shlex
-import time
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -11,7 +10,6 @@ from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.envs.rendering.window import has_display
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
@@ -73,12 +71,9 @@ def close_run(result: TrainingResult) -> int:
     """Print the table of a single run's agent and where everything is. Returns the exit code."""
     if result.exit_code != 0:
         return result.exit_code
-    summary = f"trained in {result.seconds:.1f} s"
     if result.job.config.task is not None:
-        start = time.perf_counter()
         console().print(agent_and_expert(result.job, result.model))
-        summary += f", flown for this table in {time.perf_counter() - start:.1f} s"
-    print(summary)
+    print(f"trained in {result.seconds:.1f} s")
     print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
     _print_next(result.run)
     return 0
@@ -96,11 +91,9 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
     beside = ("expert", "IL-agent", "RL-agent", REFERENCE.name)
     print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)
-    times = [f"{name}: {stage.seconds:.0f} s" for name, stage in result.stages.items()]
-    print("; ".join([*times, f"in all: {seconds:.0f} s"]))
     for name, stage in result.stages.items():
-        print(f"{name}: {stage.agent}")
-    print(f"saved in {result.folder}")
+        print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
+    print(f"saved in {result.folder}, {seconds:.0f} s in all")
     _print_next(open_run([stage for name, stage in result.stages.items() if name != REFERENCE.name][-1].run))
     return 0
 
@@ -109,13 +102,8 @@ def _print_next(run: RunFolder) -> None:
     """Print the commands that show, measure and export a run's agent, if it flies an environment of this package."""
     if run.name not in ENVIRONMENTS:
         return
-    agent, label = str(run.result), f"{run.path.parent.name}_{run.path.name}"
-    picture = [] if has_display() else ["-o", f"{label}.png"]
-    vehicle = ["--vehicle", "itm"] if agent_settings(agent)[0].vehicles else []  # else the one that it was trained on
-    print("next:")
-    for command in (
-        ["enjoy", agent, "--env", run.name, *picture],
-        ["evaluate", agent, "--suite", "quick", "-o", f"evaluations/{label}"],
-        ["export", agent, "--format", "torchscript", *vehicle],
-    ):
-        print("  " + shlex.join(["sb3-quad", *command]))
+    agent, label = shlex.quote(str(run.result)), shlex.quote(f"{run.path.parent.name}_{run.path.name}")
+    vehicle = " --vehicle itm" if agent_settings(run.result)[0].vehicles else ""  # else the one that it was trained on
+    print(f"next:\n  sb3-quad enjoy {agent} --env {run.name} -o {label}.png")
+    print(f"  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}")
+    print(f"  sb3-quad export {agent} --format torchscript{vehicle}")

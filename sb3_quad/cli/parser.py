@@ -12,14 +12,9 @@ from pydantic import BaseModel
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_number, parse_value
 
-BRIDGE = "is of rl_zoo3 alone; the bridge takes it: python -m sb3_quad.zoo {}, docs/zoo.md"
-
 
 class Parser(argparse.ArgumentParser):
     """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
-
-    elsewhere: Mapping[str, str] = {}
-    """By options of rl-zoo that a command lacks: what else to call."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs})
@@ -34,11 +29,10 @@ class Parser(argparse.ArgumentParser):
         :raises ConfigError: an unknown option, a missing or bad value.
         """
         options, rest = super().parse_known_args(args, namespace)
-        for text in rest:
-            if (name := text.split("=")[0]) in self.elsewhere:
-                raise ConfigError(f"{name} {self.elsewhere[name]}")
+        if rest:
             valid = [option for action in self._actions for option in action.option_strings]
-            raise ConfigError(unknown("option", name, valid).split("(valid:")[0].rstrip(": ") + "; see --help")
+            says = unknown("option", rest[0].split("=")[0], valid).split("(valid:")[0].rstrip(": ")
+            raise ConfigError(f"{says}; see --help, and docs/zoo.md for flags of rl_zoo3")
         return options, rest
 
 

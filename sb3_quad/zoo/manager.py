@@ -19,10 +19,12 @@ from sb3_quad.base.literals import parse_mapping
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.training.algorithms import takes_expert
+from sb3_quad.training.algorithms import constructor_parameters, takes_expert
 from sb3_quad.training.config import SETTINGS, VEC_ENVS
 from sb3_quad.training.transfer import transfer_policy
-from sb3_quad.zoo.search_spaces import OWN_ALGORITHMS, Settings, register_space, to_keywords
+from sb3_quad.training.values import convert
+
+Settings = dict[str, Any]
 
 
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
@@ -39,6 +41,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     ``eval_tasks``              left out: rl_zoo3 evaluates on one environment; a line says so
     ``learning_rate: lin_x``    SB3's own schedule, so that the zip loads where rl_zoo3 is not installed
     ``-i`` / --trained-agent    for our algorithms: policy and critic of any on-policy zip, with a new optimiser
+    ``-optimize``, --trial-id   for our algorithms: refused; ``sb3-quad tune`` searches, and writes settings for ``-conf``
     ==========================  ===================================================================================
 
     Its ``args.yml`` gives as ``env_kwargs`` what evaluations are flown with, which is what ``enjoy`` is to show.
@@ -46,16 +49,18 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
     config: str
     env_kwargs: Settings
-    trial_id: int | None
     vec_env_class: Callable[..., VecEnv]
 
     def __init__(self, *arguments: Any, **keywords: Any) -> None:
         super().__init__(*arguments, **keywords)
         self._env_id: str = self.env_name.gym_id
-        self._ours = self.algo in OWN_ALGORITHMS or self._env_id in ENVIRONMENTS
+        self._own_algorithm = takes_expert(ALGOS[self.algo])
+        self._ours = self._own_algorithm or self._env_id in ENVIRONMENTS
         self._batched = False
         if self._ours:
             self.config = _find_config(self.config, self.algo)
+        if self._own_algorithm and (self.optimize_hyperparameters or self.trial_id):
+            raise ConfigError(f"{self.algo}: search for its hyperparameters with sb3-quad tune --algo {self.algo}")
         if self._env_id in ENVIRONMENTS:
             self.monitor_kwargs = {"info_keywords": ("is_success",)}  # for plot_train -y success
 
@@ -64,16 +69,9 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if not self._ours:
             return super().read_hyperparameters()
         given, self.env_kwargs = self.env_kwargs, {}
-        trial_id, self.trial_id = self.trial_id, None  # is read below, once the settings that it changes are known
         settings, saved = super().read_hyperparameters()
-        changes: Settings = {}
-        if self.algo in OWN_ALGORITHMS:
-            register_space(self.algo, dict(settings))
-        if self.storage and self.study_name and trial_id:
-            changes = {**self.load_trial(self.storage, self.study_name, trial_id), **(self.custom_hyperparams or {})}
-        changes["env_kwargs"] = {**parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"), **given}
         for each in (settings, saved):
-            each.update(changes)
+            each["env_kwargs"] = {**parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"), **given}
         return settings, saved
 
     def _preprocess_hyperparams(self, hyperparams: Settings) -> Any:
@@ -84,9 +82,13 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if hyperparams.pop("eval_tasks", None):
             print("eval_tasks: left out, rl_zoo3 evaluates on the environment's own task")
         expert = hyperparams.pop("expert", None)
-        if takes_expert(ALGOS[self.algo]):
+        if self._own_algorithm:
             hyperparams["expert"] = resolve_expert(expert or DEFAULT_EXPERT, hyperparams["env_kwargs"].get("vehicle", "itm"))
-        hyperparams = to_keywords(self.algo, hyperparams, self.config)
+        for name, parameter in constructor_parameters(ALGOS[self.algo]).items():
+            if name in hyperparams:
+                hyperparams[name] = convert(hyperparams[name], parameter, f"{self.config}: {name}")
+        if isinstance(hyperparams.get("policy_kwargs"), dict):
+            hyperparams["policy_kwargs"] = parse_mapping(hyperparams["policy_kwargs"], f"{self.config}: policy_kwargs")
         processed = super()._preprocess_hyperparams(hyperparams)
         self.eval_env_kwargs = {**self.env_kwargs, **evaluation, **(self._eval_env_kwargs_args or {})}
         if self._batched and processed[1] is not None:
@@ -94,7 +96,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         return processed
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:
-        return hyperparams if self._ours else super()._preprocess_schedules(hyperparams)  # to_keywords has made ours
+        return hyperparams if self._ours else super()._preprocess_schedules(hyperparams)  # ours are made above
 
     def _choose_vec_env(self, setting: str | None) -> None:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
@@ -126,7 +128,7 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         return super().create_envs(n_envs, eval_env, no_log)
 
     def _load_pretrained_agent(self, hyperparams: Settings, env: VecEnv) -> Any:
-        if self.algo not in OWN_ALGORITHMS:
+        if not self._own_algorithm:
             return super()._load_pretrained_agent(hyperparams, env)
         given = {name: getattr(self, name) for name in ("tensorboard_log", "seed", "verbose", "device")}
         model = ALGOS[self.algo](env=env, **given, **hyperparams)

@@ -65,7 +65,7 @@ def test_bad_input_is_one_line_and_leaves_nothing_behind(name, here, capsys):
 @pytest.mark.parametrize(
     ("raised", "says"),
     [
-        (SystemExit(0), "left with sys.exit(0)"),
+        (SystemExit(0), "SystemExit: 0 ("),
         (OSError(errno.ENOSPC, "No space left on device", "run/0.monitor.csv"), "run/0.monitor.csv: No space left on device"),
         (ZeroDivisionError("in a callback"), "ZeroDivisionError: in a callback (test_bad_input.py, line"),
     ],

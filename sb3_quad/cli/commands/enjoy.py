@@ -22,10 +22,9 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import BRIDGE, PAIRS, Parser, above_zero, add_common, given, natural, positive, whole
+from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, given, natural, positive, whole
 from sb3_quad.envs.registration import ENVIRONMENTS
 
-LACKED = "--num-threads --verbose --device --norm-reward --reward-log --gym-packages --custom-objects"
 DEFAULT_ENV = "QuadTargetTracking-v0"
 LAST = "last checkpoint"
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
@@ -33,7 +32,6 @@ SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, an
 
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
-    parser.elsewhere = dict.fromkeys(LACKED.split(), BRIDGE.format("enjoy"))
     parser.set_defaults(trained_agent=None)
     parser.add_argument("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
     task = add_flight_arguments(parser)

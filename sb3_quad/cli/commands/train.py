@@ -9,7 +9,6 @@ examples:
   sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
-  sb3-quad train --seed 0 1 2                             three seeds side by side, one table: a sweep
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
@@ -24,30 +23,20 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.cli.parser import BRIDGE, PAIRS, Parser, add_common, add_fields, given, positive, seed
+from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, SettingsOptions
 
 DEFAULT_PIPELINE = "imitation.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
-SEARCH = "is of rl-zoo's search for hyperparameters, here a command of its own: sb3-quad tune --help, docs/tune.md"
-ELSEWHERE = {
-    SEARCH: "-optimize --optimize-hyperparameters --n-trials --max-total-trials --sampler --pruner --n-startup-trials "
-    "--n-evaluations --storage --study-name --n-jobs --trial-id --no-optim-plots --optimization-log-path",
-    BRIDGE.format("train"): "--track --wandb-project-name --wandb-entity --wandb-group -tags --wandb-tags "
-    "--save-replay-buffer --truncate-last-trajectory",
-}
-"""By what to call instead, flags of rl-zoo's ``train.py`` that ours lacks."""
 KEPT_BY_RESUME = (
     *("algo", "env", "conf_file", "hyperparams", "eval_env_kwargs", "trained_agent", "log_folder", "seed", "reference"),
     *SettingsOptions.model_fields,
 )
-NOT_OF_SWEEPS = ("resume", "reference", "uuid", "tensorboard_log", "num_threads", "verbose", "log_interval")
 
 
 def add_settings(parser: Parser) -> None:
     """Add the flags for what is trained, which ``tune`` has as well."""
-    parser.elsewhere = {flag: place for place, flags in ELSEWHERE.items() for flag in flags.split()}
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
     add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
@@ -66,8 +55,7 @@ def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
     add = parser.add_argument
-    several = "seed (0); negative: a random one, recorded in args.yml; several: a run each, compared, as sweep does"
-    add("--seed", type=seed, nargs="+", metavar="N", help=several)
+    add("--seed", type=seed, metavar="N", help="seed (0); negative: a random one, recorded in args.yml")
     add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
     add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose")
     add(
@@ -85,10 +73,6 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.training.job import TrainingJob, describe
     from sb3_quad.training.trainer import resume, train
 
-    seeds = vars(options)["seed"] or []
-    if len(seeds) > 1:
-        return _sweep(options)
-    options.seed = seeds[0] if seeds else None
     prepare(options)
     start = time.perf_counter()
     arguments = {**given(options, *JobOptions.model_fields), "progress": shows_progress(options.progress)}
@@ -114,16 +98,6 @@ def run(options: argparse.Namespace) -> int:
     job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
     print(describe(job))
     return close_run(train(job))
-
-
-def _sweep(options: argparse.Namespace) -> int:
-    """Train one configuration with several seeds, by ``sweep`` with its defaults. Returns the exit code."""
-    from sb3_quad.cli.commands import sweep
-
-    for name in given(options, *NOT_OF_SWEEPS):
-        raise ConfigError(f"--{name.replace('_', '-')} goes with one seed; several make a sweep, docs/sweeps.md")
-    defaults = {"sweep": None, "name": "train", "dry_run": False, "workers": None, "executor": "local", "address": None}
-    return sweep.run(argparse.Namespace(**{**vars(options), **defaults}))
 
 
 def prepare(options: argparse.Namespace) -> None:
