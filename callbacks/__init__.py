@@ -5,7 +5,6 @@ from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule
 from sb3_quad.callbacks.episodes import EpisodeLog, FlightMetrics
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
-from sb3_quad.callbacks.observation_statistics import ObservationStatistics
 
 __all__ = [
     "BestModel",
@@ -14,6 +13,5 @@ __all__ = [
     "EpisodeLog",
     "FlightMetrics",
     "LastGoodModel",
-    "ObservationStatistics",
     "StopOnSignal",
 ]

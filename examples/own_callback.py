@@ -10,7 +10,7 @@ import argparse
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad import DAgger, GeometricExpert
-from sb3_quad.callbacks import CoefficientSchedule, ObservationStatistics
+from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs import QuadcopterVecEnv
 
 
@@ -42,5 +42,4 @@ env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=300, seed=0
 model = DAgger("MlpPolicy", env, GeometricExpert(), n_steps=125, batch_size=4096, gradient_steps=30, n_epochs=2,
                learning_rate=2e-3, seed=0, device="cpu")  # fmt: skip
 less_expert = CoefficientSchedule("beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05))
-sigma = ObservationStatistics(verbose=1)  # prints what Table A.2 of the thesis rounds
-model.learn(arguments.timesteps, callback=[CrashRate(), less_expert, sigma])
+model.learn(arguments.timesteps, callback=[CrashRate(), less_expert])

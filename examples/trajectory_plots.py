@@ -50,7 +50,7 @@ class TrajectoryPlots(EveryTimesteps):
         verbose: int = 0,
         **environment: Any,
     ) -> None:
-        super().__init__(every, verbose, n_flights=n_flights, max_steps=max_steps)
+        super().__init__(every, verbose)
         self._seeds = row_seeds(seed, n_flights)
         self._settings = FlightSettings().with_changes(**environment, max_episode_steps=max_steps)
 
