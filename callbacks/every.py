@@ -1,8 +1,5 @@
 """Callbacks that do something every so many timesteps: their base class, and the simplest one."""
 
-from collections.abc import Callable
-from pathlib import Path
-
 from stable_baselines3.common.callbacks import EventCallback
 
 from sb3_quad.base.errors import ConfigError
@@ -43,18 +40,16 @@ class Checkpoint(EveryTimesteps):
     ['rl_model_1600_steps.zip', 'rl_model_800_steps.zip']
 
     :param every: timesteps, over all environments together.
-    :param path: the file, with ``{steps}`` where the number of timesteps goes; or a function from that number to the file.
-        A file there is replaced.
+    :param path: the file, with ``{steps}`` where the number of timesteps goes. A file there is replaced.
     :raises ConfigError: ``every`` below 1, a path without ``{steps}``; when saving, a folder that cannot be written.
     """
 
-    def __init__(self, every: int, path: str | Callable[[int], Path], verbose: int = 0) -> None:
+    def __init__(self, every: int, path: str, verbose: int = 0) -> None:
         super().__init__(every, verbose)
-        if isinstance(path, str) and "{steps}" not in path:
+        if "{steps}" not in path:
             raise ConfigError(f"Checkpoint: {path}: must hold {{steps}}, or each checkpoint would replace the one before")
         self._path = path
 
     def _on_event(self) -> bool:
-        path, steps = self._path, self.num_timesteps
-        save_model(self.model, path.replace("{steps}", str(steps)) if isinstance(path, str) else path(steps))
+        save_model(self.model, self._path.replace("{steps}", str(self.num_timesteps)))
         return True

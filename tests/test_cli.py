@@ -266,7 +266,9 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     assert all(part in card for part in (*facts, run.command.read_text().strip()))
     assert agent_settings("mine.zip")[0] == agent_settings("mailed_best_model.zip")[0]
     assert main(["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]) == 2
-    assert f"{run.best_model}: layer" in capsys.readouterr().err  # of other sizes
+    assert (
+        f"{run.best_model}: environment spaces and policy_kwargs must be the same" in capsys.readouterr().err
+    )  # of other sizes
 
 
 def test_only_interrupted_runs_resume(trained_runs, capsys):
@@ -315,15 +317,13 @@ def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
     assert f"{content['results'][-1]['rate']:,.0f}" in capsys.readouterr().out
 
 
-def test_the_benchmark_says_where_the_time_of_a_training_goes(tmp_path, capsys):
+def test_the_benchmark_measures_rollouts_and_updates(tmp_path):
     sizes = "n_timesteps: 100, n_envs: 4, n_steps: 10, batch_size: 20, n_epochs: 1"
     (tmp_path / "tiny.yml").write_text(f"QuadStateRecovery-v0: {{{sizes}}}")
     arguments = ["benchmark", "--training", "--conf-file", str(tmp_path / "tiny.yml"), "--output", str(tmp_path / "out.json")]
     assert main(arguments) == 0
     content = json.loads((tmp_path / "out.json").read_text())
     assert [entry["name"] for entry in content["results"]][::3] == ["dagger, whole loop", "ppo_bc, whole loop"]
-    assert all(seconds > 0.0 for parts in content["seconds"].values() for seconds in parts.values())
-    assert "rollout: the rest" in capsys.readouterr().out
 
 
 def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with():

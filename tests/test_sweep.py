@@ -104,7 +104,7 @@ def test_entries_of_a_list_have_their_names_and_inherit():
         ({"grid": {"algo": ["dagger", "ppo"]}}, [], "'ppo': "),
         ({"grid": {"vehicle": ["itm", "no-such"]}}, [], "no-such"),
         ({"seed": []}, [], "seed"),
-        ({"seed": -1}, [], "seed -1"),
+        ({"seed": -1}, [], "seed.0: Input should be greater than or equal to 0"),
         ({"configurations": [{"name": "a"}, {"name": "a"}]}, [], "two configurations are called 'a'"),
         ({"eval_freq": "often"}, [], "eval_freq"),
         ({"evaluation": {"suite": "no-such"}}, [], "no-such"),

@@ -8,7 +8,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.yaml_files import YamlFolder
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
-SETTINGS = YamlFolder("settings", "sb3_quad.zoo_configs", ".yml", in_name=True, folders=("thesis",))
+SETTINGS = YamlFolder("settings", "sb3_quad.zoo_configs", ".yml", folders=("thesis",))
 
 
 @pytest.fixture

@@ -5,11 +5,10 @@ Streams are told apart by :class:`numpy.random.SeedSequence` of a run's seed, a 
 """
 
 import typing
-from typing import Literal
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
-
-from sb3_quad.base.errors import ConfigError
+from pydantic import Field
 
 Purpose = Literal[
     "training",
@@ -26,6 +25,7 @@ PURPOSES = typing.get_args(Purpose)
 _PURPOSE, _ROW = range(2)  # what a key tells apart
 SCENARIO_STREAM = 0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
 LARGEST = 2**32  # NumPy's global generator, which SB3 seeds, takes no more
+Seed: TypeAlias = Annotated[int, Field(ge=0, lt=LARGEST)]
 
 
 def seed_for(purpose: Purpose, seed: int = 0) -> int:
@@ -43,13 +43,3 @@ def row_seeds(seed: int, n: int) -> list[int]:
 
 def _hash(seed: int, *key: int) -> int:
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0] >> np.uint64(11))
-
-
-def check_seed(seed: int) -> int:
-    """``seed``, if a run can have it.
-
-    :raises ConfigError: it is negative or too large.
-    """
-    if not 0 <= seed < LARGEST:
-        raise ConfigError(f"seed {seed}: must be at least 0 and below {LARGEST}")
-    return seed

@@ -1,11 +1,10 @@
 """Ctrl-C, SIGTERM and SIGHUP as a request to stop, answered where the training can be left cleanly."""
 
-import os
 import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last when a terminal is closed
@@ -42,7 +41,7 @@ class StopSignals:
             self._previous = {number: signal.signal(number, self._note) for number in handled}
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
         outer = getattr(self._previous.get(self.received or 0), "__self__", None)
@@ -62,22 +61,15 @@ class StopSignals:
 
 @contextmanager
 def interrupts_leave() -> Iterator[None]:
-    """Within the block, Ctrl-C ends the program at once, with exit code 130: for imports.
+    """Within the block, Ctrl-C kills the program at once, as the shell's exit code 130 says: for imports.
 
     A KeyboardInterrupt there comes out of some compiled modules as an ImportError, or not at all.
     """
-
-    def leave(number: int, frame: FrameType | None) -> None:
-        os.write(2, b"interrupted\n")
-        os._exit(130)
-
     main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGINT, leave) if main else None
-    try:
-        yield
-    finally:
-        if main:
-            signal.signal(signal.SIGINT, before)
+    before = signal.signal(signal.SIGINT, signal.SIG_DFL) if main else None
+    yield
+    if main:
+        signal.signal(signal.SIGINT, before)
 
 
 def ignore_interrupts() -> None:

@@ -11,8 +11,6 @@ import yaml
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
 
-SUFFIXES = (".yaml", ".yml")
-
 
 class UniqueKeyLoader(yaml.SafeLoader):
     """PyYAML's SafeLoader silently keeps the last of two equal keys; this one refuses them."""
@@ -33,18 +31,20 @@ def parse_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = UniqueKeyL
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
 
 
-def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader] = UniqueKeyLoader) -> dict[str, Any]:
+def parse_mapping_text(text: str, where: str, loader: type[yaml.SafeLoader] = UniqueKeyLoader) -> dict[Any, Any]:
+    """:raises ConfigError: text that is not YAML, or holds no keys and values."""
+    content = parse_yaml(text, where, loader)
+    if not isinstance(content, dict):
+        raise ConfigError(f"{where}: must hold keys and values")
+    return content
+
+
+def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader]) -> dict[str, Any]:
     """The keys and values of a YAML file.
 
     :raises ConfigError: it is missing, unreadable or holds something else.
     """
-    return _mapping(parse_yaml(read_text(path), str(path), loader), str(path))
-
-
-def _mapping(content: Any, where: str) -> dict[Any, Any]:
-    if not isinstance(content, dict):
-        raise ConfigError(f"{where}: must hold keys and values")
-    return content
+    return parse_mapping_text(read_text(path), str(path), loader)
 
 
 @dataclass(frozen=True)
@@ -54,14 +54,12 @@ class YamlFolder:
     :param kind: what messages call such a file.
     :param package: that holds the files.
     :param suffix: of the files.
-    :param in_name: whether the suffix is part of the name, as in ``thesis/dagger.yml``.
-    :param folders: further ones inside the package, in the order in which their names are listed.
+    :param folders: further ones inside the package. With them the suffix is part of a name, as in ``thesis/dagger.yml``.
     """
 
     kind: str
     package: str
     suffix: str = ".yaml"
-    in_name: bool = False
     folders: tuple[str, ...] = ()
 
     def names(self) -> list[str]:
@@ -73,9 +71,9 @@ class YamlFolder:
 
         Where the suffix is part of the name, a source is a path if the user has such a file.
         """
-        if isinstance(source, Path) or (self.in_name and Path(source).is_file()):
-            return True
-        return not self.in_name and (bool(Path(source).suffix) or "/" in source)
+        if isinstance(source, Path) or self.folders:
+            return isinstance(source, Path) or Path(source).is_file()
+        return bool(Path(source).suffix) or "/" in source
 
     def text(self, source: str | Path) -> tuple[str, str]:
         """The text of a file by name or path, and what messages call it.
@@ -95,14 +93,12 @@ class YamlFolder:
         :raises ConfigError: as :meth:`text`; or it holds something else.
         """
         text, where = self.text(source)
-        return _mapping(parse_yaml(text, where), where), where
+        return parse_mapping_text(text, where), where
 
     def _files(self) -> dict[str, Any]:
         """The files in the package, by name."""
-        found = {}
-        for folder in ("", *self.folders):
-            for file in sorted(resources.files(self.package).joinpath(folder).iterdir(), key=lambda file: file.name):
-                if file.name.endswith(self.suffix):
-                    name = str(PurePosixPath(folder, file.name))
-                    found[name if self.in_name else name.removesuffix(self.suffix)] = file
-        return found
+        package = resources.files(self.package)
+        folders = {folder: package.joinpath(folder).iterdir() for folder in ("", *self.folders)}
+        paths = sorted(str(PurePosixPath(folder, file.name)) for folder, files in folders.items() for file in files)
+        found = [path for path in paths if path.endswith(self.suffix)]
+        return {path if self.folders else path.removesuffix(self.suffix): package.joinpath(path) for path in found}

@@ -15,11 +15,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, BeforeValidator, Field, NonNegativeFloat, PositiveInt, model_validator
+from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.literals import parse_number
-from sb3_quad.base.seeds import check_seed
+from sb3_quad.base.seeds import Seed
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.options import RunOptions, SettingsOptions
@@ -67,13 +67,13 @@ class Evaluation(Frozen):
     suite: str | None = Field(default=None, description="name or YAML file; without it, fresh episodes of both tasks")
     scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = Field(default=(), description="only these of the suite")
     episodes: PositiveInt | None = Field(default=None, description="of each scenario; without a suite 240")
-    seed: Annotated[int, AfterValidator(check_seed)] | None = Field(default=None, description="of the episodes")
+    seed: Seed | None = Field(default=None, description="of the episodes")
 
 
 class SweepSpec(Configuration):
     """A sweep."""
 
-    seed: Annotated[tuple[Annotated[int, AfterValidator(check_seed)], ...], BeforeValidator(as_list)] = Field(
+    seed: Annotated[tuple[Seed, ...], BeforeValidator(as_list)] = Field(
         default=(0,), min_length=1, description="one or a list"
     )
     grid: dict[str, Any] = Field(default={}, description="keys, each with a list of values")

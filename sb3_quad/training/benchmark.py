@@ -4,7 +4,6 @@ import itertools
 import platform
 import re
 import time
-from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
@@ -12,7 +11,6 @@ from importlib import metadata
 from pathlib import Path
 from timeit import Timer
 from typing import Any
-from unittest.mock import patch
 
 import gymnasium
 import numba
@@ -24,7 +22,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_quad.base.cores import available_cpus
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.version import __version__
-from sb3_quad.controllers.controller import Controller
 from sb3_quad.training.config import TrainingConfig, build_config
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
@@ -33,7 +30,6 @@ from sb3_quad.training.trainer import build_model
 ENV_ID = "QuadTargetTracking-v0"
 TRAINED = "QuadStateRecovery-v0"  # by train without arguments
 REPETITIONS = 5
-PARTS = ("rollout: environment", "rollout: labels", "rollout: the rest", "update")
 NAMES = {"batch": "batch", "dummy": "PyBullet, DummyVecEnv", "subproc": "PyBullet, SubprocVecEnv"}
 PACKAGES = ("stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 
@@ -61,7 +57,7 @@ def single(seconds: float) -> list[Measurement]:
 def vectorised(kind: str, n_envs: int, seconds: float, randomize: Any = None) -> list[Measurement]:
     """``VecEnv.step`` of ``batch``, ``dummy`` or ``subproc``: physics, noise, reward, resets, infos; random actions.
 
-    :param randomize: worlds to fly in as well, in turns with still air: on a shared machine the speed changes from second to
+    :param randomize: to be flown with as well, in turns with still air: on a shared machine the speed changes from second to
         second.
     """
     envs: dict[str, Any] = {}
@@ -82,75 +78,48 @@ def _measure(envs: dict[str, Any], n_envs: int, shape: tuple[int, ...], seconds:
     counts = {}
     for name, timer in timers.items():
         timer.timeit(3)  # compiles, fills caches
-        count, elapsed = 1, 0.0
-        while elapsed < seconds / 20:  # how many steps a repetition takes
-            count *= 2
-            elapsed = timer.timeit(count)
+        count, elapsed = timer.autorange()
         counts[name] = max(1, round(count * seconds / REPETITIONS / elapsed))
     rates: dict[str, list[float]] = {name: [] for name in envs}
     for _ in range(REPETITIONS):
         for name, timer in timers.items():
             rates[name].append(counts[name] * n_envs / timer.timeit(counts[name]))
-    return [Measurement(name, n_envs, float(np.median(each)), each) for name, each in rates.items()]
+    return [_measurement(name, n_envs, each) for name, each in rates.items()]
 
 
-def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> tuple[list[Measurement], dict[str, float]]:
-    """A whole SB3 training loop with the settings' own sizes; the first rollout and update, which compile, are left out.
+def _measurement(name: str, n_envs: int, rates: list[float]) -> Measurement:
+    return Measurement(name, n_envs, float(np.median(rates)), rates)
 
-    :return: the rates of all of it, of its rollouts and of its updates; and the seconds that each of its ``PARTS`` takes, per
-        rollout and update.
+
+def training_loop(config: TrainingConfig, rollouts: int = REPETITIONS) -> list[Measurement]:
+    """The rates of a whole SB3 training loop with the settings' own sizes, of its rollouts and of its updates.
+
+    The first rollout and update, which compile, are left out.
     """
     if config.is_off_policy:
         raise ConfigError(f"{config.algo}: only loops of on-policy algorithms are measured, in rollouts and updates")
     with closing(make_environments(config, config.n_envs, 0)) as env:
-        model, clock = build_model(TrainingJob(config=config), env), _Clock()
-        steps = config.rollout_steps * config.n_envs
-        vec_env: Any = model.get_env()
-        with ExitStack() as stack:
-            for owner, name, part in ((vec_env, "step", "environment"), (Controller, "labels", "labels")):
-                stack.enter_context(patch.object(owner, name, clock.timed(getattr(owner, name), f"rollout: {part}")))
-            model.learn(steps * (rollouts + 1), callback=clock)
+        clock, steps = _Clock(), config.rollout_steps * config.n_envs
+        build_model(TrainingJob(config=config), env).learn(steps * (rollouts + 1), callback=clock)
     rollout, update = np.diff(clock.times).reshape(-1, 2)[1:].T
-    whole = {"whole loop": rollout + update, "rollout": rollout, "update": update}
-    rates = [
-        Measurement(f"{config.algo}, {part}", config.n_envs, float(np.median(steps / seconds)), (steps / seconds).tolist())
-        for part, seconds in whole.items()
-    ]
-    rest = rollout.sum() - sum(clock.seconds.values())
-    seconds = {**clock.seconds, "rollout: the rest": float(rest), "update": float(update.sum())}
-    return rates, {part: seconds[part] / rollouts for part in PARTS}
+    parts = {"whole loop": rollout + update, "rollout": rollout, "update": update}
+    return [_measurement(f"{config.algo}, {part}", config.n_envs, (steps / each).tolist()) for part, each in parts.items()]
 
 
 class _Clock(BaseCallback):
-    """When rollouts begin and end (an update lies between two of them), and how long what rollouts call takes."""
+    """When rollouts begin and end; an update lies between two of them."""
 
     def __init__(self) -> None:
         super().__init__()
         self.times: list[float] = []
-        self.seconds: dict[str, float] = {}
 
     def _note(self) -> None:
         self.times.append(time.perf_counter())
-        if len(self.times) == 3:  # the second rollout
-            self.seconds = dict.fromkeys(self.seconds, 0.0)
 
     _on_rollout_start = _on_rollout_end = _on_training_end = _note
 
     def _on_step(self) -> bool:
         return True
-
-    def timed(self, function: Callable[..., Any], part: str) -> Callable[..., Any]:
-        """The function, whose time is added to that of a part."""
-        self.seconds[part] = 0.0
-
-        def call(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                self.seconds[part] += time.perf_counter() - start
-
-        return call
 
 
 def machine() -> dict[str, Any]:

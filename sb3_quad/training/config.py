@@ -36,7 +36,6 @@ SETTINGS = YamlFolder(
     "settings file",
     "sb3_quad.zoo_configs",
     ".yml",
-    in_name=True,
     folders=("any_quadcopter", "nominal", "pid", "robust", "thesis", "value_based"),
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""

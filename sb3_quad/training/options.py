@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.seeds import check_seed
+from sb3_quad.base.seeds import Seed
 from sb3_quad.base.validate import Frozen
 
 
@@ -62,7 +62,7 @@ class JobOptions(RunOptions):
     """All that a training is told beyond its settings. All its random numbers follow from ``seed``."""
 
     log_folder: str = option("logs", "folder for the run folders", "-f", metavar="DIR")
-    seed: Annotated[int, AfterValidator(check_seed)] = option(0, "seed of policy, environments and exploration")
+    seed: Seed = option(0, "seed of policy, environments and exploration")
     log_interval: PositiveInt = option(1, "rollouts between two tables of --verbose 1")
     tensorboard_log: str | None = option(None, "folder for TensorBoard", "-tb", metavar="DIR")
     verbose: Literal[0, 1, 2] = option(0, "1: SB3's tables, 2: debugging")

@@ -58,7 +58,7 @@ class RunFolder:
         ended = self.model.is_file() and not self.resume_state.is_file()
         return int(saved_data(self.model)["num_timesteps"]) if ended else 0
 
-    def checkpoint(self, timesteps: int) -> Path:
+    def checkpoint(self, timesteps: int | str) -> Path:
         """Where the model after ``timesteps`` goes."""
         return self.path / f"rl_model_{timesteps}_steps.zip"
 

@@ -6,7 +6,6 @@ import os
 import random
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -120,20 +119,14 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
     state = read_arrays(path)
     if "model" not in state:
         raise ConfigError(f"{path}: not a snapshot")
-    environment, zip_file = _part(state, ENVIRONMENT), io.BytesIO(state["model"].tobytes())
-    batch: Any = getattr(env.unwrapped, "batch", None)
-    if environment and batch is None:
-        raise ConfigError(f"{path}: holds the state of batched environments; use the run's own settings")
-    try:
-        algorithm: Any = get_algorithm(algo)
-        model: Any = load_zip(algorithm, zip_file, env=env, device=device, force_reset=not environment, **attributes)
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(f"{path}: {str(error).replace(f'model {zip_file}', 'its model')}") from None
+    environment, algorithm = _part(state, ENVIRONMENT), get_algorithm(algo)
+    zip_file, batch = io.BytesIO(state["model"].tobytes()), getattr(env.unwrapped, "batch", None)
+    model: Any = load_zip(algorithm, zip_file, env=env, device=device, force_reset=not environment, **attributes)
     if hasattr(model, "dataset"):
         model.dataset.restore(_part(state, DATASET), path)
     for name, buffer in _replay_buffers(model).items():
-        _fill(buffer, _part(state, f"{name}."), path)
-    if environment:
+        _fill(buffer, _part(state, f"{name}."))
+    if batch is not None:
         batch.restore(environment)
         if hasattr(model, "restore_expert_state"):
             model.restore_expert_state(_part(state, EXPERT_STATE))
@@ -167,17 +160,11 @@ def _filled(buffer: ReplayBuffer) -> Arrays:
     return {name: array[:rows] for name, array in vars(buffer).items() if isinstance(array, np.ndarray)}
 
 
-def _fill(buffer: ReplayBuffer, arrays: Arrays, path: Path) -> None:
-    """Give a new replay buffer the rows of :func:`_filled`, and its ``pos`` and ``full``.
-
-    :raises ConfigError: they do not fit.
-    """
-    try:
-        for name in arrays.keys() - {"pos", "full"}:
-            getattr(buffer, name)[: len(arrays[name])] = arrays[name]
-        buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
-    except (AttributeError, KeyError, ValueError) as error:
-        raise ConfigError(f"{path}: its replay buffer is not of this model ({error})") from None
+def _fill(buffer: ReplayBuffer, arrays: Arrays) -> None:
+    """Give a new replay buffer the rows of :func:`_filled`, and its ``pos`` and ``full``."""
+    for name in arrays.keys() - {"pos", "full"}:
+        getattr(buffer, name)[: len(arrays[name])] = arrays[name]
+    buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
 
 
 def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:

@@ -212,10 +212,10 @@ def _learn(
         )
         callbacks.append(best)
     if job.save_freq > 0:
-        callbacks.append(Checkpoint(job.save_freq, run.checkpoint))
+        callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
     callbacks += own_callbacks
     if job.progress:
-        callbacks.append(ProgressBar())
+        callbacks.append(ProgressBarCallback())
     callbacks.append(ConvertCallback(lambda local, _: signals.received is None or not last_good.is_fresh))
     start = time.perf_counter()
     try:
@@ -266,15 +266,3 @@ def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None,
     finite = all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
     if isinstance(error, ValueError) and not finite:
         raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate{where}") from error
-    if where and hasattr(error, "add_note"):  # Python 3.11 and later
-        error.add_note(where.removeprefix("; "))
-
-
-class ProgressBar(ProgressBarCallback):
-    """SB3's progress bar, which says when it stands still because the networks learn rather than fly."""
-
-    def _on_rollout_start(self) -> None:
-        self.pbar.set_description("flying")
-
-    def _on_rollout_end(self) -> None:
-        self.pbar.set_description("learning")

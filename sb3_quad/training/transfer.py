@@ -24,8 +24,8 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
     ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that holds. The optimiser
     stays as it is, so a new model starts with a fresh one.
 
-    :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ; the message names the
-        first that does.
+    :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ; the message names
+        them.
     """
     try:
         _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")  # unpickles nothing
@@ -42,17 +42,13 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
         return
     if not all(th.isfinite(tensor).all() for tensor in theirs.values()):
         raise ConfigError(f"{path}: holds parameters that are not finite")
-    for layer in sorted({**ours, **theirs}, key=lambda name: name == "log_std"):  # the network's own layers say more
-        if layer not in ours or layer not in theirs:
-            only = "the zip" if layer in theirs else f"this {type(model).__name__}"
-            raise ConfigError(f"{path}: layer {layer} is in {only} only (policy_kwargs differ)")
-        there, here = tuple(theirs[layer].shape), tuple(ours[layer].shape)
-        if there != here:
-            advice = "environment spaces and policy_kwargs must be the same"
-            raise ConfigError(f"{path}: layer {layer} has shape {there}, here it is {here}; {advice}")
     if "log_std_init" in model.policy_kwargs and "log_std" in ours:
         theirs["log_std"] = ours["log_std"]
-    model.policy.load_state_dict(theirs)
+    try:
+        model.policy.load_state_dict(theirs)
+    except RuntimeError as error:
+        what = one_line(error).partition(": ")[2]
+        raise ConfigError(f"{path}: environment spaces and policy_kwargs must be the same ({what})") from None
 
 
 CLONE_ROWS = 20_000  # states that are flown for a clone, at least

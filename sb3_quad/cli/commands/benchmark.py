@@ -3,7 +3,7 @@
 examples:
   sb3-quad benchmark                                   everything, about a minute
   sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
-  sb3-quad benchmark --training                        where the time of a training goes
+  sb3-quad benchmark --training                        rollouts and updates of trainings
   sb3-quad benchmark --algo ppo_bc --conf-file pid/ppo_bc.yml --output benchmark.json
 """
 
@@ -22,7 +22,7 @@ def add_arguments(parser: Parser) -> None:
     add("--seconds", type=above_zero, default=3.0, metavar="S", help="duration of each measurement (3)")
     add("--algo", nargs="+", default=["dagger", "ppo_bc"], help="algorithms of the training loops (dagger ppo_bc)")
     add("-conf", "--conf-file", metavar="FILE", help="its settings (those of train without arguments)")
-    add("--training", help="only, or no, training loops: where the time goes in rollouts and updates", **YES_OR_NO)
+    add("--training", help="only, or no, training loops: their rollouts and updates", **YES_OR_NO)
     add("--output", metavar="FILE", help="write everything as JSON, with machine, versions and thread counts")
 
 
@@ -30,12 +30,12 @@ def run(options: argparse.Namespace) -> int:
     """Measure, print, write. Returns the exit code."""
     from sb3_quad.cli.output import console
     from sb3_quad.evaluation.tables import text_table
-    from sb3_quad.training.benchmark import PARTS, TRAINED, machine, single, training_loop, vectorised
+    from sb3_quad.training.benchmark import TRAINED, machine, single, training_loop, vectorised
     from sb3_quad.training.config import load_config
 
     screen = console()
     loops = [] if options.training is False else [load_config(algo, TRAINED, options.conf_file) for algo in options.algo]
-    measurements, parts = [], {}
+    measurements = []
     if options.training is not True:
         with screen.status("one PyBullet environment"):
             measurements.extend(single(options.seconds))
@@ -46,20 +46,12 @@ def run(options: argparse.Namespace) -> int:
                 measurements.extend(vectorised(kind, n_envs, options.seconds, randomized))
     for config in loops:
         with screen.status(f"training loop of {config.algo}"):
-            rates, parts[config.algo] = training_loop(config)
-            measurements.extend(rates)
+            measurements.extend(training_loop(config))
     first = measurements[0].rate
     rows = [(each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements]
     screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
-    if parts:
-        shares = [(part, *(_share(seconds, part) for seconds in parts.values())) for part in PARTS]
-        screen.print(text_table("a rollout and its update, ms", ("", *parts), shares))
     if options.output is not None:
-        content = {"machine": machine(), "results": [asdict(each) for each in measurements], "seconds": parts}
+        content = {"machine": machine(), "results": [asdict(each) for each in measurements]}
         write_text(options.output, json.dumps(content, indent=2) + "\n")
         print(f"written to {options.output}")
     return 0
-
-
-def _share(seconds: dict[str, float], part: str) -> str:
-    return f"{1000 * seconds[part]:,.1f}  ({seconds[part] / sum(seconds.values()):.0%})"
