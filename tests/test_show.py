@@ -18,7 +18,7 @@ from sb3_quad.base.errors import ControllerError
 from sb3_quad.cli import main
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.envs.rendering.picture import Overlay, draw_overlays
+from sb3_quad.envs.rendering.picture import Trail, draw_trails
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.show import sequence
 from sb3_quad.show.episodes import fixed_setting, fly_all, scenario_setting
@@ -109,12 +109,12 @@ def test_points_are_seen_where_they_are():
 
 
 @pytest.mark.parametrize(("distance", "seen"), [(3.0, True), (8.0, False), (-3.0, False)])
-@pytest.mark.parametrize("width", [0.1, None])
-def test_lines_and_discs_are_hidden_by_what_is_before_them(distance, seen, width):
+def test_trails_are_hidden_by_what_is_before_them(distance, seen):
     points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0], [distance, 0.0, 0.5]])
-    overlay = Overlay(points, (1.0, 0.0, 0.0), 0.8, width)
-    drawn = np.asarray(draw_overlays([overlay], looking_along_x(), np.full((40, 80), 5.0, np.float32)))
-    assert (drawn[..., 3] > 200).any() == (drawn[..., 3] > 0).any() == seen
+    picture = Image.new("RGBA", (80, 40))
+    draw_trails(picture, [Trail(points, "red", 0.1)], looking_along_x(), np.full((40, 80), 5.0, np.float32))
+    drawn = np.asarray(picture)
+    assert (drawn[..., 3] == 255).any() == (drawn[..., 3] > 0).any() == seen
     assert (drawn[drawn[..., 3] > 0, :3] == (255, 0, 0)).all()
 
 

@@ -10,8 +10,9 @@ from sb3_quad.simulation.state import POSITION, TARGET
 
 SLOPE = math.tan(math.radians(15.0))  # see Lens; small, so that near and far are nearly of one size
 CHASE_SLOPE = math.tan(math.radians(27.0))
-ELEVATIONS = math.radians(-45.0), math.radians(52.0)  # of a chasing camera
-ELEVATION_AT_TARGET = math.radians(-8.0)
+CHASE_MARGIN = 0.6  # around vehicle and target, m, for the default vehicle
+ASIDE = math.radians(9.0)  # between the direction to the target and that of a chasing camera
+STEEPEST = math.radians(70.0)  # elevation of a chasing camera
 DOWN = math.radians(5.0)  # how far a camera that frames points looks down
 LOWEST = (-math.inf, -math.inf, 0.3)  # where a camera is at least, m
 
@@ -73,7 +74,7 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
 
 
 class ChaseCamera:
-    """A camera behind the vehicle as seen from its target and a little aside, so that both are in the picture.
+    """A camera behind the vehicle as seen from its target and a little aside, which has both in its picture.
 
     :param scale: the vehicle's size, in that of the default one.
     :param width: of its pictures, pixels; ``height`` likewise.
@@ -81,27 +82,17 @@ class ChaseCamera:
 
     def __init__(self, scale: float, width: int, height: int) -> None:
         self.scale, self.lens = scale, Lens(width, height, CHASE_SLOPE)
-        self.course, self.elevation = 0.0, ELEVATION_AT_TARGET
+        self.course, self.elevation = ASIDE, -ASIDE
 
     def follow(self, state: FloatArray, share: float) -> Camera:
-        """The camera for ``state``, (STATE_SIZE,), turned towards the target by a share of the angle; at it, it levels out."""
+        """The camera for ``state``, (STATE_SIZE,), turned towards the target by a share of the angle."""
         x, y, z = state[TARGET] - state[POSITION]
-        across = math.hypot(x, y)
-        far = math.hypot(across, z) > self.scale
-        if far and across > 0.3 * self.scale:
-            self.course += share * math.remainder(math.atan2(y, x) - self.course, 2.0 * math.pi)
-        elevation = float(np.clip(math.atan2(z, across), *ELEVATIONS)) if far else ELEVATION_AT_TARGET
-        self.elevation += share * (elevation - self.elevation)
-        level, aside = direction(self.course, 0.0), direction(self.course - math.pi / 2, 0.0)
-        ahead, above = direction(self.course, self.elevation), direction(self.course, self.elevation + math.pi / 2)
-        over = 0.4 - 0.75 * max(self.elevation, 0.0)  # a target far above is seen past the vehicle from below
-        eye = np.maximum(state[POSITION] + self.scale * (-1.3 * ahead + 0.35 * aside + over * above), LOWEST)
-        forward = _unit(state[POSITION] - eye) + _unit(state[TARGET] - eye) + 0.05 * level  # never straight up or down
-        return Camera(eye, _axes(_unit(forward)), self.lens)
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / max(float(np.linalg.norm(vector)), 1e-3))
+        if math.hypot(x, y, z) > self.scale:  # nearer targets would turn it to and fro
+            self.course += share * math.remainder(math.atan2(y, x) + ASIDE - self.course, 2.0 * math.pi)
+            elevation = float(np.clip(math.atan2(z, math.hypot(x, y)) - ASIDE, -STEEPEST, STEEPEST))
+            self.elevation += share * (elevation - self.elevation)
+        both = np.stack([state[POSITION], state[TARGET]])
+        return framing_camera(both, CHASE_MARGIN * self.scale, direction(self.course, self.elevation), self.lens)
 
 
 def _axes(forward: FloatArray) -> FloatArray:

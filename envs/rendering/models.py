@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -13,14 +13,13 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 Vector: TypeAlias = tuple[float, float, float]
 Colour: TypeAlias = tuple[float, float, float, float]
-Mesh: TypeAlias = dict[str, Any]  # vertices and triangles, as createVisualShape takes them
 
 DARK: Colour = (0.13, 0.14, 0.17, 1.0)
 GREY: Colour = (0.55, 0.58, 0.62, 1.0)
-BLUE: Colour = (0.10, 0.36, 0.75, 1.0)
 FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
 WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
 SLOWED = 12.0  # the drawn rotors turn that much slower than real ones, which would seem to stand or turn backwards in a film
+HEAD = (0.75, 2.4), (0.85, 1.6), (0.95, 0.8)  # of an arrow: height of a step, of the length, and its width
 NOWHERE: Vector = (0.0, 0.0, -1000.0)
 
 
@@ -51,12 +50,6 @@ def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
     return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
 
 
-def add_mesh(mesh: Mesh, colour: Colour, client: int) -> int:
-    """A body that is a mesh, out of sight; its number."""
-    shape = p.createVisualShape(p.GEOM_MESH, rgbaColor=colour, physicsClientId=client, **mesh)
-    return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
-
-
 def move_body(client: int, body: int, position: Sequence[float], quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
     """Move a body; the quaternion is (x, y, z, w), as PyBullet's are."""
     p.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
@@ -77,26 +70,20 @@ def rotor_turning(vehicle: Vehicle, speeds: FloatArray) -> FloatArray:
     return np.asarray(-np.sign(vehicle.rotor_directions) * speeds / SLOWED)
 
 
-def frame(arm: float, foot: float, centres: FloatArray) -> dict[Colour, list[Part]]:
+def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
     """A vehicle without its rotors, by colour: PyBullet's window gives a body one colour only.
 
-    :param foot: height of the landing skids' feet, below zero.
     :param centres: of the rotors, (4, 3).
     """
     parts = {
-        DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02 * arm), radius=0.30 * arm, length=0.10 * arm)],
-        BLUE: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.10 * arm), radius=0.24 * arm, length=0.06 * arm)],
+        DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02 * arm), radius=0.30 * arm, length=0.14 * arm)],
         GREY: [Part(p.GEOM_BOX, (-0.02 * arm, 0.0, -0.10 * arm), (0.34 * arm, 0.20 * arm, 0.12 * arm))],
-        FRONT: [Part(p.GEOM_SPHERE, (0.30 * arm, 0.0, 0.04 * arm), radius=0.075 * arm)],  # a camera
+        FRONT: [],
     }
     for x, y, z in centres.tolist():
         beam = math.hypot(x, y), 0.09 * arm, 0.06 * arm
         parts[FRONT if x > 0 else DARK].append(Part(p.GEOM_BOX, (x / 2, y / 2, 0.02 * arm), beam, yaw=math.atan2(y, x)))
         parts[GREY].append(Part(p.GEOM_CYLINDER, (x, y, 0.45 * z), radius=0.09 * arm, length=0.9 * z))
-    for y in (-0.32 * arm, 0.32 * arm):
-        parts[DARK].append(Part(p.GEOM_BOX, (0.0, y, foot + 0.02 * arm), (0.8 * arm, 0.04 * arm, 0.04 * arm)))
-        for x in (-0.2 * arm, 0.2 * arm):
-            parts[DARK].append(Part(p.GEOM_BOX, (x, 0.9 * y, foot / 2), (0.03 * arm, 0.03 * arm, -foot)))
     return parts
 
 
@@ -108,26 +95,18 @@ def rotor(radius: float, pitch: float) -> list[Part]:
     return [Part(p.GEOM_CYLINDER, radius=0.09 * radius, length=0.16 * radius), *ends]
 
 
-def arrow(length: float, radius: float) -> Mesh:
-    """An arrow along +z from the origin."""
-    neck, head = 0.72 * length, 2.4 * radius
-    return _revolve(np.array([(0.0, 0.0), (radius, 0.0), (radius, neck), (head, neck), (0.0, length)]), 20)
+def arrow(length: float, radius: float) -> list[Part]:
+    """An arrow along +z from the origin; its head has three steps."""
+    head = [Part(p.GEOM_CYLINDER, (0.0, 0.0, z * length), radius=k * radius, length=0.1 * length) for z, k in HEAD]
+    return [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.35 * length), radius=radius, length=0.7 * length), *head]
 
 
-def rings(radius: float, thickness: float) -> Mesh:
-    """Two upright rings around the origin, at right angles to each other."""
-    angle = np.linspace(0.0, 2.0 * np.pi, 9)
-    ring = _revolve(np.stack([radius + thickness * np.cos(angle), thickness * np.sin(angle)], axis=1), 48)
-    points, triangles = ring["vertices"], ring["indices"]
-    upright = np.concatenate([points[:, [2, 0, 1]], points[:, [1, 2, 0]]])
-    return {"vertices": upright, "indices": [*triangles, *(corner + len(points) for corner in triangles)]}
-
-
-def _revolve(profile: FloatArray, segments: int) -> Mesh:
-    """The surface that ``profile``, (k, 2), radius and height, sweeps out about z; the outside lies to its right."""
-    angle = np.linspace(0.0, 2.0 * np.pi, segments, endpoint=False)
-    circle = np.stack([np.cos(angle), np.sin(angle), np.ones(segments)], axis=1)
-    corner = np.arange(len(profile) * segments).reshape(-1, segments)
-    a, b = corner[:-1], np.roll(corner, -1, axis=1)[:-1]
-    triangles = np.stack([a, b, b + segments, a, b + segments, a + segments], axis=-1)
-    return {"vertices": (profile[:, None, [0, 0, 1]] * circle).reshape(-1, 3), "indices": triangles.ravel().tolist()}
+def hoop(radius: float, thickness: float, yaw: float) -> list[Part]:
+    """An upright ring around the origin, turned about z by an angle, rad."""
+    length = 2.06 * radius * math.tan(math.pi / 16)
+    parts = []
+    for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
+        level, height = radius * math.cos(angle), radius * math.sin(angle)
+        at = -level * math.sin(yaw), level * math.cos(yaw), height
+        parts.append(Part(p.GEOM_CYLINDER, at, radius=thickness, length=length, roll=angle, yaw=yaw))
+    return parts

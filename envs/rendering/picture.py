@@ -1,10 +1,10 @@
-"""What PyBullet does not draw: sky and ground behind its bodies, trails and turning rotors laid over them.
+"""What PyBullet does not draw: sky and ground behind its bodies, and trails.
 
 Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its top.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import to_rgb
@@ -26,13 +26,12 @@ VISIBILITY = 90.0  # distance at which 1/e of the ground is still seen through t
 THINNEST = 1.4  # width of a line at least, pixels
 
 
-class Overlay(NamedTuple):
-    """What is laid over a picture: a line through points, or with no width the flat shape that they surround."""
+class Trail(NamedTuple):
+    """The line that a vehicle has flown along."""
 
     points: FloatArray  # (n, 3)
-    colour: Any  # as matplotlib takes it
-    opacity: float
-    width: float | None = None  # m
+    colour: str  # as matplotlib takes it
+    width: float  # m
 
 
 def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
@@ -40,68 +39,39 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
 
     :param shadows: centre x, y and radius of each shadow on the ground, (k, 3).
     """
-    axes, (width, height, slope) = camera.axes.astype(np.float32), camera.lens
-    x = np.float32(slope / height) * (2.0 * np.arange(width, dtype=np.float32) + 1.0 - width)
-    y = np.float32(slope / height) * (height - 1.0 - 2.0 * np.arange(height, dtype=np.float32))
-    rise = axes[0, 2] + y * axes[2, 2]  # of a row's rays, whose part along forward is 1; a camera without roll
-    share = np.clip(1.6 * rise / np.sqrt(1.0 + y * y), 0.0, 1.0)
-    picture = np.repeat((SKY_HORIZON + share[:, None] * (SKY_ZENITH - SKY_HORIZON))[:, None], width, axis=1)
-    first = int((rise > -1e-3).sum())
-    eye_x, eye_y, eye_z = camera.eye.tolist()
-    if first == height or eye_z <= 0.0:
-        return picture
-    y, along = y[first:, None], -eye_z / rise[first:, None]
-    east = eye_x + along * (axes[0, 0] + x * axes[1, 0] + y * axes[2, 0])
-    north = eye_y + along * (axes[0, 1] + x * axes[1, 1] + y * axes[2, 1])
-    distance = along * np.sqrt(1.0 + x * x + y * y)
+    width, height, slope = camera.lens
+    across = np.linspace(-1.0, 1.0, width, dtype=np.float32) * np.float32(slope * width / height)
+    upwards = np.linspace(slope, -slope, height, dtype=np.float32)
+    forward, right, up = camera.axes.astype(np.float32)
+    rays = forward + across[:, None] * right + upwards[:, None, None] * up
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    sky = SKY_HORIZON + np.clip(1.6 * rays[..., 2:], 0.0, 1.0) * (SKY_ZENITH - SKY_HORIZON)
+    eye = camera.eye.astype(np.float32)
+    distance = np.maximum(eye[2], 0.0) / np.maximum(
+        -rays[..., 2], 1e-6
+    )  # so far away where there is no ground that haze hides it
+    east, north = (eye[:2] + distance[..., None] * rays[..., :2]).transpose(2, 0, 1)
     # What a pixel covers of the ground, in squares; finer squares blur into their mean instead of flickering.
-    footprint = along * along * (2.0 * slope / height / eye_z / SQUARE)
-    soft = np.maximum(0.5 * np.pi * footprint, 0.02)
-    wave = np.clip(np.sin(np.pi / SQUARE * east) / soft, -1.0, 1.0) * np.clip(np.sin(np.pi / SQUARE * north) / soft, -1.0, 1.0)
-    dark = 0.5 + 0.5 * wave * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
-    light = np.ones_like(dark)
+    footprint = distance * distance * np.float32(2.0 * slope / height / max(eye[2], 0.1) / SQUARE)
+    wave = np.sin(np.pi / SQUARE * east) * np.sin(np.pi / SQUARE * north) / np.maximum(2.0 * footprint, 0.02)
+    dark = 0.5 + 0.5 * np.clip(wave, -1.0, 1.0) * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
+    ground = GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT)
     for centre_x, centre_y, radius in shadows.tolist():
         away = np.hypot(east - centre_x, north - centre_y) / radius
-        light *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)
-    clear = np.exp(distance / -VISIBILITY)[..., None]
-    ground = light[..., None] * (GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT))
-    picture[first:] = SKY_HORIZON + clear * (ground - SKY_HORIZON)
-    return picture
+        ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
+    return np.asarray(sky + np.exp(distance / -VISIBILITY)[..., None] * (ground - sky), dtype=np.float32)
 
 
-def draw_overlays(overlays: Sequence[Overlay], camera: Camera, depth: Float32Array) -> Pillow.Image:
-    """Overlays where nothing of less ``depth``, (height, width), m, is before them; elsewhere the picture is transparent."""
+def draw_trails(picture: Pillow.Image, trails: Sequence[Trail], camera: Camera, depth: Float32Array) -> None:
+    """Draw trails into a picture where nothing of less ``depth``, (height, width), m, is before them."""
     high, wide = depth.shape
-    picture, away = Pillow.new("RGBA", (wide, high)), Pillow.new("F", (wide, high), np.inf)
-    draw, draw_away = ImageDraw.Draw(picture), ImageDraw.Draw(away)
     larger = camera._replace(lens=Lens(wide, high, camera.lens.slope))
-    for overlay in overlays:
-        screen = larger.project(overlay.points)
-        if overlay.width is None:
-            centre = np.broadcast_to(screen.mean(axis=0), screen.shape)
-            polygons = np.stack([centre, screen, np.roll(screen, 1, axis=0)], axis=1)
-        else:
-            polygons = _ribbon(screen, overlay.width * high / (2.0 * camera.lens.slope))
-        colour = tuple(round(255 * part) for part in (*to_rgb(overlay.colour), overlay.opacity))
-        for polygon in polygons[(polygons[:, :, 2] > NEAR).all(axis=1)]:
-            corners = polygon[:, :2].clip(-1e4, 1e4).ravel().tolist()
-            draw.polygon(corners, fill=colour)
-            draw_away.polygon(corners, fill=float(polygon[:, 2].mean()))
-    seen = np.asarray(picture).copy()
-    seen[..., 3] *= np.asarray(away) < depth
-    return Pillow.fromarray(seen)
-
-
-def _ribbon(screen: FloatArray, width: float) -> FloatArray:
-    """A line as quadrilaterals, (n - 1, 4, 3), from points of it, (n, 3); each point a column, a row and a depth.
-
-    :param width: of the line at a depth of 1 m, pixels.
-    """
-    if len(screen) < 2:
-        return np.zeros((0, 4, 3))
-    along = np.gradient(screen[:, :2], axis=0)
-    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    half = 0.5 * np.maximum(width / np.maximum(screen[:, 2:], NEAR), THINNEST * SUPERSAMPLING)
-    aside = np.column_stack([half * along[:, ::-1] * (-1.0, 1.0), np.zeros(len(screen))])
-    left, right = screen - aside, screen + aside
-    return np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=1)
+    draw = ImageDraw.Draw(picture)
+    for trail in trails:
+        column, row, away = larger.project(trail.points).T
+        widths = np.maximum(trail.width * high / (2.0 * camera.lens.slope * np.maximum(away, NEAR)), THINNEST * SUPERSAMPLING)
+        before = depth[row.clip(0, high - 1).astype(int), column.clip(0, wide - 1).astype(int)]
+        seen = (away > NEAR) & (away < before)
+        colour = tuple(round(255 * part) for part in to_rgb(trail.colour))
+        for k in np.flatnonzero(seen[:-1] & seen[1:]).tolist():
+            draw.line((column[k], row[k], column[k + 1], row[k + 1]), fill=colour, width=round(widths[k]))

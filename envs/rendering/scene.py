@@ -12,8 +12,8 @@ from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.base.bullet import p
 from sb3_quad.envs.rendering import models
 from sb3_quad.envs.rendering.camera import Camera
-from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, Colour, add_body, add_mesh, move_body
-from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Overlay, backdrop, draw_overlays
+from sb3_quad.envs.rendering.models import FRONT, NOWHERE, WHITE, Colour, add_body, move_body
+from sb3_quad.envs.rendering.picture import FAR, NEAR, SUPERSAMPLING, Trail, backdrop, draw_trails
 from sb3_quad.simulation.state import POSITION, QUATERNION, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -50,24 +50,26 @@ class Scene:
         self.scale = size * vehicle.arm_length / REFERENCE_ARM  # distances in pictures are multiples of it
         self.span = size * models.span(vehicle)
         self._vehicles = [_VehicleBodies(vehicle, self.client, size, self.scale) for _ in range(n_vehicles)]
-        ball, rings = [models.Part(p.GEOM_SPHERE, radius=0.14)], models.rings(RING * self.scale, 0.014 * self.scale)
+        ball = [models.Part(p.GEOM_SPHERE, radius=0.14)]
+        hoops = [models.hoop(RING * self.scale, 0.014 * self.scale, yaw) for yaw in (0.0, math.pi / 2)]
         self._balls = [add_body(ball, MARKER, self.client) for _ in range(n_targets)]
-        self._rings = [add_mesh(rings, MARKER, self.client) for _ in range(n_targets)]
-        self._discs: list[Overlay] = []
+        self._hoops = [[add_body(parts, MARKER, self.client) for parts in hoops] for _ in range(n_targets)]
         self._shadows = np.zeros((0, 3))
 
     def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
         """Move everything: a pose for each vehicle, and ``targets``, (n_targets, 3)."""
         positions = np.array([pose.state[POSITION] for pose in poses])
-        self._discs = [disc for pose, vehicle in zip(poses, self._vehicles, strict=True) for disc in vehicle.place(pose)]
-        for target, ball, rings in zip(targets, self._balls, self._rings, strict=True):
+        for pose, vehicle in zip(poses, self._vehicles, strict=True):
+            vehicle.place(pose)
+        for target, ball, hoops in zip(targets, self._balls, self._hoops, strict=True):
             hidden = (np.linalg.norm(positions - target, axis=1) < 0.7 * self.scale).any()  # where it would hide a vehicle
             move_body(self.client, ball, NOWHERE if hidden else target.tolist())
-            move_body(self.client, rings, target.tolist())
+            for hoop in hoops:
+                move_body(self.client, hoop, target.tolist())
         shadows = [[*positions[-1, :2], self.span]]  # all of them would blacken the ground
         self._shadows = np.array(shadows + [[*target[:2], RING * self.scale] for target in targets])
 
-    def picture(self, camera: Camera, trails: Sequence[Overlay] = ()) -> Image:
+    def picture(self, camera: Camera, trails: Sequence[Trail] = ()) -> Image:
         """Draw the scene: uint8 (height, width, 3)."""
         wide, high = SUPERSAMPLING * camera.lens.width, SUPERSAMPLING * camera.lens.height
         forward, _, up = camera.axes
@@ -88,9 +90,9 @@ class Scene:
         bodies = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
         bodies[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
         depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
-        discs = sorted(self._discs, key=lambda disc: -float(np.linalg.norm(disc.points.mean(axis=0) - camera.eye)))
-        both = Pillow.alpha_composite(Pillow.fromarray(bodies), draw_overlays([*discs, *trails], camera, depth))
-        small = np.asarray(both.reduce(SUPERSAMPLING), dtype=np.float32)
+        drawn = Pillow.fromarray(bodies)
+        draw_trails(drawn, trails, camera, depth)
+        small = np.asarray(drawn.reduce(SUPERSAMPLING), dtype=np.float32)
         behind = 255.0 * backdrop(camera, self._shadows)
         return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
 
@@ -106,19 +108,16 @@ class _VehicleBodies:
         self.client = client
         arm, radius = size * vehicle.arm_length, size * models.rotor_radius(vehicle)
         self.centres = np.array([(size * x, size * y, 0.17 * arm) for x, y in vehicle.rotor_positions])
-        angle = np.linspace(0.0, 2.0 * np.pi, 32, endpoint=False)
-        self.rims = self.centres[:, None] + radius * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
-        self.colours = [FRONT if x > 0 else WHITE for x, _ in vehicle.rotor_positions]
-        frame = models.frame(arm, -size * vehicle.collision_radius, self.centres)
-        self.frame = [add_body(parts, colour, client) for colour, parts in frame.items()]
+        colours = [FRONT if x > 0 else WHITE for x, _ in vehicle.rotor_positions]
+        self.frame = [add_body(parts, colour, client) for colour, parts in models.frame(arm, self.centres).items()]
         # A rotor's drag on the body is opposed to its sense of turning.
         rotors = [models.rotor(radius, -0.25 * sense) for sense in vehicle.rotor_directions]
-        self.rotors = [add_body(parts, colour, client) for parts, colour in zip(rotors, self.colours, strict=True)]
-        self.force = add_mesh(models.arrow(0.5 * scale, 0.012 * scale), FORCE, client)
-        self.torque = add_mesh(models.arrow(0.4 * scale, 0.012 * scale), TORQUE, client)
+        self.rotors = [add_body(parts, colour, client) for parts, colour in zip(rotors, colours, strict=True)]
+        self.force = add_body(models.arrow(0.5 * scale, 0.012 * scale), FORCE, client)
+        self.torque = add_body(models.arrow(0.4 * scale, 0.012 * scale), TORQUE, client)
 
-    def place(self, pose: Pose) -> list[Overlay]:
-        """Move it; the discs in which its rotors turn."""
+    def place(self, pose: Pose) -> None:
+        """Move it."""
         position, (w, x, y, z) = pose.state[POSITION].tolist(), pose.state[QUATERNION].tolist()
         rotation = QuadcopterState(pose.state[:, None]).rotation[0]
         for body in self.frame:
@@ -131,5 +130,3 @@ class _VehicleBodies:
             x, y, z = (in_world + rotation @ in_body).tolist()
             along = p.getQuaternionFromEuler((0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)))
             move_body(self.client, body, position if any((x, y, z)) else NOWHERE, along)
-        rims = position + self.rims @ rotation.T
-        return [Overlay(rim, colour, 0.24) for rim, colour in zip(rims, self.colours, strict=True)]

@@ -17,7 +17,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
 from sb3_quad.base.imports import require
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
-from sb3_quad.envs.rendering.picture import Overlay
+from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.envs.rendering.window import disconnect, open_window, point_window, start_drawing
 from sb3_quad.show.episodes import Recording
@@ -112,7 +112,7 @@ def _panel(recording: Recording, times: FloatArray, forward: FloatArray, lens: L
         for seconds, camera in zip(times, following_cameras([recording], times, scene.scale, forward, lens), strict=True):
             step = recording.at(seconds)
             scene.place([recording.pose(step)], recording.state.target[[step]])
-            trail = Overlay(path[: step + 1 : 2], recording.colour, 0.75, width=0.03 * scene.scale)
+            trail = Trail(path[: step + 1 : 2], recording.colour, 0.03 * scene.scale)
             pixels = scene.picture(camera, [trail])
             yield with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
 

@@ -9,7 +9,7 @@ import numpy as np
 from sb3_quad.base.arrays import FloatArray, Image
 from sb3_quad.envs.rendering.camera import Camera, Lens, broadside, framing_camera
 from sb3_quad.envs.rendering.models import span
-from sb3_quad.envs.rendering.picture import Overlay
+from sb3_quad.envs.rendering.picture import Trail
 from sb3_quad.envs.rendering.scene import Scene
 from sb3_quad.show.episodes import Recording
 from sb3_quad.show.labels import side_by_side, tag_size, with_header, with_tags
@@ -107,7 +107,7 @@ def _same_times(recordings: Sequence[Recording], ends: Sequence[int], view: _Vie
 
 
 def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) -> Image:
-    trail = Overlay(recording.state.position[: end + 1], recording.colour, 0.85, width=0.05 * view.breadth)
+    trail = Trail(recording.state.position[: end + 1], recording.colour, 0.05 * view.breadth)
     with closing(Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
         pixels = scene.picture(view.camera, [trail])
