@@ -102,11 +102,6 @@ def load(file_format, content, name):
     return {"torchscript": load_torchscript, "onnx": load_onnx, "c": lambda it: load_header(it, name)}[file_format](content)[0]
 
 
-@pytest.fixture(autouse=True)
-def few_calls(monkeypatch):
-    monkeypatch.setattr("sb3_quad.export.load.CALLS", 20)
-
-
 compiled = [needs_compiler, pytest.mark.slow]
 CASES = [("torchscript", kind, "thrusts") for kind in SEES] + [("onnx", "all", "speeds")]
 CASES += [pytest.param("c", kind, "thrusts", marks=compiled) for kind in SEES] + [("onnx", "integral", "thrusts")]
@@ -183,7 +178,7 @@ def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
     expected = ITM.hover_thrust * (1.0 + 0.5 * actions)  # Eq. 3.18
     assert expected.std(axis=0).min() > 0.3  # all rotors at work
     np.testing.assert_allclose(load(file_format, exported.content, kind)(physical, None)[0], expected, atol=1e-4)
-    assert 0 <= exported.max_error < 1e-4 and exported.microseconds > 0
+    assert 0 <= exported.max_error < 1e-4
     assert f"{exported.max_error:.2g} N in " in exported.metadata["check"]
 
 
@@ -358,7 +353,7 @@ def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, c
     for file_format, file in (("onnx", "agent.onnx"), ("c", "agent.h")):
         assert main(["export", str(path), "--format", file_format, "-o", file]) == 0
     printed = capsys.readouterr().out
-    assert "µs per call" in printed and ("state: zeros begin" in printed) == stateful
+    assert ("state: zeros begin" in printed) == stateful
     section, scope = DOCS.split("## A policy with a state" if stateful else "## Python")[1], {}
     exec(section.split("```python")[1].split("```")[0], scope)
     (tmp_path / "main.c").write_text(section.split("```c\n")[1].split("```")[0])

@@ -19,7 +19,7 @@ from sb3_quad.simulation.tasks import Task
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
-FLIGHT_STEPS, LONG_FLIGHT_STEPS = 100, 1000  # of a policy of the present features, and of one with a state
+SHORT, LONG = 2, 1000  # control steps of the flights of a policy of the present features, and of one with a state
 TOLERANCE = 1e-4  # of the range between least and greatest output: far above rounding, far below any mistake
 _WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "body_rates_std": 8.0}
 _NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)  # where a position integral is at work at once
@@ -51,57 +51,52 @@ class Comparison(Hook):
     """Asks a file at each control step of the policy's flights; it keeps its own state from a flight's start to its end.
 
     :ivar error: the largest difference of any rotor so far, N or rad/s.
+    :ivar count: how many observations the file has been asked about.
     """
 
     def __init__(self, reference: Reference, call: Call) -> None:
-        self._reference, self._call = reference, call
-        integral = reference.observation.position_integral
+        self._reference, self._call, seen = reference, call, reference.observation
+        integral = seen.position_integral
         self._limits = {"position": integral.distance, "velocity": integral.speed} if integral else {}
-        self._state: Any = None
-        self._observations: list[Float32Array] = []
-        self.error = 0.0
-
-    @property
-    def observations(self) -> Float32Array:
-        """What the file was asked, in physical units, (n, 18)."""
-        return np.concatenate(self._observations)
-
-    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
-        self._sure = np.ones(state.n, dtype=np.bool_)
+        self._state, self._sure, self.count, self.error = None, np.True_, 0, 0.0
 
     def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
-        features = physical_features(state)
+        if self._reference.observation.is_extended:
+            features = physical_features(state)
+        else:
+            features = (observation * self._reference.std + self._reference.mean).astype(np.float32)
         for group, limit in self._limits.items():  # so close to one, rounding may begin to integrate a step later, or earlier
-            self._sure &= np.abs(np.linalg.norm(features[:, GROUPS[group]], axis=1) / limit - 1.0) > _ROUNDING
+            self._sure = self._sure & (np.abs(np.linalg.norm(features[:, GROUPS[group]], axis=1) / limit - 1.0) > _ROUNDING)
         self._results, self._state = self._call(features, self._state)
         self._compared = flying & self._sure
-        self._observations.append(features[self._compared])
 
     def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         difference = np.abs(self._results - self._reference.results(actions))[self._compared]
         self.error = float(np.max(difference, initial=self.error))  # NaN stays
+        self.count += len(difference)
 
 
 def compare(reference: Reference, call: Call, by: str, n: int = N_OBSERVATIONS) -> Comparison:
-    """Compare a file with the policy that it came from, in flights without noise.
+    """Compare a file with the policy that it came from, in its flights.
 
-    The flights start at any attitude, up to 30 m from the target, with velocities of N(0, 4 m/s) and body rates of
-    N(0, 8 rad/s) per axis, twice what an episode starts with. Those of a policy with a state are longer, and half of them
-    start within 1 m.
+    They start at any attitude, up to 30 m from the target, with velocities of N(0, 4 m/s) and body rates of N(0, 8 rad/s) per
+    axis, twice what an episode starts with. A policy of the present features flies two steps each time, so that half of the
+    observations are such starts, and both see noise. The flights of one with a state are longer, without noise, and half of
+    them start within 1 m.
 
     :param by: what runs the file.
     :param n: observations, at most: a flight may end early.
     :raises ExportError: a difference above ``TOLERANCE`` of the range, or a result that is not finite.
     """
     has_state = reference.observation.is_extended
-    steps = LONG_FLIGHT_STEPS if has_state else FLIGHT_STEPS
+    steps = LONG if has_state else SHORT
     task: dict[str, Any] = {"task": "recovery_and_tracking", "task_kwargs": _WIDE}
     seen = {"observation_mean": reference.mean, "observation_std": reference.std, **dict(reference.observation)}
     settings = FlightSettings().with_changes(
         **({"task": {"recovery_and_tracking": 1.0, _NEAR: 1.0}} if has_state else task),
         **seen,
         vehicle=reference.vehicle,
-        noise=0.0,
+        noise=0.0 if has_state else 0.05,
         max_episode_steps=steps,
     )
     comparison = Comparison(reference, call)

@@ -2,12 +2,10 @@
 
 import ctypes
 import io
-import itertools
 import json
 import shutil
 import subprocess
 import tempfile
-import timeit
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +21,6 @@ from sb3_quad.simulation.observation import OBSERVATION_SIZE
 
 N_ROTORS = 4
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
-CALLS, ROUNDS = 2000, 5  # that are timed: with one observation each, or with all at once
 Call = Callable[..., tuple[Float32Array, Any]]
 """From observations in physical units, (n, 18), and states to results, (n, 4), and the next states; None: flights begin."""
 
@@ -116,11 +113,3 @@ void run(const float *in, float *out, {name}_state *states, int begin, long n)
         return results, states
 
     return call, f"{Path(compiler).name} {' '.join(FLAGS)}"
-
-
-def time_calls(call: Call, observations: Float32Array, at_once: bool = False) -> float:
-    """Median time per observation, µs, of calls with one observation each, or ``at_once`` with all of them."""
-    parts = itertools.cycle(observations[None] if at_once else observations[:, None])
-    state = call(next(parts))[1]
-    times = timeit.repeat(lambda: call(next(parts), state), number=1, repeat=ROUNDS if at_once else CALLS)
-    return float(np.median(times)) * 1e6 / (len(observations) if at_once else 1)

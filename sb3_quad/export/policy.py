@@ -1,4 +1,4 @@
-"""A trained zip for others: as a file that flies by itself, checked and timed, or as a small zip of stock PPO."""
+"""A trained zip for others: as a file that flies by itself, checked, or as a small zip of stock PPO."""
 
 import hashlib
 import io
@@ -36,7 +36,6 @@ class Export(NamedTuple):
     metadata: dict[str, str]  # what it says about itself
     max_error: float  # the largest difference to the policy, in `unit`
     unit: str  # N or rad/s
-    microseconds: float  # per call with one observation, on one thread
     settings: Path | None  # the file that vehicle and scaling came from, where they were not given
 
 
@@ -94,11 +93,10 @@ def export_policy(
         warnings.simplefilter("ignore", DeprecationWarning)
         call, by = read(write(network, metadata))
         checked = compare(reference, call, by, n_observations)
-        extent = f"{len(checked.observations)} observations of flights"
-        metadata["check"] = f"largest error {checked.error:.2g} {network.unit} in {extent} ({by})"
+        found = f"largest error {checked.error:.2g} {network.unit} in {checked.count} observations of flights"
+        metadata["check"] = f"{found} ({by})"
         content = write(network, metadata)
-    time = load.time_calls(call, checked.observations, at_once=file_format == "c")
-    return Export(content, metadata, checked.error, network.unit, time, source)
+    return Export(content, metadata, checked.error, network.unit, source)
 
 
 def _describe(path: Path, algorithm: str, network: Network, reference: Reference) -> dict[str, str]:

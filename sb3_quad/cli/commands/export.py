@@ -37,7 +37,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Build, check, time, write. Returns the exit code."""
+    """Build, check, write. Returns the exit code."""
     from sb3_quad.cli.output import output_file, warn
     from sb3_quad.evaluation.controllers import ControllerSpec
     from sb3_quad.export.c_header import c_name
@@ -61,6 +61,5 @@ def run(options: argparse.Namespace) -> int:
     for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check"):
         if key in exported.metadata:
             print(f"{key}: {exported.metadata[key]}")
-    print(f"time: {exported.microseconds:.2f} µs per call, one observation, one thread")
     print(f"saved {file} ({len(exported.content)} bytes)")
     return 0
