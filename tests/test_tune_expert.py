@@ -1,13 +1,11 @@
 """The search for gains: it finds better ones, goes on where it was left, and loses no file."""
 
-import dataclasses
 import os
 import re
 import signal
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 from hypothesis import given
@@ -16,11 +14,6 @@ from hypothesis import strategies as st
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.cli.commands import tune_expert
-from sb3_quad.evaluation.expert_metrics import by_start
-from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert
-from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.tuning import expert
 from sb3_quad.tuning.expert import ExpertObjective, ExpertSearch, with_gains
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
@@ -91,22 +84,6 @@ def test_the_cost_tells_better_gains_from_worse_and_repeats_itself():
     careless = objective.cost(GAINS.model_copy(update={"attitude": 1.0}))
     assert timid.settling > good.settling and timid.value > good.value
     assert careless.too_low > good.too_low and careless.value > good.value
-
-
-def test_recoveries_by_start_count_each_flight_once_per_quantity():
-    flights = fly(GeometricExpert(), "state_recovery", 200, 5, noise=0.0, max_steps=1)
-    recovered = np.random.default_rng(0).random(200) < 0.7
-    counts = by_start(dataclasses.replace(flights, survival=recovered))
-    for quantity in ("tilt", "falling", "body rate"):
-        flown, lost = zip(*(counts[start] for start in counts if start.startswith(quantity)), strict=True)
-        assert len(flown) == 3 and sum(flown) == 200 and sum(lost) == (~recovered).sum()
-    batch = QuadcopterBatch(200, FlightSettings(task="state_recovery", noise=0.0), seed=5)
-    batch.reset()
-    state = batch.true_state()
-    upside_down = state.rotation[:, 2, 2] < -0.5
-    assert counts["tilt above 120°"] == (upside_down.sum(), (upside_down & ~recovered).sum())
-    assert counts["falling below 2 m/s"][0] == (state.velocity[:, 2] > -2).sum()
-    assert counts["body rate above 10 rad/s"][0] == (np.linalg.norm(state.body_rates, axis=1) >= 10).sum()
 
 
 @pytest.mark.slow

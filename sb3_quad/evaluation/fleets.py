@@ -6,14 +6,11 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.layout import row_slices
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState
-
-MAX_CLIENTS = 512  # PyBullet allows about 1000 physics clients in a process
 
 
 class FleetStep(NamedTuple):
@@ -78,10 +75,6 @@ class PyBulletFleet:
     """As :class:`BatchFleet`, with a PyBullet environment per row, in turn; the controller still sees them as one batch."""
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        if len(seeds) > MAX_CLIENTS:
-            raise ConfigError(
-                f"n_episodes {len(seeds)}: PyBullet flies at most {MAX_CLIENTS} side by side; fly them in several parts"
-            )
         self._seeds = seeds
         self._envs = [QuadcopterEnv(**dict(settings.with_changes(max_episode_steps=ENDLESS))) for _ in seeds]
         self.vehicle, self.observation_size = self._envs[0].vehicle, self._envs[0].batch.observation.size

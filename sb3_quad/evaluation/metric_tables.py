@@ -72,18 +72,15 @@ def reference_cells(reference: Reference) -> Cells:
     return cells | {time_row(tolerance): _printed(time) for tolerance, time in reference.time_to.items()}
 
 
-def metric_rows(
-    scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = (), brief: bool = False
-) -> list[Row]:
+def metric_rows(scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = ()) -> list[Row]:
     """The rows of a scenario, the best of each marked: first the cells of the controllers, then those from elsewhere.
 
     :param measured: of each controller; None: it failed.
-    :param brief: only the main ones of many tolerances; a plot shows the others.
     """
     others = [reference_cells(reference) for reference in references]
     none_lost = all(cells is None or cells[SURVIVAL].value == 100.0 for cells in measured)
     rows = []
-    for row in _rows_of(scenario, brief):
+    for row in _rows_of(scenario):
         failed = Cell(words="failed") if row == SUCCESS else Cell()
         own = [failed if cells is None else cells.get(row, Cell()) for cells in measured]
         if all(cell == Cell() for cell in own):
@@ -142,14 +139,14 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
     return groups
 
 
-def _rows_of(scenario: Scenario, brief: bool) -> list[Row]:
-    """The rows that mean something in a scenario."""
+def _rows_of(scenario: Scenario) -> list[Row]:
+    """The rows that mean something in a scenario; only the main ones of many tolerances, a plot shows the others."""
     if scenario.target.waypoints is not None:
         return [SUCCESS, SURVIVAL, REACHED, COMPLETED, COURSE_TIME]
     if scenario.group is not None:
         return [SUCCESS, SURVIVAL, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
     tolerances = scenario.tolerances
-    if brief and len(tolerances) > MOST_TOLERANCES:
+    if len(tolerances) > MOST_TOLERANCES:
         referenced = {float(key) for reference in scenario.reference.values() for key in reference.time_to}
         kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from sb3_quad.base.arrays import Float32Array
-from sb3_quad.export.network import Network
-from sb3_quad.export.stateful import StatefulNetwork
+from sb3_quad.export.network import Network, StatefulNetwork
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
 
 WIDTH = 110  # columns

@@ -10,7 +10,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy.typing as npt
 from stable_baselines3 import PPO
 
 from sb3_quad.base.errors import ConfigError, unknown
@@ -21,7 +20,6 @@ from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, check_policy, write_onnx, write_torchscript
-from sb3_quad.export.stateful import StatefulNetwork
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -44,8 +42,6 @@ def export_policy(
     file_format: str,
     output: str = "thrusts",
     vehicle: str | Path | Vehicle | None = None,
-    observation_mean: npt.ArrayLike | None = None,
-    observation_std: npt.ArrayLike | None = None,
     name: str | None = None,
     n_observations: int = N_OBSERVATIONS,
 ) -> Export:
@@ -53,12 +49,11 @@ def export_policy(
 
     It takes the 18 features of an observation in physical units, see ``metadata["observation"]``. It gives the four rotors'
     thrusts (N) or speeds (rad/s), by the policy's mean action, clipped. Earlier frames that the policy sees are in a state,
-    ``metadata["state"]``. Vehicle and scaling that are not given are those that :func:`agent_settings` finds in or beside
-    the zip, or else ``itm`` and Table A.2.
+    ``metadata["state"]``. A vehicle that is not given, and the scaling, are those that :func:`agent_settings` finds in or
+    beside the zip, or else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
     :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
-    :param observation_mean: μ of Eq. 3.16, (18,); ``observation_std`` σ, likewise.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
     :param n_observations: of the check, at most, see :func:`~sb3_quad.export.check.compare`.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are not the quadcopter's or
@@ -78,15 +73,12 @@ def export_policy(
         raise ConfigError(unknown("format", file_format, formats))
     write, read = formats[file_format]
     algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), agent_settings(path)
-    changes = {"vehicle": vehicle, "observation_mean": observation_mean, "observation_std": observation_std}
-    settings = settings.with_changes(**{key: value for key, value in changes.items() if value is not None})
+    settings = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
     if settings.vehicles is not None:
         raise ConfigError(f"model {path}: flies any vehicle; say with --vehicle which one's thrusts the file is to give")
     row = QuadcopterBatch(1, settings, n_threads=1)  # it checks them
     reference = Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.observation)
     network = build_network(reference, f"model {path}")
-    if reference.observation.is_extended:
-        network = StatefulNetwork(network.layers, reference)
     metadata = _describe(Path(path), algorithm, network, reference)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.

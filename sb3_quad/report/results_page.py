@@ -78,7 +78,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
         first, each_of = scenarios[0], ""
         if first.group is None:
             measured = [measured_cells(results, label, first) for label in colours]
-            rows = metric_rows(first, measured, first.reference.values(), brief=True)
+            rows = metric_rows(first, measured, first.reference.values())
             tables = [Table(_columns(colours, first.reference, results.source), rows)]
             plots: Sequence[Plot | Space] = _scenario_plots(results, first, colours, folder)
         else:

@@ -67,8 +67,7 @@ def run(options: argparse.Namespace) -> int:
         print(f"{signals.name}: writing the best of {search.trials_done} so far")
     seeds = row_seeds(seed_for("expert", options.seed), FRESH_SETS)
     tried = search.first, search.best
-    results = [measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, FRESH_EPISODES) for each in tried]
-    measured = [metrics for metrics, _ in results]
+    measured = [measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, FRESH_EPISODES) for each in tried]
     chosen = 1 if fresh_cost(measured[1]) < fresh_cost(measured[0]) else 0
     content = with_gains(text, tried[chosen].model_copy(update={"measured": measured[chosen]}))
     search.note_output(content.encode("utf-8"))
@@ -85,10 +84,6 @@ def run(options: argparse.Namespace) -> int:
     console().print(text_table("on fresh episodes, true state", ("gains", "before", "best of the search"), rows))
     if not chosen:
         print("the search found nothing better on fresh episodes: the file keeps the gains that it began with")
-    starts = []
-    for start, (flown, lost) in results[chosen][1].items():
-        starts.append((start, str(flown), str(lost), f"{100 * (1 - lost / flown):.2f} %" if flown else ""))
-    console().print(text_table("state recovery, by how it starts", ("", "flown", "lost", "survival"), starts))
     print(f"{search.trials_done} gains tried, least cost {search.study.best_value:.3f}; journal: {journal}")
     print(f"saved {output}")
     return signals.exit_code

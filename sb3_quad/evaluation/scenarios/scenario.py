@@ -200,7 +200,7 @@ class Scenario(Frozen):
         return not any(random) and all(vector.value is not None or vector.largest == 0.0 for vector in vectors)
 
     def _check_way(self, vehicle: Vehicle) -> None:
-        """See that start and targets lie above ground, within ``max_distance`` of each other and within reach."""
+        """See that start and targets lie above ground, within ``max_distance`` of each other."""
         start, points, least = self.start.position, self.target.points, vehicle.collision_radius
         for place, point in (("start.position", start), *(("target", point) for point in points)):
             if point[2] <= least:
@@ -209,13 +209,6 @@ class Scenario(Frozen):
         if max(legs) > self.max_distance:
             limit = f"an episode ends beyond max_distance {self.max_distance:g} m"
             raise ValueError(f"target: {max(legs):.3g} m away, and {limit}")
-        # Full thrust in one direction throughout: no point outside this ball can be reached, whatever flies there.
-        half, coasting = 0.5 * self.duration**2, self.start.velocity.largest * self.duration
-        fall, thrust = vehicle.gravity, vehicle.thrust_limits[1] * vehicle.gravity
-        outside = [math.dist(start, (x, y, z + fall * half)) > thrust * half + coasting for x, y, z in points]
-        reach = (thrust - fall if self.target.distance else thrust + fall) * half + coasting
-        if any(outside) or sum(legs) > reach:
-            raise ValueError(f"target: cannot be reached within the duration of {self.duration:g} s at full thrust")
 
 
 class Suite(Frozen):
