@@ -172,7 +172,7 @@ def test_plotly_is_only_where_something_can_be_turned(parts):
 def test_the_page_is_small_and_says_what_was_flown_when_and_by_which_version(folder, page):
     assert page.stat().st_size < 2_600_000  # plotly.js alone has 4.8 million bytes
     results = load_results(folder)
-    agent = results.controllers[0].model_copy(update={"algorithm": "PPO"})
+    agent = results.controllers[0].model_copy(update={"algorithm": "PPO", "content": "0123456789abcdef"})
     failure = Failure(controller="x<y", scenario="hit", message="no & no")
     flown = results.model_copy(update={"controllers": [agent, *results.controllers[1:]], "failures": [failure]})
     text = render("title", facts(flown), sections(flown, folder))
