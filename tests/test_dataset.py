@@ -6,7 +6,7 @@ import torch as th
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sb3_quad.algorithms.dataset import AggregatedDataset, sample_rows
+from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
 from sb3_quad.base.errors import ConfigError
 
 

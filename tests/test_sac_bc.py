@@ -197,7 +197,6 @@ def test_the_batch_gives_the_buffer_what_sb3_wants_of_ends():
     ("settings", "error", "message"),
     [
         ({"bc_loss": "nll"}, ConfigError, "bc_loss"),
-        ({"bc_coef": -1.0}, ConfigError, "bc_coef is -1.0"),
         ({"expert_fraction": 1.5, "expert_timesteps": 8}, ConfigError, "from 0 to 1"),
         ({"expert_fraction": 0.5}, ConfigError, "expert_timesteps is 0"),
         ({"expert_proposal": True, "n_steps": 3}, ConfigError, "n_steps 1"),

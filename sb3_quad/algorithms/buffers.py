@@ -1,27 +1,30 @@
-"""SB3's rollout and replay buffers with the expert's actions beside those flown."""
+"""What algorithms learn from: SB3's rollout and replay buffers with the expert's actions, and DAgger's dataset."""
 
 from collections.abc import Generator
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import torch as th
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
-from sb3_quad.base.arrays import BoolArray, Float32Array, IntArray
+from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import read_arrays, write_arrays
 
 
 class ExpertRolloutBuffer(RolloutBuffer):
     """SB3's rollout buffer with a row of expert actions beside each row of actions.
 
     ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills; the algorithm writes row
-    ``pos`` before it calls :meth:`add` for the same step. ``bc_coef`` is the weight of the cloning term in the update on this
-    rollout; where it is 0 there are no expert actions.
+    ``pos`` before it calls :meth:`add` for the same step. ``labelled`` says whether it does so in this rollout.
     """
 
     expert_actions: Float32Array
-    bc_coef = 0.0
+    labelled = False
 
     def reset(self) -> None:
         self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32)
@@ -34,7 +37,7 @@ class ExpertRolloutBuffer(RolloutBuffer):
         sampled: Any = super().get(batch_size)
         for rows in sampled:
             if self._targets is None:
-                labels = [self.swap_and_flatten(self.expert_actions)] if self.bc_coef != 0.0 else []
+                labels = [self.swap_and_flatten(self.expert_actions)] if self.labelled else []
                 for_actor = np.hstack([*labels, self.actions, self.log_probs, self.advantages], dtype=np.float32)
                 self._targets = for_actor, np.hstack([self.values, self.returns])
             chosen = rows if shuffle else in_time[first : first + len(rows)]
@@ -90,3 +93,103 @@ class ExpertReplayBuffer(ReplayBuffer):
 
 class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
     """The same with SB3's n-step returns; the next state's labels are those one step on."""
+
+
+class AggregatedDataset:
+    """A bounded set of (observation, expert action) pairs, on the CPU; the oldest leave first.
+
+    :param capacity: most pairs held
+    :param observation_shape: shape of one observation
+    :param action_dim: length of one action
+    :param dtype: of the observations; actions are float32
+    """
+
+    def __init__(
+        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike = np.float32
+    ) -> None:
+        self.capacity = capacity
+        # np.empty takes no memory before it is written to, so a large capacity costs what is in use.
+        self._arrays = {
+            "observations": np.empty((capacity, *observation_shape), dtype),
+            "actions": np.empty((capacity, action_dim), np.float32),
+        }
+        self.added = 0  # since it was empty
+
+    def __len__(self) -> int:
+        return min(self.added, self.capacity)
+
+    def clear(self) -> None:
+        """Forget every pair."""
+        self.added = 0
+
+    def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
+        """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
+        n = min(len(actions), self.capacity)
+        places = (self.added + np.arange(n)) % self.capacity
+        for array, new in zip(self._arrays.values(), (observations, actions), strict=True):
+            array[places] = new[-n:]
+        self.added += n
+
+    def batch(self, rows: IntArray) -> Batch:
+        """A mini-batch of rows (b,), counted from the oldest, with their actions as targets."""
+        places = (rows + self.added) % self.capacity if self.added > self.capacity else rows
+        return Batch(places, self._arrays["observations"], self._arrays["actions"])
+
+    def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """Observations (b, ...) and expert actions (b, action_dim) of rows (b,), counted from the oldest."""
+        return self.batch(rows.numpy()).tensors(th.device("cpu"))
+
+    def save(self, path: str | Path) -> None:
+        """Write every pair, oldest first, to an .npz file, whole or not at all.
+
+        :raises ConfigError: a place that cannot be written to
+        """
+        observations, actions = self.pairs(th.arange(len(self)))
+        write_arrays(path, observations=observations.numpy(), actions=actions.numpy())
+
+    def load(self, path: str | Path) -> None:
+        """Replace the pairs by the last ``capacity`` of those in a file that :meth:`save` wrote.
+
+        :raises ConfigError: a file that is missing, damaged, or of other observations or actions
+        """
+        arrays = read_arrays(path)
+        self._check(arrays, len(arrays.get("actions", ())), path)
+        self.clear()
+        self.add(**arrays)
+
+    def snapshot(self, added: int) -> Arrays:
+        """The dataset as it was when ``added`` pairs had been added: now, or before the latest :meth:`add`.
+
+        Pairs that :meth:`add` has replaced since then are lost: after :meth:`restore` as many must be added again before the
+        next mini-batch. The arrays are views.
+        """
+        n = min(added, self.capacity)
+        return {"added": np.array(added), **{name: array[:n] for name, array in self._arrays.items()}}
+
+    def restore(self, snapshot: Arrays, path: str | Path) -> None:
+        """Go back to a :meth:`snapshot`.
+
+        :param path: the file that it comes from, for the message.
+        :raises ConfigError: it is of another capacity, or of other observations or actions
+        """
+        added = int(snapshot.get("added", 0))
+        n = min(added, self.capacity)
+        self._check(snapshot, n, path)
+        for name, array in self._arrays.items():
+            array[:n] = snapshot[name]
+        self.added = added
+
+    def _check(self, arrays: Arrays, n: int, path: str | Path) -> None:
+        given = {name: arrays[name].shape for name in self._arrays if name in arrays}
+        needed = {name: (n, *array.shape[1:]) for name, array in self._arrays.items()}
+        if given != needed:
+            raise ConfigError(f"dataset {path}: holds arrays of shape {given}, this model needs {needed}")
+
+
+def sample_rows(n_rows: int, count: int, rng: np.random.Generator, shuffle: bool = True) -> IntArray:
+    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at random; or all in order."""
+    if not shuffle:
+        return np.arange(count, dtype=np.int64) % n_rows
+    passes, rest = divmod(count, n_rows)
+    parts = [rng.permutation(n_rows) for _ in range(passes)]
+    return np.concatenate([*parts, rng.integers(n_rows, size=rest)]).astype(np.int64, copy=False)

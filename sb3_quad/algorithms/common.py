@@ -3,9 +3,15 @@
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.type_aliases import Schedule
+from gymnasium import spaces
+from stable_baselines3.common.policies import ActorCriticPolicy
+from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
+from typing_extensions import Self
 
+from sb3_quad.algorithms.networks.gradients import network_of
+from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.arrays import Arrays
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.controller import Controller
 
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # names of the critic's own parameters
@@ -20,6 +26,28 @@ class ExpertMixin:
     def set_expert(self, expert: Any) -> None:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
         self.expert = expert
+
+    def _prepare_to_learn(self, anew: bool) -> None:
+        """Check the expert, and forget what the environments before have left where they begin ``anew``."""
+        raise NotImplementedError
+
+    def learn(self, total_timesteps: int, callback: MaybeCallback = None, **keywords: Any) -> Self:
+        """As in SB3; ``tb_log_name`` is the name of the class unless another is given.
+
+        :raises ExpertError: no expert where one is needed, or one that does not fit the environment.
+        """
+        self._prepare_to_learn(keywords.get("reset_num_timesteps", True))
+        policy: Any = self.policy  # type: ignore[attr-defined]
+        with one_torch_thread(isinstance(policy, ActorCriticPolicy) and network_of(policy) is not policy):
+            return super().learn(total_timesteps, callback, **{"tb_log_name": type(self).__name__, **keywords})  # type: ignore[misc, no-any-return]
+
+    def _refuse_dict_observations(self) -> None:
+        space = self.observation_space  # type: ignore[attr-defined]
+        if isinstance(space, spaces.Dict):
+            raise ConfigError(
+                f"observation space {space}: {type(self).__name__} does not support Dict with an expert; wrap the environment "
+                "in gymnasium.wrappers.FlattenObservation"
+            )
 
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.

@@ -9,31 +9,26 @@ import numpy.typing as npt
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import PPO
-from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import DiagGaussianDistribution
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
-from typing_extensions import Self
 
+from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
 from sb3_quad.algorithms.common import ExpertMixin, parameters_of_both
-from sb3_quad.algorithms.dataset import AggregatedDataset, sample_rows
 from sb3_quad.algorithms.networks.gradients import Batch, gradients, mean_actions, network_of, state_values
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES, CloningLoss, Loss
-from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
-_LEAST = {"n_steps": 1, "batch_size": 1, "n_epochs": 1, "gradient_steps": 1, "beta_decay": 0, "beta_final": 0}
 
-
-class DAgger(ExpertMixin, OnPolicyAlgorithm):
+class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
     """Data aggregation (DAgger): the agent flies, the expert says what it would have done, the agent learns that.
 
     In every control step and every environment, independently, the expert's action flies with probability β, else the agent's
@@ -82,7 +77,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis prepares them
         ("chronologically", 4.2.3)
-    :raises ConfigError: an argument out of range, or a space that is not supported
+    :raises ConfigError: an argument out of range, or observations that are a Dict
     :raises ExpertError: an expert that does not fit the environment
     """
 
@@ -120,15 +115,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if env is not None:
-            env = maybe_make_env(env, verbose)
-            if isinstance(env.observation_space, spaces.Dict):
-                raise ConfigError(
-                    f"observation space {env.observation_space}: DAgger does not support Dict; wrap the environment in "
-                    "gymnasium.wrappers.FlattenObservation"
-                )
-            if not isinstance(env.action_space, spaces.Box):
-                raise ConfigError(f"action space {env.action_space}: DAgger supports Box only")
         super().__init__(
             policy,
             env,
@@ -147,6 +133,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             verbose=verbose,
             seed=seed,
             device=device,
+            supported_action_spaces=(spaces.Box,),
             _init_setup_model=False,
         )
         self.batch_size = batch_size
@@ -171,7 +158,14 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        self._check_arguments()
+        if not 0.0 <= self.beta_final <= self.beta <= 1.0:
+            raise ConfigError(f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1")
+        if self.bc_loss not in CLONING_LOSSES:
+            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
+        rollout = self.n_steps * self.n_envs
+        if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
+            raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
+        self._refuse_dict_observations()
         super()._setup_model()
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):
             raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
@@ -179,29 +173,11 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
         dtype = self.rollout_buffer.observations.dtype
         self.dataset = AggregatedDataset(
-            self.dataset_capacity or self.n_steps * self.n_envs,
+            self.dataset_capacity or rollout,
             self.rollout_buffer.obs_shape,
             self.rollout_buffer.action_dim,
             np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
-
-    def _check_arguments(self) -> None:
-        """:raises ConfigError: an argument that does not fit; one line says which and what is allowed."""
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if value is not None and value < least:
-                raise ConfigError(f"{name} {value}: must be at least {least}")
-        if not self.beta_final <= self.beta <= 1.0:
-            raise ConfigError(f"beta {self.beta}: a probability, from beta_final {self.beta_final} to 1")
-        if isinstance(self.clip_range_vf, (float, int)) and self.clip_range_vf <= 0:
-            raise ConfigError(f"clip_range_vf {self.clip_range_vf}: must be positive, or None for no clipping")
-        if self.policy_kwargs.get("use_sde"):
-            raise ConfigError("policy_kwargs: DAgger needs a diagonal Gaussian policy, so no use_sde")
-        if self.bc_loss not in CLONING_LOSSES:
-            raise ConfigError(unknown("bc_loss", self.bc_loss, CLONING_LOSSES))
-        rollout = self.n_steps * self.n_envs
-        if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
-            raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
 
     def set_expert(self, expert: Any) -> None:
         """Learn from ``expert`` from now on.
@@ -365,26 +341,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
 
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "DAgger",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """As in SB3. ``reset_num_timesteps=True`` also begins β anew; the dataset stays until ``dataset.clear()``.
-
-        :raises ExpertError: no expert, or one that does not fit the environment
-        """
+    def _prepare_to_learn(self, anew: bool) -> None:
         self.set_expert(self.expert)
-        if reset_num_timesteps:
+        if anew:  # β begins anew; the dataset stays until ``dataset.clear()``
             self._n_rollouts = 0
-        with one_torch_thread(network_of(self.policy) is not self.policy):
-            return super().learn(
-                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
-            )
 
     def save_dataset(self, path: str | Path) -> None:
         """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""

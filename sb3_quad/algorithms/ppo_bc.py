@@ -10,21 +10,19 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.policies import ActorCriticPolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, explained_variance, obs_as_tensor
 from stable_baselines3.common.vec_env import VecEnv
-from typing_extensions import Self
 
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, parameters_of_both
 from sb3_quad.algorithms.networks.gradients import act, gradient_norms, gradients, network_of
 from sb3_quad.algorithms.networks.losses import BC_FILTERS, CLONING_LOSSES, CloningLoss, Loss
-from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 
 
-class PPOBC(ExpertMixin, PPO):
+class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
     """Proximal Policy Optimization with a weighted behavioural-cloning loss (PPO+BC).
 
     The minimised loss is Eq. 4.4 of the thesis: PPO-clip + c_v · value loss + c_L2 · ½Σw² − c_H · entropy + c_BC · L_BC.
@@ -59,6 +57,8 @@ class PPOBC(ExpertMixin, PPO):
         one whose labels do not fit.
     :raises TrainingError: a loss or gradient that is not finite; the parameters are those of the step before.
     """
+
+    _rollout_bc_coef = 0.0  # the weight of the cloning term in the update on the present rollout
 
     def __init__(
         self,
@@ -129,10 +129,6 @@ class PPOBC(ExpertMixin, PPO):
             raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
         if bc_filter not in BC_FILTERS:
             raise ConfigError(unknown("bc_filter", bc_filter, BC_FILTERS))
-        if not l2_coef >= 0:
-            raise ConfigError(f"l2_coef is {l2_coef}, must be at least 0")
-        if critic_warmup < 0:
-            raise ConfigError(f"critic_warmup is {critic_warmup} rollouts, must be at least 0")
         self.expert = expert
         self.bc_coef = bc_coef
         self.bc_loss: CloningLoss = bc_loss
@@ -147,11 +143,7 @@ class PPOBC(ExpertMixin, PPO):
             self._setup_model()
 
     def _setup_model(self) -> None:
-        if isinstance(self.observation_space, spaces.Dict):
-            raise ConfigError(
-                f"observation space {self.observation_space}: PPOBC does not support Dict; wrap the environment in "
-                "gymnasium.wrappers.FlattenObservation"
-            )
+        self._refuse_dict_observations()
         super()._setup_model()
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")
@@ -160,7 +152,7 @@ class PPOBC(ExpertMixin, PPO):
             self._check_cloning()
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "rollout_buffer_class", "rollout_buffer_kwargs"]
+        return [*super()._excluded_save_params(), "rollout_buffer_class", "rollout_buffer_kwargs", "_rollout_bc_coef"]
 
     @property
     def policy_is_idle(self) -> bool:
@@ -191,6 +183,10 @@ class PPOBC(ExpertMixin, PPO):
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")
 
+    def _prepare_to_learn(self, anew: bool) -> None:
+        if self.will_clone():
+            self._check_cloning()
+
     def collect_rollouts(
         self, env: VecEnv, callback: BaseCallback, rollout_buffer: RolloutBuffer, n_rollout_steps: int
     ) -> bool:
@@ -201,8 +197,8 @@ class PPOBC(ExpertMixin, PPO):
         # + The update on this rollout comes at its end, and with the weight of that time: that weight decides about labels.
         buffer = cast(ExpertRolloutBuffer, rollout_buffer)
         end = self.num_timesteps + n_rollout_steps * env.num_envs
-        buffer.bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
-        clones = buffer.bc_coef != 0.0
+        self._rollout_bc_coef = float(self.bc_coef(1.0 - float(end) / float(self._total_timesteps)))  # type: ignore[operator]
+        clones = buffer.labelled = self._rollout_bc_coef != 0.0
         # + An expert that has not seen a rollout begins anew.
         self._labeller = Controller.for_env(self.expert, env, self._labeller) if clones else None
         network = network_of(self.policy) if clones else self.policy  # + without additions as PPO, bit for bit
@@ -281,7 +277,7 @@ class PPOBC(ExpertMixin, PPO):
             policy_coef=1.0,
             clip_range=clip_range,
             normalize_advantage=self.normalize_advantage,
-            bc_coef=buffer.bc_coef,
+            bc_coef=self._rollout_bc_coef,
             bc_loss=CLONING_LOSSES.index(self.bc_loss),
             bc_filter=BC_FILTERS.index(self.bc_filter),
             vf_coef=self.vf_coef,
@@ -291,7 +287,7 @@ class PPOBC(ExpertMixin, PPO):
             l2_coef=0.0 if warming_up else self.l2_coef,
         )
         own_value_loss = clip_range_vf is not None and self.max_clipped_value
-        adds = buffer.bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
+        adds = self._rollout_bc_coef != 0.0 or self.l2_coef > 0.0 or own_value_loss or warming_up
         network, (actor, _) = network_of(self.policy) if adds else self.policy, parameters_of_both(self.policy)
 
         monitored: dict[str, list[float]] = {}  # by name: the term of each mini-batch
@@ -342,23 +338,6 @@ class PPOBC(ExpertMixin, PPO):
         self.logger.record("train/clip_range", clip_range)
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
-        self.logger.record("train/bc_coef", buffer.bc_coef)  # +
+        self.logger.record("train/bc_coef", self._rollout_bc_coef)  # +
         for name, grad_norm in grad_norms.items():  # +
             self.logger.record(f"train/grad_norm_{name}", grad_norm)
-
-    def learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        log_interval: int = 1,
-        tb_log_name: str = "PPOBC",
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> Self:
-        """As ``PPO.learn``; see the class for what it raises."""
-        if self.will_clone():
-            self._check_cloning()
-        with one_torch_thread(network_of(self.policy) is not self.policy):
-            return super().learn(
-                total_timesteps, callback, log_interval, tb_log_name, reset_num_timesteps, progress_bar=progress_bar
-            )
