@@ -12,7 +12,6 @@ from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, WRENCH_SIZE, P, QuadcopterState, W
-from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -24,7 +23,7 @@ _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a know
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none: ITM's, found by search, scaled by the vehicle's control authority.
 
-    The scales are the lag τ from a command to its thrust (:class:`~sb3_quad.vehicles.authority.Authority`); the greatest
+    The scales are the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest
     angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
     upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
     limits in hover thrusts.
@@ -128,7 +127,7 @@ class GeometricExpert(Expert):
         self.reserve = reserve
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
-        body = np.array([v.mass, v.gravity, *v.inertia, Authority(v).command_lag])
+        body = np.array([v.mass, v.gravity, *v.inertia, v.command_lag])
         self._constants = self.gains.values()[:, None], body[:, None], v.mixer_inverse[None], np.array(v.thrust_range)[:, None]
         self._told = _TrueConstants(v, self.gains) if told else None
 

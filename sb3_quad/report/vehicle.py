@@ -2,9 +2,10 @@
 
 import math
 
+import numpy as np
+
 from sb3_quad.base.errors import CannotHover
 from sb3_quad.evaluation.tables import Table, text_table
-from sb3_quad.vehicles.authority import Authority
 from sb3_quad.vehicles.vehicle import Vehicle
 
 SLIM_THRUST = 1.2  # thrust-to-weight ratio below which little is left to turn and brake with
@@ -12,7 +13,7 @@ FASTEST_HOVER = 10_000.0  # rad/s, some 95,000 rpm; above it a unit must be wron
 RPM = 60.0 / (2.0 * math.pi)  # rpm per rad/s
 
 
-def parameter_table(vehicle: Vehicle, able: Authority) -> Table:
+def parameter_table(vehicle: Vehicle) -> Table:
     """What it weighs, lifts and how soon it answers."""
     low, high = vehicle.thrust_range
     slow, fast = vehicle.rotor_speed_range
@@ -20,9 +21,13 @@ def parameter_table(vehicle: Vehicle, able: Authority) -> Table:
     action = f"{vehicle.hover_action:+.3f}" if abs(vehicle.hover_action) > 5e-4 else "0"
     ixx, iyy, izz = vehicle.inertia
     share = max(vehicle.inertia) / (sum(vehicle.inertia) - max(vehicle.inertia))
-    ratios = ", ".join(f"{ratio:.2f}" for ratio in able.gyration_ratios)
+    ratios = ", ".join(f"{ratio:.2f}" for ratio in vehicle.gyration_ratios)
+    least, most = vehicle.thrust_limits
+    up, down, sideways = (vehicle.gravity * share for share in (most - 1.0, 1.0 - least, math.sqrt(most**2 - 1.0)))
+    moments = vehicle.greatest_moments
+    turns = ", ".join(f"{each:.1f}" for each in moments / np.array(vehicle.inertia))
     rows = (
-        ("can hover", f"yes: thrust-to-weight ratio {able.thrust_to_weight:.2f}, least {able.least_thrust:.2f}"),
+        ("can hover", f"yes: thrust-to-weight ratio {most:.2f}, least {least:.2f}"),
         ("mass, weight", f"{vehicle.mass:g} kg, {vehicle.mass * vehicle.gravity:.4g} N"),
         ("rotor thrust", f"{low:.4g} to {high:.4g} N, hover {vehicle.hover_thrust:.4g} N (action {action})"),
         (
@@ -30,28 +35,18 @@ def parameter_table(vehicle: Vehicle, able: Authority) -> Table:
             f"{slow:.0f} to {fast:.0f} rad/s, hover {hover:.0f} rad/s "
             f"({slow * RPM:.0f} to {fast * RPM:.0f} rpm, hover {hover * RPM:.0f} rpm)",
         ),
-        ("acceleration", f"up {able.climb:.1f}, down {able.fall:.1f}, sideways {able.sideways:.1f} m/s²"),
-        ("", f"sideways at constant height, tilted by {math.degrees(able.tilt):.0f}°; down while level"),
+        ("acceleration", f"up {up:.1f}, down while level {down:.1f}, sideways at constant height {sideways:.1f} m/s²"),
+        ("greatest moments", f"{', '.join(f'{each:.4g}' for each in moments)} N m about roll, pitch and yaw"),
+        ("", f"which accelerate it by {turns} rad/s²"),
         ("inertia", f"{ixx:.4g}, {iyy:.4g}, {izz:.4g} kg m²"),
         ("", f"physical: the largest moment is {share:.2f} of the other two together, at most 1 (triangle inequality)"),
         ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
-        ("motors", f"time constant {1000 * able.motor_lag:.1f} ms; from command to thrust {1000 * able.command_lag:.1f} ms"),
-        ("half a turn", f"{able.half_turn:.2f} s from rest to rest, roll or pitch, the weaker; lags left out"),
+        (
+            "motors",
+            f"time constant {1000 / vehicle.motor_gain:.1f} ms; from command to thrust {1000 * vehicle.command_lag:.1f} ms",
+        ),
     )
     return text_table(vehicle.name, ("", ""), rows, align="left")
-
-
-def authority_table(able: Authority) -> Table:
-    """Moments and angular accelerations about each axis."""
-    parts = (able.moments, able.accelerations, able.hover_moments, able.hover_accelerations)
-    formats = ("{:.4g} N m", "{:.1f} rad/s²") * 2
-    rows = [
-        (name, *(form.format(part[axis]) for form, part in zip(formats, parts, strict=True)))
-        for axis, name in enumerate(("roll", "pitch", "yaw"))
-    ]
-    heads = ("axis", "greatest moment", "acceleration", "moment in hover", "acceleration")
-    caption = "in hover: total thrust kept at hover, no moment about the other axes"
-    return text_table("authority", heads, rows, caption=caption)
 
 
 def check_rotor_speed(vehicle: Vehicle, where: str) -> None:
@@ -63,19 +58,17 @@ def check_rotor_speed(vehicle: Vehicle, where: str) -> None:
         )
 
 
-def warnings(vehicle: Vehicle, able: Authority) -> list[str]:
+def warnings(vehicle: Vehicle) -> list[str]:
     """What is possible but unlikely: mostly a wrong unit."""
     found = []
-    ratio = able.gyration_ratios
+    ratio = vehicle.gyration_ratios
     if ratio.max() > 1.0 or ratio.min() < 0.05:
         found.append(
             f"inertia: radii of gyration of {ratio.min():.3g} to {ratio.max():.3g} of the rotors' distance are unusual "
             "(0.2 to 0.6 is common); is it in kg m², and are the rotor positions in m?"
         )
-    if able.thrust_to_weight < SLIM_THRUST:
-        found.append(
-            f"thrust: a thrust-to-weight ratio of {able.thrust_to_weight:.2f} leaves little to turn and to brake with"
-        )
+    if (most := vehicle.thrust_limits[1]) < SLIM_THRUST:
+        found.append(f"thrust: a thrust-to-weight ratio of {most:.2f} leaves little to turn and to brake with")
     if vehicle.collision_radius > 2.0 * vehicle.arm_length:
         found.append("collision_radius: is more than twice the rotors' distance from the centre; is it in m?")
     return found

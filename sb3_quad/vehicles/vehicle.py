@@ -198,6 +198,22 @@ class Vehicle(Frozen):
         return math.sqrt(low / self.thrust_coefficient), math.sqrt(high / self.thrust_coefficient)
 
     @property
+    def command_lag(self) -> float:
+        """τ, from a command to its thrust, s: delay, half the control step it is held for, and the motors' 1/k_m."""
+        return (self.delay + 0.5) * self.control_step + 1.0 / self.motor_gain
+
+    @property
+    def greatest_moments(self) -> FloatArray:
+        """(3,), N m, about roll, pitch and yaw; the other axes and the thrust left to themselves."""
+        low, high = self.thrust_range  # equal thrusts give no moment: what counts is how far each can go from the middle
+        return np.asarray(np.abs(self.mixer[1:]).sum(axis=1) * (high - low) / 2)
+
+    @property
+    def gyration_ratios(self) -> FloatArray:
+        """(3,), radii of gyration √(I/m) by the arm length; above 1 the mass would lie beyond the rotors."""
+        return np.asarray(np.sqrt(np.array(self.inertia) / self.mass) / self.arm_length)
+
+    @property
     def hover_rotor_speed(self) -> float:
         """Speed of one rotor in hover, rad/s."""
         return math.sqrt(self.hover_thrust / self.thrust_coefficient)

@@ -29,8 +29,7 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.cli.output import console
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
-    from sb3_quad.report.vehicle import authority_table, check_rotor_speed, parameter_table, warnings
-    from sb3_quad.vehicles.authority import Authority
+    from sb3_quad.report.vehicle import check_rotor_speed, parameter_table, warnings
     from sb3_quad.vehicles.vehicle import load_vehicle
 
     try:
@@ -39,10 +38,8 @@ def run(options: argparse.Namespace) -> int:
     except CannotHover as error:
         print(f"cannot hover: {error}", file=sys.stderr)
         return 1
-    able = Authority(vehicle)
-    console().print(parameter_table(vehicle, able))
-    console().print(authority_table(able))
-    for warning in warnings(vehicle, able):
+    console().print(parameter_table(vehicle))
+    for warning in warnings(vehicle):
         print(f"unusual: {warning}")
     if options.episodes:
         gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
