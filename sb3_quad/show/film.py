@@ -39,7 +39,7 @@ def check_film(path: Path) -> Any:
     :raises ConfigError: the suffix is not one of FORMATS, or the packages that write videos are missing.
     """
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{path}: must end in {' or '.join(FORMATS)}")
+        raise ConfigError(f"{path}: must end in {', '.join(FORMATS)} for a film, .png for a picture")
     require("imageio_ffmpeg", "video", "a video")
     return require("imageio.v2", "video", "a video")
 

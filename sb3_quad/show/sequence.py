@@ -16,11 +16,9 @@ from sb3_quad.show.labels import side_by_side, tag_size, with_header, with_tags
 
 SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near its target
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
-AREA, RATIOS = 290_000, (0.7, 1.6)  # of a panel: pixels, width by height
 LARGEST = 6.0  # how much larger than life it is drawn at most
-APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth: so far away, a flight asks for one more
+APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth
 SIDES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-0.8, -0.8], [0.8, -0.8], [-0.8, 0.8], [0.8, 0.8]])  # of a pose
-NEAR = 0.6  # and with it come those of the other flights at this time that are at least so far from their neighbours
 
 
 class _View(NamedTuple):
@@ -36,22 +34,15 @@ class _View(NamedTuple):
         return screen[:, :2], self.breadth * lens.height / (2.0 * lens.slope * screen[:, 2])
 
 
-def sequence(
-    recordings: Sequence[Recording], times: Sequence[float] | None = None, size: tuple[int, int] | None = None
-) -> Image:
-    """One panel for each recording, all seen by the same camera.
+def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
+    """One panel for each recording, all seen by the same camera; as many poses as do not hide one another.
 
-    :param times: s, at which poses are drawn; None: as many as do not hide one another, at the same times in all panels.
-    :param size: width and height of a panel, its header not counted, pixels; None: in the proportions of the flights.
+    :param width: of a panel, its header not counted, pixels; ``height`` likewise.
     :return: uint8 (height, about panels * width, 3).
     """
-    ends = [_end(recording) if times is None else recording.at(max(times)) for recording in recordings]
-    view = _view(recordings, ends, size)
-    if times is None:
-        chosen = _same_times(recordings, ends, view)
-    else:
-        chosen = [sorted({recording.at(seconds) for seconds in times}) for recording in recordings]
-    panels = [_panel(*each, view) for each in zip(recordings, chosen, ends, strict=True)]
+    ends = [_end(recording) for recording in recordings]
+    view = _view(recordings, ends, Lens(width, height))
+    panels = [_panel(each, _steps(each, end, view), end, view) for each, end in zip(recordings, ends, strict=True)]
     return side_by_side(panels, columns=len(panels))
 
 
@@ -61,49 +52,25 @@ def _end(recording: Recording) -> int:
     return min(int(away[-1]) + 1 if away.size else 0, len(recording.times) - 1)
 
 
-def _view(recordings: Sequence[Recording], ends: Sequence[int], size: tuple[int, int] | None) -> _View:
+def _view(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) -> _View:
     paths = [recording.state.position[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
     points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
-    forward = broadside(points)
-    lens = Lens(*(size or _proportions(points, forward)))
-    breadth = 2.0 * span(recordings[0].vehicle)
-    enlarged = 1.0
-    for _ in range(20):  # a larger vehicle needs a camera farther away
+    forward, breadth, enlarged = broadside(points), 2.0 * span(recordings[0].vehicle), 1.0
+    for _ in range(5):  # a larger vehicle needs a camera farther away
         camera = framing_camera(points, 0.8 * enlarged * breadth, forward, lens)
         depth = float(np.median((points - camera.eye) @ camera.axes[0]))
-        wanted = VEHICLE_SHARE * 2.0 * lens.slope * depth / breadth
-        enlarged = float(np.clip(0.5 * (enlarged + wanted), 1.0, LARGEST))
+        enlarged = float(np.clip(VEHICLE_SHARE * 2.0 * lens.slope * depth / breadth, 1.0, LARGEST))
     return _View(camera, enlarged, enlarged * breadth)
 
 
-def _proportions(points: FloatArray, forward: FloatArray) -> tuple[int, int]:
-    x, y = forward[:2] / np.linalg.norm(forward[:2])
-    high, wide = float(np.ptp(points[:, 2])), float(np.ptp(points[:, 0] * y - points[:, 1] * x))
-    ratio = float(np.clip((wide + 0.3 * high + 1.0) / (high + 0.3 * wide + 1.0), *RATIOS))
-    width = 2 * round((AREA * ratio) ** 0.5 / 2)
-    return width, 2 * round(AREA / width / 2)
-
-
-def _same_times(recordings: Sequence[Recording], ends: Sequence[int], view: _View) -> list[list[int]]:
-    """Steps to be drawn in each panel: one that a flight has room for is drawn in all that it does not hide a pose in."""
-    seen = [view.project(each.state.position[: end + 1]) for each, end in zip(recordings, ends, strict=True)]
-    chosen: list[list[int]] = [[0] for _ in recordings]
-    # When a flight was pushed and how it was lost must be seen.
-    shown = [
-        {*(push for push in each.pushes if push <= end), *([end] if each.lost else [])}
-        for each, end in zip(recordings, ends, strict=True)
-    ]
-    for step in [*sorted(set().union(*shown)), *range(1, max(ends) + 1)]:
-        gaps = {
-            k: float(np.linalg.norm(places[chosen[k]] - places[step], axis=1).min() / breadth[step])
-            for k, (places, breadth) in enumerate(seen)
-            if step <= ends[k]
-        }
-        asked = any(step in steps for steps in shown) or max(gaps.values()) > APART
-        for k, gap in gaps.items():
-            if step in shown[k] or (asked and gap > NEAR):
-                chosen[k] = sorted({*chosen[k], step})
-    return chosen
+def _steps(recording: Recording, end: int, view: _View) -> list[int]:
+    """The steps of the poses: each that hides none before it, the pushes, and how the flight was lost."""
+    places, breadth = view.project(recording.state.position[: end + 1])
+    shown = {0, *(push for push in recording.pushes if push <= end), *([end] if recording.lost else [])}
+    for step in range(1, end + 1):
+        if np.linalg.norm(places[[*shown]] - places[step], axis=1).min() > APART * breadth[step]:
+            shown.add(step)
+    return sorted(shown)
 
 
 def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) -> Image:

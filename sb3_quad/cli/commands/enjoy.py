@@ -46,11 +46,8 @@ def add_arguments(parser: Parser) -> None:
     add("--torque", help="an external torque, body frame, N m", **vector)
     add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
     add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
-    output = "write a film (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
-    add("-o", "--output", metavar="FILE", help=output)
-    add("--record", metavar="FILE", help="write a film, also beside a picture: .mp4 or .gif")
-    add("--sequence", metavar="FILE", help="write a picture, also beside a film: .png")
-    add("--times", nargs="+", type=float, metavar="S", help="times of the sequence's poses, s (wherever they do not overlap)")
+    output = "write films (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
+    add("-o", "--output", nargs="+", default=[], metavar="FILE", help=output)
 
 
 def add_flight_arguments(parser: Parser) -> Any:
@@ -96,9 +93,7 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.show.episodes import fly_all
     from sb3_quad.show.film import show_in_window
 
-    if options.output:
-        vars(options)["sequence" if options.output.lower().endswith(".png") else "record"] = options.output
-    window = not (options.no_render or options.record or options.sequence)
+    window = not (options.no_render or options.output)
     _check(options, window)
     setting, controllers = _setting(options)
     how = options.seed, options.n_timesteps, not options.stochastic, options.n_envs
@@ -109,10 +104,12 @@ def run(options: argparse.Namespace) -> int:
             end = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
             head = f"episode {number}, {recording.name}" if len(episodes) > 1 else recording.name
             print(f"{head}: {end} after {recording.times[-1]:.2f} s, reward {recording.reward:.2f}")
-    if options.sequence:
-        _write_sequence(options, episodes[0])
-    if options.record:
-        _write_film(options, episodes)
+    size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
+    for file in options.output:
+        if file.lower().endswith(".png"):
+            _write_sequence(file, episodes[0], size)
+        else:
+            _write_film(file, episodes, size, options)
     if window:
         width, height = options.size or SINGLE
         show_in_window(episodes, width, height, options.speed)
@@ -169,18 +166,14 @@ def _check(options: argparse.Namespace, window: bool) -> None:
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
     if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
-    if options.times is not None and (not options.sequence or min(options.times) < 0):
-        raise ConfigError("--times goes with --sequence, and must not be negative")
     if options.size:
         check_size(*options.size)
-    if options.sequence and Path(options.sequence).suffix.lower() != ".png":
-        raise ConfigError(f"--sequence {options.sequence}: must end in .png")
-    if options.record:
-        check_film(Path(options.record))
-    for file in filter(None, (options.record, options.sequence)):
+    for file in options.output:
+        if not file.lower().endswith(".png"):
+            check_film(Path(file))
         refuse_existing(file, options.overwrite)
     if window and not has_display():
-        raise ConfigError("no display to open a window on (DISPLAY is not set); --record flight.mp4 makes a film instead")
+        raise ConfigError("no display to open a window on (DISPLAY is not set); -o flight.mp4 makes a film instead")
 
 
 def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
@@ -213,25 +206,22 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     return setting._replace(own=own), controllers
 
 
-def _write_sequence(options: argparse.Namespace, episode: Sequence[Any]) -> None:
+def _write_sequence(file: str, episode: Sequence[Any], size: tuple[int, int]) -> None:
     from PIL import Image
-    from rich.console import Console
 
     from sb3_quad.show.sequence import sequence
 
     buffer = io.BytesIO()
-    with Console(file=sys.stderr).status("drawing"):
-        Image.fromarray(sequence(episode, options.times, options.size)).save(buffer, format="png", optimize=True)
-    write_bytes(options.sequence, buffer.getvalue())
-    print(f"saved {options.sequence}")
+    Image.fromarray(sequence(episode, *size)).save(buffer, format="png", optimize=True)
+    write_bytes(file, buffer.getvalue())
+    print(f"saved {file}")
 
 
-def _write_film(options: argparse.Namespace, episodes: Sequence[Sequence[Any]]) -> None:
+def _write_film(file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: argparse.Namespace) -> None:
     from sb3_quad.cli.output import with_progress
     from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
 
-    width, height = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
-    frames = (frame for episode in episodes for frame in film_frames(episode, width, height, options.speed))
-    write_film(Path(options.record), with_progress(frames, total, "frames", options.progress))
-    print(f"saved {options.record}, {total / FPS:.1f} s")
+    frames = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
+    write_film(Path(file), with_progress(frames, total, "frames", options.progress))
+    print(f"saved {file}, {total / FPS:.1f} s")

@@ -1,4 +1,4 @@
-"""Record a film of a trained agent, as enjoy --record does, with the flags and folders of rl-zoo's record_video.
+"""Record a film of a trained agent, as enjoy -o does, with the flags and folders of rl-zoo's record_video.
 
 examples:
   sb3-quad record-video --algo ppo_bc --env QuadStateRecovery-v0                   the latest run, into its folder videos/
@@ -7,7 +7,7 @@ examples:
   sb3-quad record-video --env QuadStateRecovery-v0 -i path/to/agent.zip --stochastic --size 320x240
 
 Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
-Films need: pip install '.[video]' from a clone. Several controllers, scenarios and pushes: sb3-quad enjoy --record FILE.
+Films need: pip install '.[video]' from a clone. Several controllers, scenarios and pushes: sb3-quad enjoy -o FILE.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from sb3_quad.cli.commands import enjoy
 from sb3_quad.cli.parser import Parser, positive
 from sb3_quad.controllers.pretrained import agent_path
 
-ONLY_ENJOY = ("task", "scenario", "target", "force", "torque", "start", "duration", "sequence", "times", "output")
+ONLY_ENJOY = ("task", "scenario", "target", "force", "torque", "start", "duration")
 
 
 def add_arguments(parser: Parser) -> None:
@@ -40,5 +40,5 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError("whose flight? Give a run by --algo and --env, or an agent by -i; one of both")
     env_id, path = enjoy.known_environment(options), Path(enjoy.chosen_agent(options)[1])
     name = f"{path.stem}-{env_id}-seed-{options.seed}-{options.n_timesteps}-steps.mp4"
-    options.record = str(output_file(options.output_folder or (path.parent / "videos" if options.algo else None), name))
+    options.output = [str(output_file(options.output_folder or (path.parent / "videos" if options.algo else None), name))]
     return enjoy.run(options)
