@@ -203,7 +203,7 @@ def test_the_run_folder_tells_vehicle_and_scaling(zips, tmp_path):
     (run_folder / "Env-v0" / "config.yml").write_text(json.dumps({"env_kwargs": given}))
     exported = export_policy(path, "torchscript", n_observations=100)
     assert "light" in exported.metadata["vehicle"] and exported.settings.name == "config.yml"
-    assert "mean 0.5 (18 times) and std 2 (18 times)" in exported.metadata["scaling"]
+    assert "mean 0.5, 0.5, " in exported.metadata["scaling"] and "std 2, 2, " in exported.metadata["scaling"]
     assert str(tmp_path) not in json.dumps(exported.metadata)
     assert "itm" in export_policy(path, "torchscript", vehicle="itm", n_observations=100).metadata["vehicle"]
     (run_folder / "Env-v0" / "vecnormalize.pkl").touch()

@@ -66,7 +66,7 @@ class ControllerSpec:
 
 
 def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[ControllerSpec]:
-    """Controllers from ``spec`` or ``label=spec``; a label left out is as short as tells them apart.
+    """Controllers from ``spec`` or ``label=spec``; a label left out is the spec, of a zip the file's name.
 
     :param scaling: of all but the experts, ``none`` or ``adaptive``; ``both``: each of them once plain and once adaptive.
     :raises ConfigError: an unknown scaling, or two controllers of the same label.
@@ -74,8 +74,6 @@ def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[Contr
     if scaling not in SCALINGS:
         raise ConfigError(unknown("scaling", scaling, SCALINGS))
     named = [_label_and_spec(text) for text in texts]
-    zips = [spec for label, spec in named if not label and spec.endswith(".zip")]
-    named = [(label or (_short(spec, zips) if spec.endswith(".zip") else spec), spec) for label, spec in named]
     plain = [ControllerSpec(label, spec) for label, spec in named if scaling != "adaptive" or spec in EXPERTS]
     adapted = [(f"{label} (adaptive)", spec) for label, spec in named if scaling != "none" and spec not in EXPERTS]
     found = plain + [ControllerSpec(*each, "adaptive") for each in adapted]
@@ -125,21 +123,11 @@ def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | 
 
 
 def _label_and_spec(text: str) -> tuple[str, str]:
-    """The label, empty if the text gives none, and the name or path."""
+    """The label and the name or path."""
     label, equals, spec = text.partition("=")
     if not equals or "/" in label or "\\" in label:  # an equals sign further on belongs to the path
         path = agent_path(text)
-        return ("" if path == text else Path(text).name), path
+        return Path(text).name if path != text else Path(path).stem if path.endswith(".zip") else path, path
     if not label or not spec:
         raise ConfigError(f"controller {text!r}: write name=path, or the path alone")
     return label, agent_path(spec)
-
-
-def _short(path: str, paths: Sequence[str]) -> str:
-    """The end of a path that no other of ``paths`` has, without the ending."""
-    parts = Path(path).with_suffix("").parts
-    others = [Path(other).with_suffix("").parts for other in paths if other != path]
-    for count in range(1, len(parts) + 1):
-        if not any(other[-count:] == parts[-count:] for other in others):
-            return "/".join(parts[-count:])
-    return "/".join(parts)

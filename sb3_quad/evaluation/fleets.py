@@ -1,7 +1,7 @@
 """The same n episodes in either environment, side by side in one process, for :mod:`sb3_quad.evaluation.flights`."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -12,16 +12,9 @@ from sb3_quad.simulation.layout import row_slices
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState
 
-
-class FleetStep(NamedTuple):
-    """What a control step of n vehicles gives."""
-
-    observation: Float32Array  # (n, 18), or what else the agent is to see
-    reward: FloatArray  # (n,)
-    lost: BoolArray  # (n,), on the ground or out of range
-    collided: BoolArray  # (n,), on the ground
-    distance: FloatArray  # |r - r_T|, (n,), m
-    arrived: BoolArray  # (n,), a flight that ended now would be a success
+# What a control step gives: observations, (n, 18) or what else the agent is to see; rewards, (n,); which rows are lost, on the
+# ground or out of range, and which on the ground; |r - r_T|, m; which would be a success if they ended now.
+FleetStep: TypeAlias = tuple[Float32Array, FloatArray, BoolArray, BoolArray, FloatArray, BoolArray]
 
 
 class BatchFleet:
@@ -52,7 +45,7 @@ class BatchFleet:
         observation, reward, _ = self._batch.step(actions)
         end = self._batch.outcome
         ends = ~end["truncated"], end["collision"], end["distance"], end["success"]
-        return FleetStep(observation, reward.astype(np.float64), *ends)
+        return observation, reward.astype(np.float64), *ends
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         """Move the targets of some rows, (len(rows), 3); all observations with the new targets."""
@@ -94,7 +87,7 @@ class PyBulletFleet:
         for row in np.flatnonzero(flying):
             self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(actions[row])
             collided[row], distance[row], arrived[row] = info["collision"], info["distance"], info["is_success"]
-        return FleetStep(self._observation.copy(), reward, lost, collided, distance, arrived)
+        return self._observation.copy(), reward, lost, collided, distance, arrived
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:
         for row, target in zip(rows, targets, strict=True):

@@ -4,9 +4,8 @@ import hashlib
 import io
 import re
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -98,6 +97,7 @@ def _describe(path: Path, algorithm: str, network: Network, reference: Reference
     rotors = enumerate(zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True))
     sizes = [network.steps[0][0].in_features, *(layer.out_features for layer, _ in network.steps)]
     hidden = ", ".join(activation for _, activation in network.steps[:-1]) or "none"
+    mean, std = (", ".join(f"{value:.6g}" for value in values) for values in (reference.mean, reference.std))
     n_parameters = sum(parameter.numel() for parameter in network.parameters())
     return {
         "policy": f"{path.name} ({algorithm}), sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}",
@@ -112,15 +112,10 @@ def _describe(path: Path, algorithm: str, network: Network, reference: Reference
         f"within {low:.6g} to {high:.6g}",
         "rotors": "; ".join(f"{k} at x {x:.4g} m, y {y:.4g} m, yaw moment {sign:+d}"[:-1] for k, ((x, y), sign) in rotors),
         "period": f"{vehicle.control_step:g} s between calls, as in training",
-        "scaling": f"done inside, (x - mean) / std with mean {_compact(reference.mean)} and std {_compact(reference.std)}",
+        "scaling": f"done inside, (x - mean) / std with mean {mean} and std {std}",
         "network": f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, {n_parameters} float32 parameters",
         "check": "pending",
     }
-
-
-def _compact(values: Iterable[float]) -> str:
-    """Equal numbers in a row once, with how many they are: ``5.7735 (3 times), 1.73205 (9 times)``."""
-    return ", ".join(f"{word} ({len(list(group))} times)" for word, group in groupby(f"{value:.6g}" for value in values))
 
 
 def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> bytes:

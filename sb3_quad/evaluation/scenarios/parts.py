@@ -7,7 +7,6 @@ from pydantic import (
     Field,
     NonNegativeFloat,
     PositiveFloat,
-    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -103,14 +102,6 @@ class Start(Frozen):
     velocity: VectorDistribution = Field(default=ZERO, description="world frame, m/s: [x, y, z], {std: …} or {magnitude: …}")
     body_rates: VectorDistribution = Field(default=ZERO, description="body frame, rad/s: given as velocity is")
 
-    @field_validator("velocity", "body_rates")
-    @classmethod
-    def _in_si_units(cls, value: VectorDistribution, info: ValidationInfo) -> VectorDistribution:
-        most, unit = (100.0, "m/s") if info.field_name == "velocity" else (200.0, "rad/s, not deg/s")
-        if value.largest > most:
-            raise ValueError(f"{value.largest:g} is beyond {most:g}; the unit is {unit}")
-        return value
-
 
 class Target(OneOf):
     """Where to fly: ``[x, y, z]``, ``{distance: 10}`` in a random direction, or ``{waypoints: [[x, y, z], …]}``."""
@@ -125,12 +116,6 @@ class Target(OneOf):
         default=None, min_length=1, description="targets one after the other, world frame, m"
     )
     radius: PositiveFloat | None = Field(default=None, description="a waypoint counts as reached within this, m (0.5)")
-
-    @model_validator(mode="after")
-    def _radius_with_waypoints(self) -> "Target":
-        if self.radius is not None and self.waypoints is None:
-            raise ValueError("radius goes with waypoints; the tolerances of a single target are the scenario's tolerances")
-        return self
 
     @property
     def points(self) -> tuple[Vector, ...]:
