@@ -21,9 +21,10 @@ from sb3_quad.base.errors import WorkerDied
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
 from sb3_quad.executors import start_executor
-from sb3_quad.sweep.compare import Comparison, over_seeds
+from sb3_quad.sweep.compare import over_seeds
 from sb3_quad.sweep.expand import expand
 from sb3_quad.sweep.folder import Plan, SweepFolder
+from sb3_quad.sweep.results import verdict
 from sb3_quad.sweep.run import digest
 from sb3_quad.sweep.spec import SWEEPS, SweepSpec, load_sweep
 
@@ -140,7 +141,7 @@ def test_who_is_better_is_known_where_it_is_clear():
     random = np.random.default_rng(0)
     common = random.normal(size=(1, 60))  # some episodes are harder, for all
     low, high = (common + random.normal(shift, 0.3, (3, 60)) for shift in (0.0, 1.0))
-    verdicts = [Comparison(over_seeds(difference)).verdict for difference in (high - low, low - high, low - low)]
+    verdicts = [verdict(over_seeds(difference)) for difference in (high - low, low - high, low - low)]
     assert verdicts == ["better", "worse", "cannot tell"]
     interval = over_seeds(low)
     assert interval.low < low.mean() < interval.high and interval.value == pytest.approx(low.mean())

@@ -138,7 +138,7 @@ def test_two_processes_share_a_study(command):
 def test_pruned_trials_end_early_and_are_never_the_best(command, monkeypatch, capsys):
     monkeypatch.setitem(search_module.PRUNERS, "median", lambda *arguments: optuna.pruners.ThresholdPruner(lower=10.0))
     assert main([*command, "--n-trials", "2"]) == 0
-    assert "pruned after 1 evaluations" in capsys.readouterr().out
+    assert "trial 0 pruned, success" in capsys.readouterr().out
     rows = trials()
     assert [(row["state"], row["evaluations"], row["value"]) for row in rows] == [("PRUNED", "1", "")] * 2
     assert PPO.load(Path(rows[0]["run"]) / f"{ENV}.zip").num_timesteps == 408

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -33,7 +32,7 @@ class LocalExecutor:
         self._stopped = False
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        """See :meth:`~sb3_quad.executors.start.Executor.submit`."""
+        """See :meth:`~sb3_quad.executors.Executor.submit`."""
         return self._threads.submit(self._call, function, *arguments)
 
     def stop(self) -> None:
@@ -43,7 +42,7 @@ class LocalExecutor:
     def __enter__(self) -> "LocalExecutor":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end(signal.SIGKILL)
         self._threads.shutdown()
 

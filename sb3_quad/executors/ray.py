@@ -9,7 +9,6 @@ import tempfile
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import torch
@@ -19,8 +18,6 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.trust import VARIABLE, trusted
 
 RETRIES = 3  # of a call whose node or worker process dies
-PORT = 6379  # of a cluster's head, where an address names none
-CLIENT, CLIENT_PORT = "ray://", 10001
 
 
 class RayExecutor:
@@ -59,7 +56,7 @@ class RayExecutor:
         self.workers = max(1, int(total.get("CPU", 0) // num_cpus) if num_cpus else workers)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        """See :meth:`~sb3_quad.executors.start.Executor.submit`."""
+        """See :meth:`~sb3_quad.executors.Executor.submit`."""
         call = self._ray.remote(_call).options(name=getattr(function, "__name__", "call"), **self._needs)
         reference, future = call.remote(sys.argv, os.getcwd(), function, *arguments), Future[Any]()
         self._references.append(reference)
@@ -74,7 +71,7 @@ class RayExecutor:
     def __enter__(self) -> "RayExecutor":
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(self, *error: object) -> None:
         """Leave the cluster, or end the one that was started here."""
         for reference in self._references:
             self._ray.cancel(reference, force=True)
@@ -93,22 +90,18 @@ class RayExecutor:
 
 
 def _check_address(address: str) -> None:
-    """See that somebody answers at an address, so that nobody waits for a cluster that is none.
+    """See that somebody answers at an address, since Ray itself would wait for minutes, and then end the process.
 
     :raises ConfigError: nobody answers.
     """
     if address == "auto":  # Ray looks for one on this machine, and says at once that there is none
         return
-    host, _, port = address.removeprefix(CLIENT).rpartition(":")
-    if not host:
-        host, port = port, str(CLIENT_PORT if address.startswith(CLIENT) else PORT)
-    if not port.isdigit() or not host:
-        raise ConfigError(f"address {address!r}: must be auto, host:port or ray://host:port")
+    host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=4.0).close()
-    except (OSError, OverflowError):
-        start = f"start one with: ray start --head --port {PORT}, or leave --address out"
-        raise ConfigError(f"address {address}: no Ray cluster answers; {start}") from None
+    except (ValueError, OSError, OverflowError):
+        way_out = "must be auto, host:port or ray://host:port; start one with: ray start --head --port 6379"
+        raise ConfigError(f"address {address}: no Ray cluster answers; {way_out}") from None
 
 
 def _copy_package(folder: Path) -> Path:

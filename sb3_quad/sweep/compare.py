@@ -9,27 +9,15 @@ intervals that are too narrow (Agarwal et al., Deep Reinforcement Learning at th
 import importlib.util
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
-from sb3_quad.base.files import one_line
 from sb3_quad.evaluation.statistics import Estimate
 
 RESAMPLES = 1000
 AGGREGATES = ("median", "iqm", "mean", "optimality_gap")
-
-
-class Comparison(NamedTuple):
-    """The first of two configurations against the second, by a measure of which more is better."""
-
-    difference: Estimate
-
-    @property
-    def verdict(self) -> str:
-        """Better or worse if the interval of the difference leaves out zero."""
-        return "better" if self.difference.low > 0 else "worse" if self.difference.high < 0 else "cannot tell"
 
 
 def over_seeds(values: FloatArray, statistic: Callable[..., FloatArray] = np.nanmean) -> Estimate | None:
@@ -55,27 +43,21 @@ def aggregates(rates: Mapping[str, FloatArray]) -> dict[str, Any] | None:
     """rliable's aggregate metrics of success rates, with 95 % intervals by its stratified bootstrap over runs.
 
     :param rates: by configuration, (runs, scenarios).
-    :return: None: rliable cannot be imported (extra ``[sweep]``), or there are no rates.
+    :return: None: rliable is not installed (extra ``[sweep]``), or there are no rates.
     """
     if not rates or importlib.util.find_spec("rliable") is None:
         return None
-    try:
-        from rliable import library, metrics
-    except Exception as error:  # with another pandas than it knows, a TypeError
-        why = one_line(error)
-        warnings.warn(f"no aggregate metrics: rliable cannot be imported ({why}); pip install 'pandas<3'", stacklevel=2)
-        return None
+    from rliable import library, metrics
 
     def measured(scores: Any) -> Any:
         return np.array([getattr(metrics, f"aggregate_{name}")(scores) for name in AGGREGATES])
 
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # what rliable calls will once want another generator
-        random = np.random.RandomState(0)
-        found, ends = library.get_interval_estimates(dict(rates), measured, reps=RESAMPLES, random_state=random)
-    numbers = {name: np.vstack([found[name], ends[name]]).T.tolist() for name in rates}  # by aggregate: value, low, high
-    words = ("value", "low", "high")
+    random = np.random.RandomState(0)
+    found, ends = library.get_interval_estimates(dict(rates), measured, reps=RESAMPLES, random_state=random)
     return {
-        name: {each: dict(zip(words, three, strict=True)) for each, three in zip(AGGREGATES, rows, strict=True)}
-        for name, rows in numbers.items()
+        name: {
+            each: {"value": value, "low": low, "high": high}
+            for each, value, low, high in zip(AGGREGATES, found[name].tolist(), *ends[name].tolist(), strict=True)
+        }
+        for name in rates
     }

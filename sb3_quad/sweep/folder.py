@@ -4,12 +4,13 @@ A sweep's folder holds
 
 - ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Plan`: its runs with all their settings;
 - ``runs/<configuration>/seed_<k>/``, folders as ``train`` leaves them;
-- ``records/<configuration>/seed_<k>.json``, a :class:`~sb3_quad.sweep.records.RunRecord` of each run that ended;
+- ``records/<configuration>/seed_<k>.json``, a :class:`RunRecord` of each run that ended;
 - ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was measured.
 """
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal, TypeAlias
 
 import yaml
 from pydantic import Field
@@ -19,10 +20,31 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.expand import Run
-from sb3_quad.sweep.records import RunRecord
 from sb3_quad.sweep.spec import SweepSpec
 
 PLAN = "plan.json"
+Numbers: TypeAlias = tuple[float | None, ...]
+SUCCESS, SURVIVAL, REWARD, ERROR, TIME = "success", "survival", "reward", "final_error", "time"
+MEASURES = (SUCCESS, SURVIVAL, REWARD, ERROR, TIME)
+"""Of an episode: 0 or 1, 0 or 1, sum, m (None: lost), s to the tightest tolerance, or, where it
+starts at its target, until stable (None: never)."""
+
+
+class RunRecord(Frozen):
+    """How a run ended."""
+
+    name: str
+    configuration: str
+    seed: int
+    state: Literal["finished", "failed", "interrupted"]
+    message: str = Field(default="", description="why it failed, in one line")
+    agent: str = Field(default="", description="the zip that flew, relative to the run's folder")
+    weights: str = Field(default="", description="SHA-256 of that agent's parameters")
+    timesteps: int = 0
+    seconds: float = Field(default=0.0, description="wall-clock time of the training; of a run that was resumed, since then")
+    flights: dict[str, dict[str, Numbers]] = Field(
+        default={}, description="by scenario and measure, a number for each episode, the same episodes in every run"
+    )
 
 
 class Plan(Frozen):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
-from sb3_quad.evaluation.tables import Table, text_table
+from sb3_quad.evaluation.tables import Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
@@ -14,7 +14,7 @@ from sb3_quad.sweep.results import SweepResults
 
 
 def write_report(place: SweepFolder, found: SweepResults, shown: Mapping[str, Sequence[Table]]) -> Path:
-    """Write the report of a sweep's finished runs: a section for each scenario, the learning curves, the runs.
+    """Write the report of a sweep's finished runs: a section for each scenario and the learning curves.
 
     :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`, by scenario.
     :return: the page.
@@ -28,7 +28,6 @@ def write_report(place: SweepFolder, found: SweepResults, shown: Mapping[str, Se
     plots = _curves(place, found)
     if plots:
         parts.append(Section("curves", "Learning curves", "Mean over seeds, with their range.", [], plots))
-    parts.append(Section("runs", "Runs", "", [_runs(found)]))
     configurations = len({run.configuration for run in found.plan.runs})
     facts = f"{found.finished} of {len(found.plan.runs)} runs of {configurations} configurations are finished."
     return write_page(place.path, f"Sweep: {found.plan.spec.name}", facts, parts)
@@ -50,15 +49,3 @@ def _curves(place: SweepFolder, found: SweepResults) -> list[Plot]:
             continue
         plots.append(Plot(f"curves_{number}", f"{kind}: success and reward along the training.", figure))
     return plots
-
-
-def _runs(found: SweepResults) -> Table:
-    rows: list[Sequence[str]] = []
-    for run in found.plan.runs:
-        record = found.records.get(run.name)
-        if record is None:
-            rows.append((run.name, "not finished", "", ""))
-        else:
-            state = f"{record.state}: {record.message}" if record.message else record.state
-            rows.append((run.name, state, f"{record.timesteps:,}", f"runs/{run.name}/{record.agent}" if record.agent else ""))
-    return text_table("", ("run", "state", "timesteps", "agent"), rows, align="left")

@@ -15,9 +15,8 @@ from sb3_quad.base.files import write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.statistics import Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
-from sb3_quad.sweep.compare import Comparison, aggregates, over_seeds
-from sb3_quad.sweep.folder import Plan, SweepFolder
-from sb3_quad.sweep.records import ERROR, MEASURES, REWARD, SUCCESS, SURVIVAL, TIME, RunRecord
+from sb3_quad.sweep.compare import aggregates, over_seeds
+from sb3_quad.sweep.folder import ERROR, MEASURES, REWARD, SUCCESS, SURVIVAL, TIME, Plan, RunRecord, SweepFolder
 
 ROWS = {  # by measure: its row, factor and decimals
     SUCCESS: (Row("success", "%"), 100.0, 2),
@@ -29,7 +28,6 @@ ROWS = {  # by measure: its row, factor and decimals
 STATISTICS = {measure: np.nanmedian if measure == ERROR else np.nanmean for measure in MEASURES}
 COMPARED = (SUCCESS, REWARD)
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
-MOST_COMPARED = 8  # configurations of which every pair is compared; of more, each with the first alone
 
 
 @dataclass(frozen=True)
@@ -38,14 +36,14 @@ class SweepResults:
 
     :param groups: by configuration, its finished runs, in the order of the seeds; only configurations that have any.
     :param estimates: by configuration, scenario and measure; None: not measured.
-    :param comparisons: by scenario, measure and pair of configurations.
+    :param comparisons: by scenario, measure and pair of configurations, the first less the second.
     """
 
     plan: Plan
     records: Mapping[str, RunRecord]
     groups: dict[str, list[RunRecord]]
     estimates: dict[tuple[str, str, str], Estimate | None]
-    comparisons: dict[tuple[str, str, str, str], Comparison]
+    comparisons: dict[tuple[str, str, str, str], Estimate]
 
     @property
     def finished(self) -> int:
@@ -66,17 +64,21 @@ def evaluate(plan: Plan, records: Mapping[str, RunRecord]) -> SweepResults:
     return SweepResults(plan, records, groups, estimates, _compare(groups))
 
 
-def _compare(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Comparison]:
-    names, found = list(groups), {}
-    pairs = [pair for pair in itertools.combinations(names, 2) if len(names) <= MOST_COMPARED or pair[0] == names[0]]
-    for scenario, measure, pair in itertools.product(_scenarios(groups), COMPARED, pairs):
+def _compare(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Estimate]:
+    found = {}
+    for scenario, measure, pair in itertools.product(_scenarios(groups), COMPARED, itertools.combinations(groups, 2)):
         first, second = ({record.seed: record for record in groups[name]} for name in pair)
         common = [seed for seed in first if seed in second]
         one, two = (_matrix([each[seed] for seed in common], scenario, measure) for each in (first, second))
         difference = over_seeds(one - two) if common and one.shape == two.shape else None
         if difference is not None:
-            found[scenario, measure, pair[0], pair[1]] = Comparison(difference)
+            found[scenario, measure, pair[0], pair[1]] = difference
     return found
+
+
+def verdict(difference: Estimate) -> str:
+    """Whether the first of two is better or worse: whether the interval of the difference leaves out zero."""
+    return "better" if difference.low > 0 else "worse" if difference.high < 0 else "cannot tell"
 
 
 def write_results(place: SweepFolder, found: SweepResults) -> None:
@@ -106,9 +108,9 @@ def write_results(place: SweepFolder, found: SweepResults) -> None:
             for name, group in found.groups.items()
         },
         "comparisons": [
-            {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": pair.verdict}
-            | pair.difference.model_dump()
-            for (scenario, measure, first, second), pair in found.comparisons.items()
+            {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": verdict(difference)}
+            | difference.model_dump()
+            for (scenario, measure, first, second), difference in found.comparisons.items()
         ],
         "aggregates": aggregates(rates),
     }
@@ -127,8 +129,8 @@ def tables(found: SweepResults) -> dict[str, list[Table]]:
                 rows.append(Row(row.name, row.unit, cells))
         made[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
         lines = [
-            Row(f"{one} than {two}", ROWS[measure][0].heading, [Cell(words=pair.verdict), _cell(pair.difference, measure)])
-            for (where, measure, one, two), pair in found.comparisons.items()
+            Row(f"{one} than {two}", ROWS[measure][0].heading, [Cell(words=verdict(difference)), _cell(difference, measure)])
+            for (where, measure, one, two), difference in found.comparisons.items()
             if where == scenario
         ]
         if lines:

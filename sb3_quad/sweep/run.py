@@ -1,7 +1,6 @@
 """What a worker does: train a run of a sweep as ``train`` does, or what is left of it, and fly its agent."""
 
 import hashlib
-import platform
 from contextlib import closing
 from pathlib import Path
 
@@ -21,8 +20,7 @@ from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.sweep.expand import Run
-from sb3_quad.sweep.folder import PLAN
-from sb3_quad.sweep.records import MEASURES, REWARD, Numbers, RunRecord
+from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, RunRecord
 from sb3_quad.sweep.spec import Evaluation
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
@@ -36,14 +34,11 @@ LOG = "log.txt"  # what the training reports, in the run's folder
 def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> RunRecord:
     """Train a run in its folder, or what is left of it, and fly its agent; of a run that fails, why.
 
-    :param folder: below that of the sweep.
     :param suite: what the agent flies; None: fresh episodes of both tasks, as many as ``evaluation`` says.
     """
     use_cpus(1)
     place = Path(folder)
     try:
-        if not (place.parents[2] / PLAN).is_file():
-            raise ConfigError(f"{place.parents[2]}: not seen by {platform.node()}; a Ray cluster needs a disk that all share")
         place.mkdir(parents=True, exist_ok=True)
         import_packages(run.gym_packages, "gym_packages:")
         result = _train(run, place)
@@ -67,11 +62,6 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
     )
 
 
-def standing(folder: Path) -> str:
-    """How a run goes on that has no record yet, in words; empty if it has not begun."""
-    return "goes on where it was left" if _pipeline_folder(folder) is not None else ""
-
-
 def digest(agent: Path) -> str:
     """The SHA-256 of the parameters in an agent's zip."""
     parameters = load_model(agent).policy.state_dict()
@@ -79,7 +69,8 @@ def digest(agent: Path) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _pipeline_folder(place: Path) -> Path | None:
+def pipeline_folder(place: Path) -> Path | None:
+    """Where a run's training is, if it has begun."""
     return next((path.parent for path in sorted(place.glob(f"*/*/{STATUS_FILE}"))), None)
 
 
@@ -90,7 +81,7 @@ def _train(run: Run, place: Path) -> PipelineResult:
         with (place / LOG).open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
 
-    begun = _pipeline_folder(place)
+    begun = pipeline_folder(place)
     if begun is not None:
         return resume_pipeline(begun, report)
     stages = []

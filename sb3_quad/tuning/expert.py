@@ -3,7 +3,6 @@
 Gains are judged by recoveries first, then the way to a target, then the reward.
 """
 
-import hashlib
 import json
 import re
 from collections.abc import Callable, Sequence
@@ -34,7 +33,7 @@ DESCENT, WAY, RECOVERY = 400, 800, 1000  # control steps flown of each kind
 # Slow descents are for agents that imitate the expert imprecisely; the expert itself could do without, and is not asked.
 SEARCHED = tuple(name for name in GAIN_NAMES if name != "descent_deceleration")
 RANGE = 2.0  # each gain between its first value divided by this and multiplied by it
-SETTINGS, WRITTEN = "settings", "written"
+SETTINGS = "settings"
 BLOCK = "geometric_gains"
 COMMENT = "of GeometricExpert, found by search; what each means: sb3_quad/vehicles/gains.py"
 
@@ -170,14 +169,6 @@ class ExpertSearch:
                 study.stop()
 
         self.study.optimize(fly, n_trials=remaining, callbacks=[report])
-
-    def may_overwrite(self, output: Path) -> bool:
-        """Whether a file holds what this search itself wrote there earlier."""
-        return output.is_file() and self.study.user_attrs.get(WRITTEN) == hashlib.sha256(output.read_bytes()).hexdigest()
-
-    def note_output(self, content: bytes) -> None:
-        """Remember what is going to be written, for :meth:`may_overwrite`."""
-        self.study.set_user_attr(WRITTEN, hashlib.sha256(content).hexdigest())
 
     def _gains(self, values: dict[str, float]) -> GeometricGains:
         rounded = {name: float(f"{value:.4g}") for name, value in values.items()}

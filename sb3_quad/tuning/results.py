@@ -14,14 +14,12 @@ from optuna.trial import FrozenTrial
 from optuna.visualization.matplotlib import plot_optimization_history, plot_slice
 
 from sb3_quad.base.files import write_bytes, write_text
-from sb3_quad.evaluation.tables import Table, text_table
 from sb3_quad.report.plots import picture
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
 
 BEST, TRIALS = "best.yml", "trials.csv"
 STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
-SHOWN = 5  # trials in the table of the best
 PLOTS: dict[str, Callable[..., Any]] = {"trials.png": plot_slice, "history.png": plot_optimization_history}
 
 
@@ -77,29 +75,19 @@ def in_words(search: Search, trial: FrozenTrial) -> str:
 
 def trial_line(search: Search, trial: FrozenTrial) -> str:
     """One line that says how a trial ended."""
-    seconds = trial.duration.total_seconds() if trial.duration is not None else 0.0
-    values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
     if trial.state.name == "FAIL":
-        return f"trial {trial.number} failed: {trial.user_attrs[ERROR]} ({values})"
-    pruned = f"pruned after {len(trial.intermediate_values)} evaluations, " if trial.state.name == "PRUNED" else ""
+        how = f"failed: {trial.user_attrs.get(ERROR, INTERRUPTED)}"
+    else:
+        how = f"{STATES[trial.state.name]}, {in_words(search, trial)}"
     mark = " (best so far)" if search.best is not None and search.best.number == trial.number else ""
-    return f"trial {trial.number}: {pruned}{in_words(search, trial)}, {seconds:.1f} s{mark} ({values})"
+    values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
+    return f"trial {trial.number} {how}{mark} ({values})"
 
 
 def count_trials(search: Search) -> str:
     """How many trials of the study ended, by how they did."""
     counts = {word: len(search.trials(state)) for state, word in STATES.items()}
     return ", ".join(f"{count} {word}" for word, count in counts.items() if count) or "no trial yet"
-
-
-def best_table(search: Search) -> Table:
-    """The best trials: what they reached, and the settings that the search varies."""
-    trials = sorted(search.trials("COMPLETE"), key=lambda trial: -(trial.value or 0.0))[:SHOWN]
-    rows = [("mean reward", *(f"{trial.user_attrs[REWARD]:.3f}" for trial in trials))]
-    if search.job.config.task is not None:
-        rows.insert(0, ("success", *(f"{100 * trial.user_attrs[SUCCESS]:.2f} %" for trial in trials)))
-    rows += [(name, *(str(varied(search, trial)[name]) for trial in trials)) for name in search.space.dimensions]
-    return text_table(f"the best of {count_trials(search)}", ("trial", *(str(trial.number) for trial in trials)), rows)
 
 
 def train_command(search: Search) -> str:
@@ -110,17 +98,12 @@ def train_command(search: Search) -> str:
 
 
 def write_plots(search: Search) -> None:
-    """Plot the history of the finished trials, and each setting against what came of it, as Optuna does; PNG.
-
-    The vertical axis is the success, or the mean reward once half of the finished trials succeed equally often and best.
+    """Plot the mean rewards of the finished trials in order, and against each setting, as Optuna does; PNG.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    successes = [trial.user_attrs[SUCCESS] for trial in search.trials("COMPLETE")]
-    by_reward = search.job.config.task is None or 2 * successes.count(max(successes)) > len(successes)
-    key, label = (REWARD, "mean reward") if by_reward else (SUCCESS, "success")
     for name, plot in PLOTS.items():
-        axes = plot(search.study, target=lambda trial: trial.user_attrs[key], target_name=label)
+        axes = plot(search.study, target=lambda trial: trial.user_attrs[REWARD], target_name="mean reward")
         figure = np.ravel(axes)[0].figure
         write_bytes(Path(search.job.log_folder, name), picture(figure, "png", dpi=110, bbox_inches="tight"))
         pyplot.close(figure)

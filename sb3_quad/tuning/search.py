@@ -6,11 +6,11 @@ import math
 import os
 import platform
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from optuna import Study, Trial
+from optuna import Trial
 from optuna.exceptions import OptunaError, TrialPruned
 from optuna.trial import FrozenTrial
 
@@ -75,35 +75,22 @@ class Search:
             other = f"was begun with other settings ({differing})"
             raise ConfigError(f"{where}: {other}; give the same again, or another --study-name")
 
-    def run(
-        self, n_trials: int, max_total_trials: int | None, signals: StopSignals, after_each: Callable[[FrozenTrial], None]
-    ) -> None:
-        """Train up to ``n_trials`` times, until a signal comes, or until the study has ``max_total_trials``.
+    def try_one(self, most: int | None) -> FrozenTrial | None:
+        """Train once.
 
-        :param max_total_trials: those of other processes and earlier sessions included, failed ones not.
-        :param after_each: told of each trial that ended.
-        :raises TrainingError: the first trials of all have failed.
+        :param most: trials of the study, those of other processes and earlier sessions included, failed ones not.
+        :return: the trial that ended; None: the study has as many as it may.
         :raises ConfigError: a storage that fails meanwhile.
         """
-        most = math.inf if max_total_trials is None else max_total_trials
         ended: list[FrozenTrial] = []
-
-        def is_over() -> bool:
-            return signals.received is not None or len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most
-
-        def after(study: Study, trial: FrozenTrial) -> None:
-            ended.append(trial)
-            after_each(trial)
-            check_hopeless(ended)
-            if is_over():
-                study.stop()
-
         try:
             retry_dead_trials(self.study)
-            if not is_over():
-                self.study.optimize(self._train, n_trials, catch=(Exception,), callbacks=[after])
+            if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
+                return None
+            self.study.optimize(self._train, 1, catch=(Exception,), callbacks=[lambda study, trial: ended.append(trial)])
         except (OSError, OptunaError) as error:
             raise ConfigError(f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})") from error
+        return ended[0]
 
     def trials(self, *states: str) -> list[FrozenTrial]:
         """The trials in these states, such as ``COMPLETE``; all that ended by default."""
@@ -187,19 +174,17 @@ class Search:
         }
 
 
-def train_trial(
-    job: TrainingJob, space: SearchSpace, name: str, storage: str, study: tuple[str, str, int, int], most: int | None
+def try_one_of(
+    job: TrainingJob, space: SearchSpace, name: str, storage: str | Path, study: tuple[str, str, int, int], most: int | None
 ) -> int | None:
-    """In a worker: one trial of a study that several share.
+    """In a worker: one trial of a study that several share, see :meth:`Search.try_one`.
 
     :param study: sampler, pruner, n_startup_trials, n_evaluations, as for :class:`Search`.
-    :param most: trials of the whole study; None: no limit.
-    :return: its number; None: the study has as many as it may.
+    :return: its number.
     """
-    numbers: list[int] = []
-    with StopSignals() as signals:
-        Search(job, space, name, storage, *study).run(1, most, signals, lambda trial: numbers.append(trial.number))
-    return numbers[0] if numbers else None
+    with StopSignals():
+        trial = Search(job, space, name, storage, *study).try_one(most)
+    return None if trial is None else trial.number
 
 
 def check_hopeless(ended: Sequence[FrozenTrial]) -> None:

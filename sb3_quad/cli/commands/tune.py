@@ -16,13 +16,11 @@ The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. N
 import argparse
 import sys
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, wait
 from contextlib import suppress
-from itertools import count
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
+from sb3_quad.base.errors import SB3QuadError, WorkerDied
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
 from sb3_quad.cli.parser import Parser, add_common, given, natural, positive, seed, whole
@@ -55,63 +53,57 @@ def run(options: argparse.Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.tuning.results import count_trials, trial_line, write_results
+    from sb3_quad.tuning.search import check_hopeless
 
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
         print(f"study {search.name} in {search.storage}: {count_trials(search)}; results go to {search.job.log_folder}")
         with progress_bar(options.progress) as show:
-            done = count()
-            show(next(done), options.n_trials, "trials")
+            ended = list[Any]()
+            show(0, options.n_trials, "trials")
 
             def after_each(trial: Any) -> None:
+                ended.append(trial)
                 write_results(search)
                 print(trial_line(search, trial))
-                show(next(done), options.n_trials, "trials")
+                show(len(ended), options.n_trials, "trials")
+                check_hopeless(ended)
 
             try:
-                if options.workers > 1 or options.executor != "local":
-                    _share(options, search, signals, after_each)
-                else:
-                    search.run(options.n_trials, options.max_total_trials, signals, after_each)
+                _try(options, search, signals, after_each)
             finally:
                 write_results(search)
     _print_results(search)
     return signals.exit_code
 
 
-def _share(options: argparse.Namespace, search: Any, signals: StopSignals, after_each: Callable[[Any], None]) -> None:
-    """Have workers train the trials, each of which opens the study.
+def _try(options: argparse.Namespace, search: Any, signals: StopSignals, after_each: Callable[[Any], None]) -> None:
+    """Train the trials: here one by one, or by workers, each of which opens the study."""
+    from sb3_quad.executors import as_they_end, start_executor
+    from sb3_quad.tuning.search import try_one_of
 
-    :raises TrainingError: the first trials of all have failed.
-    """
-    from sb3_quad.executors import start_executor
-    from sb3_quad.tuning.search import check_hopeless, train_trial
-
-    if options.address is not None and options.storage is None:
-        raise ConfigError("--address: workers elsewhere need a study that they see; name one with --storage")
+    if options.workers == 1 and options.executor == "local" and options.address is None:
+        for _ in range(options.n_trials):
+            trial = search.try_one(options.max_total_trials)
+            if trial is None:
+                return
+            after_each(trial)
+            if signals.received is not None:
+                return
+        return
     study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
-    storage = str(search.storage) if "://" in str(search.storage) else str(Path(str(search.storage)).absolute())
-    shared = search.job.model_copy(update={"log_folder": str(Path(search.job.log_folder).absolute())})
-    ended, stopped = list[Any](), False
+    arguments = search.job, search.space, search.name, search.storage, study, options.max_total_trials
     with start_executor(options.executor, options.workers, options.address) as executor:
-        arguments = shared, search.space, search.name, storage, study, options.max_total_trials
-        futures = {executor.submit(train_trial, *arguments) for _ in range(options.n_trials)}
-        while futures:
-            done, futures = wait(futures, 1.0, FIRST_COMPLETED)
-            for future in done:
-                try:
-                    number = None if future.cancelled() else future.result()
-                except WorkerDied as error:
-                    print(f"a trial is lost, and tried again by whoever goes on: {error}", file=sys.stderr)
-                    continue
-                if number is not None:
-                    ended.append(search.study.get_trials(deepcopy=False)[number])
-                    after_each(ended[-1])
-                    check_hopeless(ended)
-            if signals.received is not None and not stopped:
-                stopped = True
-                executor.stop()
+        calls = {executor.submit(try_one_of, *arguments): number for number in range(options.n_trials)}
+        for _, future in as_they_end(executor, calls, signals, print):
+            try:
+                number = future.result()
+            except WorkerDied as error:
+                print(f"a trial is lost, and tried again by whoever goes on: {error}", file=sys.stderr)
+                continue
+            if number is not None:
+                after_each(search.study.get_trials(deepcopy=False)[number])
 
 
 def _make_search(options: argparse.Namespace) -> Any:
@@ -144,32 +136,24 @@ def _make_search(options: argparse.Namespace) -> Any:
 
 
 def _print_results(search: Any) -> None:
-    """Print the best trials, the best agent on fresh episodes, and where everything is."""
-    from sb3_quad.tuning.results import BEST, PLOTS, TRIALS, count_trials, train_command, write_plots
-
-    if search.best is not None:
-        write_plots(search)
-        _print_best(search, search.best)
-    written = [TRIALS] if search.best is None else [TRIALS, BEST, *PLOTS]
-    print(f"{count_trials(search)}; saved in {search.job.log_folder}: {', '.join(written)}")
-    print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
-    if search.best is not None:
-        print(f"to train: {train_command(search)}")
-
-
-def _print_best(search: Any, best: Any) -> None:
-    """Print the best trials, and the best agent on episodes by which nothing was chosen, if its run folder is at hand."""
+    """Print the best trial, its agent on episodes by which nothing was chosen, and where everything is."""
     from sb3_quad.cli.closing import agent_and_expert
     from sb3_quad.cli.output import console
     from sb3_quad.controllers.zips import load_model
     from sb3_quad.training.config import build_config
     from sb3_quad.training.runs import open_run
-    from sb3_quad.tuning.results import best_table, settings_of
+    from sb3_quad.tuning.results import count_trials, settings_of, train_command, trial_line, write_plots
     from sb3_quad.tuning.search import RUN
 
-    known, path = search.job.config, Path(best.user_attrs[RUN])
-    console().print(best_table(search))
-    if known.task is not None and path.is_dir():
-        run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
-        console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
-        print(f"agent: {run.model}")
+    known, best = search.job.config, search.best
+    if best is not None:
+        write_plots(search)
+        print(f"the best: {trial_line(search, best)}")
+        path = Path(best.user_attrs[RUN])
+        if known.task is not None and path.is_dir():  # a process elsewhere may have trained it
+            run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
+            console().print(agent_and_expert(search.job.model_copy(update={"config": config}), load_model(run.model)))
+            print(f"agent: {run.model}")
+        print(f"to train: {train_command(search)}")
+    print(f"{count_trials(search)}; saved in {search.job.log_folder}")
+    print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")

@@ -3,11 +3,11 @@
 examples:
   sb3-quad tune-expert                                   for ITM, into itm_tuned.yaml
   sb3-quad tune-expert --vehicle my.yaml -o tuned.yaml   for your own vehicle
-  sb3-quad tune-expert -n 2000                           continues the first search, up to 2000 gains in all
+  sb3-quad tune-expert -n 2000 --overwrite               continues the first search, up to 2000 gains in all
   sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
 The first gains stay where those found are no better on fresh episodes.
-Ctrl-C writes the best gains so far; the same command continues. Needs pip install '.[tune]' from a clone.
+Ctrl-C writes the best gains so far; the same command with --overwrite continues. Needs pip install '.[tune]' from a clone.
 """
 
 import argparse
@@ -48,9 +48,8 @@ def run(options: argparse.Namespace) -> int:
     if output.suffix not in (".yaml", ".yml"):
         raise ConfigError(f"--output {output}: must end in .yaml or .yml")
     journal = Path(options.journal) if options.journal else output.with_suffix(".journal")
-    refuse_existing(output, options.overwrite or journal.exists())
+    refuse_existing(output, options.overwrite)
     search = ExpertSearch(vehicle, journal, options.seed, options.starts, options.targets)
-    refuse_existing(output, options.overwrite or search.may_overwrite(output))
 
     with StopSignals() as signals, progress_bar(options.progress) as show:
         show(search.trials_done, options.trials, "choosing the hardest starts")
@@ -69,14 +68,10 @@ def run(options: argparse.Namespace) -> int:
     tried = search.first, search.best
     measured = [measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, FRESH_EPISODES) for each in tried]
     chosen = 1 if fresh_cost(measured[1]) < fresh_cost(measured[0]) else 0
-    content = with_gains(text, tried[chosen].model_copy(update={"measured": measured[chosen]}))
-    search.note_output(content.encode("utf-8"))
-    write_text(output, content)
+    write_text(output, with_gains(text, tried[chosen].model_copy(update={"measured": measured[chosen]})))
 
     rows = [
-        ("state recovery: episodes", *(str(each.recovery_episodes) for each in measured)),
         ("state recovery: survival", *(f"{100 * each.recovery_survival:.2f} %" for each in measured)),
-        ("target tracking: episodes", *(str(each.tracking_episodes) for each in measured)),
         ("target tracking: survival", *(f"{100 * each.tracking_survival:.2f} %" for each in measured)),
         ("target tracking: mean time to 0.1 m", *(f"{each.time_to_0_1_m:.3f} s" for each in measured)),
         ("target tracking: mean reward", *(f"{each.tracking_reward:.3f}" for each in measured)),
