@@ -80,6 +80,7 @@ def call_first(barrier, hits):
     hits.put(sum(function.stats.cache_hits.values()))
 
 
+@pytest.mark.slow
 def test_of_processes_that_start_together_one_compiles(folder):
     context = multiprocessing.get_context("fork")
     barrier, hits = context.Barrier(3), context.Queue()

@@ -68,6 +68,7 @@ def from_threads(call, n=4):
     return errors
 
 
+@pytest.mark.slow
 def test_interrupted_steps_leave_nothing_behind():
     done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -129,6 +130,7 @@ def test_one_pybullet_environment_is_stepped_from_several_threads():
     env.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
 def test_a_fork_while_a_step_is_under_way_can_step():
     env = QuadcopterBatch(300, seed=0, n_threads=2)
