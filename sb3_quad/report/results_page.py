@@ -123,7 +123,7 @@ def _scenario_plots(
     recorded = [each for each in flights if each.tracks]
     plots: list[Plot | Space] = [paths_plot(scenario, recorded)] if recorded else []
     if flights and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
-        plots.append(arrivals_plot(scenario, flights, results.source))
+        plots.append(arrivals_plot(scenario, flights))
     if recorded:
         plots.append(errors_plot(scenario, recorded))
     if any(each.entry.hit_limit is not None for each in flights):

@@ -1,7 +1,7 @@
 """The plots of a scenario: times to its target, distances from it, how large a hit is survived, what ``vary`` changes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.results import Entry, Results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.report.plots import INK, PAPER, POINTS, Plot, band, interval_ends, legend, new_axes, styled
+from sb3_quad.report.plots import INK, POINTS, Plot, band, interval_ends, legend, new_axes, styled
 
 FORCE = "#db1a24"
 LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
@@ -27,11 +27,8 @@ class ControllerFlights(NamedTuple):
 
 
 @styled
-def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights], source: str) -> Plot:
-    """Bars of the mean times to each tolerance, cf. Figs. 4.6 and 4.7.
-
-    :param source: where the reference metrics come from.
-    """
+def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
+    """Bars of the mean times to each tolerance, cf. Figs. 4.6 and 4.7."""
     figure, axes = new_axes("tolerance (m)", "time (s)")
     places, width = np.arange(len(scenario.tolerances)), 0.75 / len(flights)
     for number, each in enumerate(flights):
@@ -40,12 +37,6 @@ def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights], sour
         spread, middle = np.stack([value - low, high - value]), places + (number - 0.5 * (len(flights) - 1)) * width
         whiskers = {"ecolor": INK, "elinewidth": 0.9, "capsize": 2}
         axes.bar(middle, value, 0.92 * width, color=each.colour, label=each.label, yerr=spread, error_kw=whiskers)
-    for (name, reference), marker in zip(scenario.reference.items(), "Dos^" * len(scenario.reference), strict=False):
-        given = {float(key): float(np.mean(time)) for key, time in reference.time_to.items() if time is not None}
-        if given.keys() & set(scenario.tolerances):
-            heights = [given.get(tolerance, np.nan) for tolerance in scenario.tolerances]
-            style: Any = {"color": INK, "markerfacecolor": PAPER, "markeredgewidth": 1.3, "markersize": 6, "zorder": 4}
-            axes.plot(places, heights, marker, label=f"{source}: {name}", **style)
     axes.set_xticks(places, [f"{tolerance:g}" for tolerance in scenario.tolerances])
     axes.grid(axis="x", visible=False)
     legend(figure)
@@ -62,13 +53,11 @@ def errors_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plo
     for wrench in scenario.wrenches:
         if wrench.duration is not None and wrench.start + wrench.duration < scenario.duration:
             axes.axvspan(wrench.start, wrench.start + wrench.duration, facecolor=FORCE, edgecolor=FORCE, alpha=0.16)
-            style: Any = {"xycoords": ("data", "axes fraction"), "textcoords": "offset points", "va": "top"}
-            axes.annotate("push", (wrench.start, 1.0), (2, -2), **style)
     axes.set_ylim(bottom=0.0)
     legend(figure)
     caption = (
-        f"Median and band from least to greatest of {len(flights[0].tracks)} flights. A lost flight counts as infinitely"
-        " far: a median ends where half are lost."
+        f"Median and band from least to greatest of {len(flights[0].tracks)} flights; red: a push. A lost flight counts as"
+        " infinitely far: a median ends where half are lost."
     )
     return Plot(f"{scenario.name}_error", caption, figure)
 

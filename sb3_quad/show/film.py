@@ -151,7 +151,7 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
     times, client = frame_times(recordings, speed), scene.client
     forward = broadside(np.concatenate([recording.landmarks for recording in recordings]))
     cameras = list(following_cameras(recordings, times, scene.scale, forward, lens))
-    drawn_to, labels = [0] * len(recordings), [-1] * len(recordings)
+    drawn_to = [0] * len(recordings)
     begun, number = time.perf_counter(), 0
     while number < len(times):
         now = [(recording, recording.at(times[number])) for recording in recordings]
@@ -161,9 +161,6 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
             if step > drawn_to[k]:
                 ends, colour = recording.state.position[[drawn_to[k], step]], to_rgb(recording.colour)
                 p.addUserDebugLine(*ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client)
-                above = (ends[1] + (0.0, 0.0, 0.6 * scene.scale)).tolist()
-                look = {"textColorRGB": colour, "textSize": 1.2, "replaceItemUniqueId": labels[k]}
-                labels[k] = p.addUserDebugText(recording.name, above, physicsClientId=client, **look)
                 drawn_to[k] = step
         positions = np.stack([recording.state.position[step] for recording, step in now])
         point_window(client, cameras[number], positions.mean(axis=0))

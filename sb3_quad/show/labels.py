@@ -61,11 +61,8 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
 
 def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
     """Pictures of one size in rows of ``columns``, on white; even in width and height, as video codecs ask for."""
-    height, width = pictures[0].shape[:2]
-    rows, columns = -(-len(pictures) // columns), min(columns, len(pictures))
-    high, wide = rows * (height + GAP) - GAP, columns * (width + GAP) - GAP
-    sheet = np.full((high + high % 2, wide + wide % 2, 3), 255, dtype=np.uint8)
-    for number, picture in enumerate(pictures):
-        top, left = (number // columns) * (height + GAP), (number % columns) * (width + GAP)
-        sheet[top : top + height, left : left + width] = picture
-    return sheet
+    padded = [np.pad(picture, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for picture in pictures]
+    columns = min(columns, len(padded))
+    padded += [np.full_like(padded[0], 255)] * (-len(padded) % columns)
+    sheet = np.vstack([np.hstack(padded[first : first + columns]) for first in range(0, len(padded), columns)])
+    return sheet[: sheet.shape[0] // 2 * 2, : sheet.shape[1] // 2 * 2]
