@@ -234,43 +234,31 @@ def _train_stages(
         try:
             write()
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
-                start = job.model_copy(update={"trained_agent": agent}) if agent and stage.begin == "before" else job
                 run = open_run(runs[number]) if number < len(runs) else None
-                finished = _train_stage(stage, start, run, report, partial(note, number), changes)
-                if finished is None or signals.received is not None:
+                if run is not None and run.timesteps >= job.config.n_timesteps:
+                    timesteps, seconds = run.timesteps, read_curve(run.path).seconds[-1] if run.evaluations.is_file() else 0.0
+                else:
+                    start = job.model_copy(update={"trained_agent": agent}) if agent and stage.begin == "before" else job
+                    report(f"{stage.name}: {describe(start)}")
+                    begun = run is not None and (run.not_begun or run.resume_state.is_file())
+                    trained = (
+                        resume(runs[number], report, **changes)
+                        if begun
+                        else train(start, report, on_start=partial(note, number))
+                    )
+                    if trained.exit_code:
+                        break
+                    run, timesteps, seconds = trained.run, trained.model.num_timesteps, trained.seconds
+                if signals.received is not None:
                     break
-                run, timesteps, seconds = finished
                 agent = str(_trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, run))
-                results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
+                results[stage.name] = StageResult(str(run.path), agent, timesteps, float(seconds))
         except KeyboardInterrupt:
             if signals.received is None:
                 raise
     if signals.received is not None:
         report(f"to go on with the whole pipeline: --resume {folder}")
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
-
-
-def _train_stage(
-    stage: Stage,
-    job: TrainingJob,
-    run: RunFolder | None,
-    report: Callable[[str], None],
-    on_start: Callable[[RunFolder], None],
-    changes: Mapping[str, Any],
-) -> tuple[RunFolder, int, float] | None:
-    """Train a stage, or what is left of it.
-
-    :param run: its run folder, if it has one already.
-    :return: its run folder, timesteps and seconds; None if it was interrupted.
-    """
-    if run is not None and run.timesteps >= job.config.n_timesteps:
-        return run, run.timesteps, float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
-    report(f"{stage.name}: {describe(job)}")
-    if run is not None and (run.not_begun or run.resume_state.is_file()):
-        result = resume(str(run.path), report, **changes)
-    else:
-        result = train(job, report, on_start=on_start)
-    return None if result.exit_code else (result.run, result.model.num_timesteps, result.seconds)
 
 
 def _passed_on(stage: Stage, run: RunFolder) -> Path:

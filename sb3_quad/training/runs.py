@@ -143,8 +143,7 @@ def make_folder(path: str | Path, what: str, flag: str) -> None:
         Path(path).mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=path).close()
     except OSError as error:
-        reason = error.strerror or error
-        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
+        raise ConfigError(f"{what} {path}: cannot be written ({error.strerror}); give another with {flag}") from None
 
 
 def _runs(parent: Path, name: str) -> dict[int, Path]:

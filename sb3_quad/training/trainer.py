@@ -263,6 +263,5 @@ def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None,
         raise type(error)(f"{error}{where}") from error
     if isinstance(error, (EOFError, ConnectionError)):
         raise TrainingError(f"{WORKER_ENDED}{where}") from error
-    finite = all(bool(th.isfinite(parameter).all()) for parameter in model.policy.parameters())
-    if isinstance(error, ValueError) and not finite:
+    if isinstance(error, ValueError) and not all(th.isfinite(each).all() for each in model.policy.parameters()):
         raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate{where}") from error

@@ -106,7 +106,7 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
     at_target = at_target.reshape(N_HEADINGS, N_SAMPLES, -1).mean(dim=1)
     seen = _Observations()
     fly(model, TASKS, N_FLIGHTS, seed, max_steps=STEPS, hooks=[seen], **own.in_any_task())
-    flown = _latents(model, np.concatenate(seen.kept))
+    flown = _latents(model, np.concatenate(seen.kept[::EVERY]))
     hover = first_vehicle(own.vehicle).hover_action
     with th.no_grad():
         weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()  # (inputs + 1, actions)
@@ -130,16 +130,13 @@ def _first_layer(model: BaseAlgorithm) -> th.nn.Linear:
 
 
 class _Observations(Hook):
-    """Keeps every third observation of flights."""
+    """Keeps the observations of flights."""
 
     def __init__(self) -> None:
         self.kept: list[Float32Array] = []
-        self._steps = 0
 
     def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
-        if self._steps % EVERY == 0:
-            self.kept.append(observation[flying])
-        self._steps += 1
+        self.kept.append(observation[flying])
 
 
 def _latents(model: BaseAlgorithm, observations: Float32Array) -> th.Tensor:
@@ -156,9 +153,8 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     """Observations at the target, level and at rest: N_HEADINGS headings, N_SAMPLES of each."""
     heading = np.repeat(np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False), N_SAMPLES)
     features = np.zeros((heading.size, OBSERVATION_SIZE))
-    cosine, sine = np.cos(heading), np.sin(heading)
-    rotation = np.stack([cosine, sine, 0 * sine, -sine, cosine, 0 * sine, 0 * sine, 0 * sine, 0 * sine + 1], axis=1)
-    features[:, GROUPS["rotation"]] = rotation  # world to body, row by row
+    cosine, sine, zero = np.cos(heading), np.sin(heading), np.zeros(heading.size)
+    features[:, GROUPS["rotation"]] = np.stack([cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1], axis=1)
     mean, std = _scaling(settings)
     relative, additive = levels(settings.noise)
     features *= 1.0 + relative * rng.standard_normal(features.shape)
@@ -168,6 +164,5 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
 
 def _scaling(settings: FlightSettings) -> tuple[FloatArray, FloatArray]:
     """μ and σ of Eq. 3.16, (18,) both."""
-    given = ((settings.observation_mean, DEFAULT_MEAN), (settings.observation_std, DEFAULT_STD))
-    mean, std = (np.asarray(default if value is None else value, dtype=np.float64) for value, default in given)
-    return mean, std
+    mean = DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
+    return mean, DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
