@@ -1,9 +1,9 @@
 """The gains of the geometric expert as a vehicle's YAML holds them, and how well the expert flies with them."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
@@ -22,6 +22,11 @@ class GeometricMetrics(Frozen):
     tracking_reward: float = Field(description="mean reward of the tracking episodes (Eqs. 4.5-4.9)")
     observation_noise: NonNegativeFloat = Field(description="relative, on what the expert sees")
     seeds: tuple[int, ...] = Field(min_length=1, description="seed of each set of episodes")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _former_names(cls, data: Any) -> Any:  # of the zips of policies that come with the package
+        return {str(key).replace("_success", "_survival"): value for key, value in dict(data).items()}
 
 
 class GeometricGains(Frozen):
