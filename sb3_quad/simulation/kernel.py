@@ -242,7 +242,7 @@ def step(
         if fresh or mean.shape[1] > 1:
             _load_scaling(b, mean, std, noise_level, additive_level)
         fresh = False
-        if _are_neighbours(b, count):
+        if b.row[count - 1] - b.row[0] == count - 1:  # side by side, since rows ascend
             _load_rows(state, b.row[0], count, b.state)
             _load_rows(streams, b.row[0], count, b.stream)
         else:  # lanes behind the last row keep a row of the last block
@@ -306,18 +306,11 @@ def _finite(actions):
 
 
 @compiled
-def _are_neighbours(b, count):
-    """Whether the rows of a block, which ascend, lie side by side in the batch."""
-    return b.row[count - 1] - b.row[0] == count - 1
-
-
-@compiled
 def _write_observations(b, count, integral, ages, frames, out):
     """The observations of a block to its rows of ``out``, float32 (n, size)."""
     if frames.shape[1] == 0:
-        first, together = b.row[0], _are_neighbours(b, count)
         for lane in range(count):
-            i = first + lane if together else b.row[lane]
+            i = b.row[lane]
             for k in range(OBSERVATION_SIZE):
                 out[i, k] = b.feature[k, lane]
         return
