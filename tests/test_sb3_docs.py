@@ -9,15 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import PPO
-from stable_baselines3.common.callbacks import EvalCallback, StopTrainingOnRewardThreshold
 from stable_baselines3.common.env_checker import check_env
-from stable_baselines3.common.env_util import make_vec_env
-from stable_baselines3.common.evaluation import evaluate_policy
-from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
 import sb3_quad  # noqa: F401 - registers the environments
-from sb3_quad.envs import QuadcopterVecEnv
 
 IDS = ("QuadTargetTracking-v0", "QuadStateRecovery-v0")
 RECOVERY = IDS[1]
@@ -45,44 +39,6 @@ def test_getting_started(tmp_path):
     assert vec_env.render("rgb_array").shape == (480, 640, 3)
 
 
-@pytest.mark.parametrize("env_id", IDS)
-def test_the_id_alone_trains_and_is_evaluated(env_id):
-    model = PPO("MlpPolicy", env_id, **SMALL).learn(64)
-    assert model.get_env().env_is_wrapped(Monitor) == [True]
-    rewards, lengths = evaluate_policy(model, Monitor(gym.make(env_id)), n_eval_episodes=2, return_episode_rewards=True)
-    assert all(0 < length <= 1500 for length in lengths) and max(rewards) < 0
-    mean, std = evaluate_policy(model, QuadcopterVecEnv(3, seed=0), n_eval_episodes=3, warn=False)
-    assert mean < 0 <= std
-
-
-def test_eval_callback_logs_successes(tmp_path):
-    below = StopTrainingOnRewardThreshold(reward_threshold=-1e9)
-    callback = EvalCallback(
-        make_vec_env(RECOVERY, n_envs=1),
-        callback_on_new_best=below,
-        log_path=str(tmp_path),
-        eval_freq=64,
-        n_eval_episodes=2,
-        verbose=0,
-    )
-    model = PPO("MlpPolicy", make_vec_env(RECOVERY, n_envs=2), **SMALL).learn(1024, callback=callback)
-    assert model.num_timesteps == 128  # stopped by the first evaluation, which is above that threshold
-    with np.load(tmp_path / "evaluations.npz") as file:
-        assert file["successes"].shape == (1, 2)  # is_success is in the infos
-
-
-def test_vec_normalize_saves_and_loads(tmp_path):
-    vec_env = VecNormalize(make_vec_env(RECOVERY, n_envs=2), norm_obs=True, norm_reward=True, clip_obs=10.0)
-    model = PPO("MlpPolicy", vec_env, **SMALL).learn(256)
-    vec_env.save(tmp_path / "vec_normalize.pkl")
-    loaded = VecNormalize.load(str(tmp_path / "vec_normalize.pkl"), make_vec_env(RECOVERY, n_envs=1))
-    loaded.training = loaded.norm_reward = False
-    obs = loaded.reset()
-    inside = abs(obs) < 10.0
-    np.testing.assert_allclose(loaded.unnormalize_obs(obs)[inside], loaded.get_original_obs()[inside], atol=1e-4)
-    loaded.step(model.predict(obs)[0])
-
-
 @pytest.mark.slow
 def test_record_video(tmp_path):
     """By Gymnasium's own wrapper; what it needs comes with the extra [video]."""
@@ -94,12 +50,3 @@ def test_record_video(tmp_path):
         pass
     env.close()
     assert (tmp_path / "films" / "flight-episode-0.mp4").stat().st_size > 1000
-
-
-@pytest.mark.slow
-def test_processes_of_the_multiprocessing_example():
-    vec_env = SubprocVecEnv([lambda: gym.make(RECOVERY, render_mode="rgb_array") for _ in range(2)], start_method="fork")
-    model = PPO("MlpPolicy", vec_env, **SMALL).learn(total_timesteps=128)
-    action, _states = model.predict(vec_env.reset())
-    assert vec_env.step(action)[0].shape == (2, 18)
-    vec_env.close()

@@ -370,25 +370,3 @@ def test_episodes_side_by_side_have_one_seed_after_the_other():
     assert [len(episode) for episode in abreast] == [2, 2]
     for ours, theirs in zip([each for episode in abreast for each in episode], alone, strict=True):
         np.testing.assert_array_equal(ours.state.array, theirs[0].state.array)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ([], "whose flight"),
-        (["--algo", "ppo", "-i", "itm-recovery"], "one of both"),
-        (["-i", "nowhere.zip"], "nowhere.zip"),
-        (["--algo", "ppo", "-f", "nowhere"], "no run"),
-        (["--algo", "ppoo"], "did you mean 'ppo'"),
-        (["-i", "itm-recovery", "--env", "Pendulum-v1"], "rl_zoo3"),
-        (["-i", "itm-recovery", "--speed", "0"], "--speed"),
-        (["-i", "itm-recovery", "--env-kwargs", "nois:0"], "nois"),
-        (["-i", "itm-recovery", "--size", "big"], "640x480"),
-    ],
-)
-def test_record_video_names_what_is_wrong(arguments, message, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    assert main(["record-video", *arguments]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.count("\n") == 1
-    assert not list(tmp_path.iterdir())

@@ -9,11 +9,10 @@ import numba
 import numpy as np
 import pytest
 from gymnasium.wrappers import TimeLimit
-from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import EvalCallback
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
@@ -510,20 +509,3 @@ def test_unknown_rows_methods_and_attributes_are_refused():
 
 
 # --- Stable-Baselines3
-
-
-def test_ppo_learns_on_it():
-    env = QuadcopterVecEnv(64, seed=0, max_episode_steps=40)
-    model = PPO("MlpPolicy", env, n_steps=32, batch_size=512, n_epochs=1, device="cpu").learn(64 * 32 * 2)
-    assert len(model.ep_info_buffer) > 0 and model.ep_info_buffer[0]["l"] == 40
-
-
-def test_sb3_wrappers_work_on_it():
-    env = VecNormalize(VecMonitor(QuadcopterVecEnv(8, seed=0, max_episode_steps=20)))
-    env.reset()
-    for _ in range(20):
-        observations, rewards, dones, infos = env.step(np.zeros((8, 4)))
-    assert dones.all() and np.isfinite(observations).all() and np.isfinite(rewards).all()
-    assert all(info["episode"]["l"] == 20 for info in infos)
-    env.close()
-    env.close()
