@@ -9,11 +9,12 @@ import numpy as np
 from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.controllers.controller import Controller
 
+LIVES = 20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
 Score = tuple[float, float]  # success rate, mean reward
 
 
@@ -57,6 +58,7 @@ class BestModel(EveryTimesteps):
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read or
         flew another number of episodes.
     :raises ExpertError: at the first evaluation, an expert that does not fit the environment.
+    :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's Monitor.
     """
 
     def __init__(
@@ -127,13 +129,21 @@ class BestModel(EveryTimesteps):
     def _fly(self, group: str, seconds: float) -> Score:
         """Evaluate in one group's environments; write and log the results."""
         env, successes, survivals = self._envs[group], [], []
+        unreported = 0  # ends in a row
 
         def note(local_variables: dict[str, Any], global_variables: dict[str, Any]) -> None:
+            nonlocal unreported
             info = local_variables["info"]
-            # evaluate_policy counts no end that SB3's Monitor does not report, as of one of several lives.
-            if local_variables["done"] and ("episode" in info or not local_variables.get("is_monitor_wrapped")):
-                successes.append(float(info.get("is_success", 0.0)))  # without reports all fail, and reward decides
-                survivals.append(float(info.get("survival", np.nan)))
+            if not local_variables["done"]:
+                return
+            if local_variables.get("is_monitor_wrapped") and "episode" not in info:  # evaluate_policy does not count it
+                unreported += 1
+                if unreported > LIVES * env.num_envs:
+                    raise TrainingError("evaluation: a wrapper drops info['episode'], by which SB3 counts episodes")
+                return
+            unreported = 0
+            successes.append(float(info.get("is_success", 0.0)))  # without reports all fail, and reward decides
+            survivals.append(float(info.get("survival", np.nan)))
 
         rewards, lengths = self._evaluate(self.model, env, note)
         values = {"timesteps": self.num_timesteps, "results": rewards, "ep_lengths": lengths, "successes": successes}

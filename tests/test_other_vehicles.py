@@ -94,7 +94,7 @@ def test_a_suite_flown_by_another_vehicle(here, capsys):
     assert results["scenarios"][0]["vehicle"] == load_vehicle("my.yaml").model_dump(mode="json")
     assert results["scenarios"][0]["reference"] == {}
     assert main([*command, "--vehicle", "hummingbird", "-o", "out"]) == 2  # other flights of the same name
-    assert "another scenario" in capsys.readouterr().err
+    assert "holds results already" in capsys.readouterr().err
 
 
 def test_scenarios_that_a_vehicle_cannot_fly_are_named(here):

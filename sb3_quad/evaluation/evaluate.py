@@ -131,7 +131,7 @@ def evaluate(
                     write_text(place / RESULTS, results(digest).model_dump_json(indent=2))
                 progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
         if done:
-            write_episodes(place, done.values())
+            write_episodes(place, results(None).entries)  # in the order of the suite, whoever was done first
             write_text(place / RESULTS, results(None).model_dump_json(indent=2))
     return results(None)
 
