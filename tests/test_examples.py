@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from PIL import Image
 from stable_baselines3 import PPO
 
 from sb3_quad.base.literals import parse_number
+from sb3_quad.cli import main
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout
@@ -78,6 +80,14 @@ def test_observation_statistics(run, tmp_path):
     assert [line.split()[0] for line in printed] == ["group", "position", "rotation", "velocity", "body_rates"]
     deviations = yaml.safe_load((tmp_path / "sigma.yaml").read_text())["observation_std"]
     assert len(deviations) == 18 and np.sqrt(np.mean(np.square(deviations[:3]))) == pytest.approx(5.7, rel=0.3)  # m
+
+
+def test_robustness_plot(run, tmp_path):
+    asked = ["--suite", "robustness", "--scenario", "mass", "--episodes", "2", "-o", "results", "--no-report"]
+    assert main(["evaluate", "pid", *asked]) == 0
+    run("robustness_plot.py", "results", "robustness.png")
+    width, height = Image.open(tmp_path / "robustness.png").size
+    assert width < height  # one scenario: one column of two panels
 
 
 @pytest.mark.skipif(importlib.util.find_spec("foundation_policy") is None, reason="needs foundation-policy")

@@ -1,0 +1,82 @@
+"""The picture of the README: success and final error over what each scenario of a suite varies.
+
+    sb3-quad evaluate pid geometric itm-robust --suite robustness --scenario mass constant_force -o FOLDER
+    python examples/robustness_plot.py FOLDER robustness.png
+"""
+
+import argparse
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from sb3_quad.evaluation.results import Results, load_results
+from sb3_quad.evaluation.scenarios.load import axis_label
+from sb3_quad.evaluation.scenarios.scenario import Scenario
+
+COLUMNS = 3
+MARKERS = "osD^vP"
+LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
+
+
+def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> None:
+    """Draw the success, in %, with 95 % intervals, and the median final error, in m, of the cells of one scenario."""
+    (key,) = cells[0].cell
+    for number, controller in enumerate(results.controllers):
+        entries = [(cell.cell[key], results.entry(controller.label, cell.name)) for cell in cells]
+        flown = [(x, entry.metrics) for x, entry in entries if entry is not None]
+        style = {"marker": MARKERS[number % len(MARKERS)], "markersize": 5, "color": f"C{number}", "alpha": 0.9}
+        shares = [(x, 100.0 * m.success.value, 100.0 * m.success.low, 100.0 * m.success.high) for x, m in flown if m.success]
+        if shares:
+            x, success, low, high = zip(*shares, strict=True)
+            top.plot(x, success, label=controller.label, **style)
+            top.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
+        # A median over the few flights that are left would flatter: half of them must survive.
+        errors = [(x, max(m.final_error_median, LEAST_ERROR)) for x, m in flown if m.survival.value >= 0.5]
+        if errors:
+            bottom.plot(*zip(*errors, strict=True), **style)
+    top.set_title(cells[0].title.split(":")[0].capitalize(), loc="left", fontweight="bold", fontsize=10)
+    top.set_ylim(-4.0, 104.0)
+    top.tick_params(labelbottom=False)
+    bottom.set_yscale("log")
+    bottom.set_ylim(0.8 * LEAST_ERROR, 10.0)
+    bottom.yaxis.set_major_formatter("{x:g}")
+    bottom.set_xlabel(axis_label(key, cells[0]))
+    for axes in (top, bottom):
+        axes.grid(color="#e4e7ec")
+        axes.spines[["top", "right"]].set_visible(False)
+
+
+def draw(results: Results) -> Figure:
+    """A picture with two panels for each scenario that varies one quantity.
+
+    :raises SystemExit: none of the scenarios does.
+    """
+    groups: dict[str, list[Scenario]] = {}
+    for scenario in results.scenarios:
+        if len(scenario.cell) == 1:
+            groups.setdefault(scenario.group, []).append(scenario)
+    if not groups:
+        raise SystemExit("no scenario of these results varies one quantity; evaluate --suite robustness --scenario mass does")
+    columns = min(COLUMNS, len(groups))
+    rows = -(-len(groups) // columns)
+    figure = Figure(figsize=(4.2 * columns, 4.4 * rows), dpi=120, layout="constrained")
+    for place, (part, cells) in enumerate(zip(figure.subfigures(rows, columns, squeeze=False).flat, groups.values(), strict=False)):
+        top, bottom = part.subplots(2, 1, sharex=True)
+        panel(top, bottom, results, cells)
+        if place % columns == 0:
+            top.set_ylabel("success (%)")
+            bottom.set_ylabel("final error (m)")
+        if place == 0:
+            handles = top.get_legend_handles_labels()
+    figure.legend(*handles, loc="outside upper left", ncols=len(results.controllers), frameon=False)
+    return figure
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="of results, as evaluate leaves it")
+    parser.add_argument("picture", type=Path, help="PNG, SVG or PDF to write")
+    options = parser.parse_args()
+    draw(load_results(options.folder)).savefig(options.picture)
+    print(f"wrote {options.picture}")
