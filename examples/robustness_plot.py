@@ -2,6 +2,8 @@
 
     sb3-quad evaluate pid geometric itm-robust --suite robustness --scenario mass constant_force -o FOLDER
     python examples/robustness_plot.py FOLDER robustness.png
+
+A scenario that varies nothing, or two quantities at once, has no panel.
 """
 
 import argparse
@@ -50,7 +52,7 @@ def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> N
 def draw(results: Results) -> Figure:
     """A picture with two panels for each scenario that varies one quantity.
 
-    :raises SystemExit: none of the scenarios does.
+    :raises SystemExit: no scenario varies one quantity.
     """
     groups: dict[str, list[Scenario]] = {}
     for scenario in results.scenarios:
@@ -61,7 +63,8 @@ def draw(results: Results) -> Figure:
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(4.2 * columns, 4.4 * rows), dpi=120, layout="constrained")
-    for place, (part, cells) in enumerate(zip(figure.subfigures(rows, columns, squeeze=False).flat, groups.values(), strict=False)):
+    places = figure.subfigures(rows, columns, squeeze=False).flat
+    for place, (part, cells) in enumerate(zip(places, groups.values(), strict=False)):
         top, bottom = part.subplots(2, 1, sharex=True)
         panel(top, bottom, results, cells)
         if place % columns == 0:
