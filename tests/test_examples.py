@@ -1,6 +1,7 @@
 """The scripts in examples/, run as a newcomer would run them, but for a short while."""
 
 import importlib.util
+import re
 import runpy
 import sys
 from pathlib import Path
@@ -13,6 +14,7 @@ from stable_baselines3 import PPO
 
 from sb3_quad.base.literals import parse_number
 from sb3_quad.cli import main
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SHORT = ("--timesteps", "100")  # a single rollout
@@ -80,6 +82,21 @@ def test_observation_statistics(run, tmp_path):
     assert [line.split()[0] for line in printed] == ["group", "position", "rotation", "velocity", "body_rates"]
     deviations = yaml.safe_load((tmp_path / "sigma.yaml").read_text())["observation_std"]
     assert len(deviations) == 18 and np.sqrt(np.mean(np.square(deviations[:3]))) == pytest.approx(5.7, rel=0.3)  # m
+
+
+@pytest.mark.slow
+def test_tune_expert(run, tmp_path):
+    poor = load_vehicle("itm").geometric_gains
+    poor = poor.model_copy(update={"position": 0.9 * poor.position, "measured": None})
+    slow = load_vehicle("itm").model_copy(update={"geometric_gains": poor})
+    (tmp_path / "slow.yaml").write_text(yaml.safe_dump(slow.model_dump(mode="json", exclude_none=True)))
+    few = ["slow.yaml", "-o", "tuned.yaml", "--starts", "120", "--targets", "8", "--episodes", "16"]
+    printed = [run("tune_expert.py", *few, "-n", number) for number in ("3", "20")]  # 17 more, from the journal
+    costs = [float(re.search(r"\d gains tried, least cost (-?[\d.]+); saved tuned.yaml", text)[1]) for text in printed]
+    assert costs[1] <= costs[0]
+    tuned = load_vehicle("tuned.yaml")
+    assert tuned.geometric_gains.measured.recovery_episodes == 64
+    assert tuned.model_copy(update={"geometric_gains": poor}) == slow
 
 
 def test_robustness_plot(run, tmp_path):

@@ -15,8 +15,8 @@ Purpose = Literal[
     "evaluation",  # along the way
     "trim",  # before and after an agent is trimmed
     "table",  # at the end of a run
-    "search",  # of tune-expert
-    "expert",  # tune-expert at its end, check-vehicle
+    "search",  # for gains: examples/tune_expert.py
+    "expert",  # at the end of that search, and of check-vehicle
     "offset",  # that adaptive scaling cancels
     "card",  # of published policies
     "suite",  # of scenarios

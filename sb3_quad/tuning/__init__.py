@@ -1,4 +1,4 @@
-"""Searches for hyperparameters and for an expert's gains, by Optuna."""
+"""Searches for hyperparameters, by Optuna."""
 
 import warnings
 

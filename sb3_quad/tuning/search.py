@@ -1,4 +1,4 @@
-"""The search for hyperparameters: trials, each a training of its own, in a study that may be shared and resumed."""
+"""The search for hyperparameters: trials, each a training of its own, in a study of Optuna that may be shared and resumed."""
 
 import hashlib
 import json
@@ -6,24 +6,41 @@ import math
 import os
 import platform
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from optuna import Trial
-from optuna.exceptions import OptunaError, TrialPruned
-from optuna.trial import FrozenTrial
+import numpy as np
+import optuna
+from optuna.distributions import BaseDistribution, distribution_to_json
+from optuna.pruners import BasePruner, MedianPruner, NopPruner, SuccessiveHalvingPruner
+from optuna.samplers import BaseSampler, CmaEsSampler, RandomSampler, TPESampler
+from optuna.storages import JournalStorage
+from optuna.storages.journal import JournalFileBackend
+from optuna.trial import FrozenTrial, TrialState
 
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
+from sb3_quad.base.imports import require
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
 from sb3_quad.tuning.space import SearchSpace
-from sb3_quad.tuning.study import OWNER, PRUNERS, SAMPLERS, NumberedSampler, open_study, retry_dead_trials
 
-BEGUN_WITH, SETTINGS, SUCCESS, REWARD, RUN, ERROR = "begun_with", "settings", "success_rate", "mean_reward", "run", "error"
+SAMPLERS: Mapping[str, Callable[[int, int], BaseSampler]] = {  # from a seed and n_startup_trials
+    "tpe": lambda seed, n: TPESampler(seed=seed, n_startup_trials=n, multivariate=True, constant_liar=True),
+    "random": lambda seed, n: RandomSampler(seed=seed),
+    "cmaes": lambda seed, n: CmaEsSampler(seed=seed, n_startup_trials=n, warn_independent_sampling=False),
+}
+PRUNERS: Mapping[str, Callable[[int, int], BasePruner]] = {  # from n_startup_trials and n_evaluations
+    "median": lambda n, evaluations: MedianPruner(n_startup_trials=n, n_warmup_steps=evaluations // 3),
+    "halving": lambda n, evaluations: SuccessiveHalvingPruner(min_resource=1),
+    "none": lambda n, evaluations: NopPruner(),
+}
+BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials share
+OWNER = "owner"  # user attribute of a trial: the machine and the process that train it
+SETTINGS, SUCCESS, REWARD, RUN, ERROR = "settings", "success_rate", "mean_reward", "run", "error"  # others
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
 HOPELESS = 5  # so many trials failing at first, and none not: the settings are at fault, not what is varied
 
@@ -37,8 +54,8 @@ class Search:
 
     :param job: what every trial does, but for the settings that are varied; its run folders go to its ``log_folder``.
     :param name: of the study, within its storage.
-    :param storage: see :func:`sb3_quad.tuning.study.open_study`.
-    :param sampler: one of :data:`sb3_quad.tuning.study.SAMPLERS`; ``pruner`` one of its PRUNERS.
+    :param storage: a database's URL (with ``://``), or else the path of a journal file. A study that it holds is continued.
+    :param sampler: one of :data:`SAMPLERS`; ``pruner`` one of :data:`PRUNERS`.
     :param n_startup_trials: sampled at random before the sampler begins, and finished before the median pruner does.
     :param n_evaluations: of each trial, the last at its end.
     :raises ConfigError: an option that there is not; a storage that cannot be used, or that holds a study of this name of
@@ -50,7 +67,7 @@ class Search:
         job: TrainingJob,
         space: SearchSpace,
         name: str,
-        storage: str | Path | None = None,
+        storage: str | Path,
         sampler: str = "tpe",
         pruner: str = "median",
         n_startup_trials: int = 10,
@@ -63,17 +80,21 @@ class Search:
             raise ConfigError("n_evaluations and eval_episodes must be at least 1, n_startup_trials at least 0")
         self.job, self.space, self.name, self.storage = job, space, name, storage
         self.n_evaluations = n_evaluations
-        wanted = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._kind().items()}
-        self.study, known = open_study(name, storage, "maximize", (BEGUN_WITH, wanted), space.start())
-        self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
-        self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
-        where = f"study {name} in {storage}"
+        wanted = {key: json.dumps(value, sort_keys=True, default=str) for key, value in self._shared().items()}
+        self.study = open_study(name, storage)
+        if BEGUN_WITH not in self.study.user_attrs and not self.study.trials:
+            self.study.set_user_attr(BEGUN_WITH, wanted)
+            if (first := space.start()) is not None:
+                self.study.enqueue_trial(first)
+        known, where = self.study.user_attrs.get(BEGUN_WITH), f"study {name} in {storage}"
         if not isinstance(known, dict):
             raise ConfigError(f"{where}: is not of tune; give another --study-name")
         differing = ", ".join(sorted(key for key in {**known, **wanted} if known.get(key) != wanted.get(key)))
         if differing:
             other = f"was begun with other settings ({differing})"
             raise ConfigError(f"{where}: {other}; give the same again, or another --study-name")
+        self.study.pruner = PRUNERS[pruner](n_startup_trials, n_evaluations)
+        self.study.sampler = NumberedSampler(sampler, job.seed, n_startup_trials)
 
     def try_one(self, most: int | None) -> FrozenTrial | None:
         """Train once.
@@ -82,15 +103,16 @@ class Search:
         :return: the trial that ended; None: the study has as many as it may.
         :raises ConfigError: a storage that fails meanwhile.
         """
-        ended: list[FrozenTrial] = []
         try:
             retry_dead_trials(self.study)
             if most is not None and len(self.trials("COMPLETE", "PRUNED", "RUNNING")) >= most:
                 return None
-            self.study.optimize(self._train, 1, catch=(Exception,), callbacks=[lambda study, trial: ended.append(trial)])
-        except (OSError, OptunaError) as error:
+            trial = self.study.ask(dict(self.space.dimensions))
+            trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
+            self.study.tell(trial, *self._outcome(trial))
+            return self.study.get_trials(deepcopy=False)[trial.number]
+        except (OSError, optuna.exceptions.OptunaError) as error:
             raise ConfigError(f"storage {self.storage}: fails ({type(error).__name__}: {one_line(error)})") from error
-        return ended[0]
 
     def trials(self, *states: str) -> list[FrozenTrial]:
         """The trials in these states, such as ``COMPLETE``; all that ended by default."""
@@ -102,38 +124,34 @@ class Search:
         """The best trial that was finished, of any process; None if there is none."""
         return max(self.trials("COMPLETE"), key=lambda trial: trial.value or 0.0, default=None)
 
-    def _train(self, trial: Trial) -> float:
-        """Train as a trial says; its value. Whatever a choice of settings leads to, the next one may fare better."""
-        trial.set_user_attr(OWNER, [platform.node(), os.getpid()])
+    def _outcome(self, trial: optuna.Trial) -> tuple[float | None, TrialState]:
+        """Train as a trial says; its value and state. Whatever a choice of settings leads to, the next may fare better."""
         try:
-            return self._value(trial)
-        except TrialPruned:
-            raise
+            value = self._value(trial)
+            return value, TrialState.PRUNED if value is None else TrialState.COMPLETE
         except Exception as error:
             trial.set_user_attr(ERROR, f"{type(error).__name__}: {one_line(error)}")
-            raise
         except KeyboardInterrupt:
             trial.set_user_attr(ERROR, INTERRUPTED)
             self.study.enqueue_trial(trial.params)
-            raise TrainingError(INTERRUPTED) from None
+        return None, TrialState.FAIL
 
-    def _value(self, trial: Trial) -> float:
+    def _value(self, trial: optuna.Trial) -> float | None:
+        """What a trial's last evaluation was worth; None: it was pruned."""
         known, count = self.job.config, self.n_evaluations
-        settings = self.space.suggest(trial)
+        settings = self.space.settings(trial.params)
         trial.set_user_attr(SETTINGS, json.dumps(settings))
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
         rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
         every = total // count + 1 if count > 1 else -1  # never due with the last timestep: that one follows the last update
-        evaluations: list[tuple[float, float]] = []
-
-        def value() -> float:
-            success, reward = evaluations[-1]
-            return reward if known.task is None else score(success, reward, self.job.eval_episodes)
+        evaluations: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
-            evaluations.append((success, reward))
-            trial.report(value(), len(evaluations))
+            evaluations.append(reward if known.task is None else score(success, reward, self.job.eval_episodes))
+            trial.report(evaluations[-1], len(evaluations))
+            trial.set_user_attr(SUCCESS, success)
+            trial.set_user_attr(REWARD, reward)
             return len(evaluations) >= count or not trial.should_prune()
 
         with warnings.catch_warnings():
@@ -146,15 +164,13 @@ class Search:
             )
         if result.exit_code != 0:
             raise KeyboardInterrupt
-        trial.set_user_attr(SUCCESS, evaluations[-1][0])
-        trial.set_user_attr(REWARD, evaluations[-1][1])
         if result.model.num_timesteps < total:
-            raise TrialPruned
-        if not math.isfinite(value()):
-            raise TrainingError(f"the mean reward is {evaluations[-1][1]}")
-        return value()
+            return None
+        if not math.isfinite(evaluations[-1]):
+            raise TrainingError(f"the mean reward is {trial.user_attrs[REWARD]}")
+        return evaluations[-1]
 
-    def _kind(self) -> dict[str, Any]:
+    def _shared(self) -> dict[str, Any]:
         """What all trials of a study must share to be compared."""
         job, config, agent = self.job, self.job.config, None
         if job.trained_agent is not None:
@@ -166,12 +182,67 @@ class Search:
             "algo": config.algo,
             "env": config.env_id,
             **config.settings,
-            "search_space": {name: repr(each) for name, each in self.space.dimensions.items()},
+            "search_space": {name: distribution_to_json(each) for name, each in self.space.dimensions.items()},
             "seed": job.seed,
             "trained_agent": agent,
             "n_evaluations": self.n_evaluations,
             "eval_episodes": job.eval_episodes,
         }
+
+
+class NumberedSampler(BaseSampler):
+    """One of :data:`SAMPLERS`, made anew for each trial, from a seed, the trial's number and the trials known.
+
+    So processes that share a study propose different trials, and a study that is resumed goes on as if never left.
+    """
+
+    def __init__(self, kind: str, seed: int, n_startup_trials: int) -> None:
+        self._kind, self._seed, self._startup = kind, seed, n_startup_trials
+
+    def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
+        own = int(np.random.SeedSequence([self._seed, trial.number]).generate_state(1)[0])
+        self._sampler = SAMPLERS[self._kind](own, self._startup)
+        return self._sampler.infer_relative_search_space(study, trial)
+
+    def sample_relative(self, *arguments: Any) -> dict[str, Any]:
+        return self._sampler.sample_relative(*arguments)
+
+    def sample_independent(self, *arguments: Any) -> Any:
+        return self._sampler.sample_independent(*arguments)
+
+
+def open_study(name: str, storage: str | Path) -> optuna.Study:
+    """The study of this name, also one that the storage holds already.
+
+    :raises ConfigError: cmaes is missing; a storage that cannot be used, such as a file that is no journal.
+    """
+    require("cmaes", "tune", "a search")  # Optuna imports it only when it first samples
+    try:
+        opened: Any = str(storage)
+        if "://" not in opened:
+            path = Path(storage)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if path.is_file() and path.read_bytes()[-1:] not in (b"", b"\n"):  # Optuna would append to that line
+                raise ConfigError("the last line is cut, as by a full disk, or it is no journal; remove that line")
+            opened = JournalStorage(JournalFileBackend(str(storage)))
+        return optuna.create_study(study_name=name, storage=opened, direction="maximize", load_if_exists=True)
+    except Exception as error:  # databases and damaged journals raise what they like
+        reason = f"{type(error).__name__}: {one_line(error)}"
+        raise ConfigError(f"storage {storage}: cannot be used ({reason})") from None
+
+
+def retry_dead_trials(study: optuna.Study) -> None:
+    """Have the trials tried again whose process on this machine is gone."""
+    for trial in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
+        machine, process = trial.user_attrs.get(OWNER, ["", 0])
+        if machine == platform.node():
+            try:
+                os.kill(process, 0)  # does nothing but fail where there is none
+            except ProcessLookupError:
+                study.tell(trial.number, state=TrialState.FAIL)
+                study.enqueue_trial(trial.params)
+            except PermissionError:  # another user's
+                pass
 
 
 def try_one_of(

@@ -10,7 +10,7 @@ value                                   meaning
 
 Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapping, and ``n_minibatches`` stands for the
 ``batch_size`` that divides a rollout into so many. Where the settings have ``lin_x``, the x is varied. Settings of which only
-whole numbers are known to fit get whole numbers; ``whole: true`` beside ``low`` asks for them elsewhere.
+whole numbers are known to fit get whole numbers, others four significant digits.
 """
 
 import json
@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from optuna import Trial
-from pydantic import Field, model_validator
+from optuna.distributions import BaseDistribution, CategoricalDistribution, FloatDistribution, IntDistribution
+from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_number, parse_value
@@ -35,83 +35,21 @@ MINIBATCHES = "n_minibatches"
 MAPPINGS = ("policy_kwargs", "env_kwargs")
 JOB_SETTINGS = ("n_envs", "expert")
 LINEAR = "lin_"
-Parameter = float | int | str | bool | None  # as Optuna holds it
-
-
-class Factor(Frozen):
-    """A number around what the settings have, on a logarithmic scale."""
-
-    around: float = Field(gt=1)
 
 
 class Interval(Frozen):
-    """A number between two others.
-
-    :param log: on a logarithmic scale.
-    :param whole: whole numbers only; others have four significant digits.
-    :param schedule: written ``lin_x``: falls linearly from x to 0 over the training.
-    """
+    """A number between two others; ``whole``: a whole one also where the setting need not be."""
 
     low: float
     high: float
     log: bool = False
     whole: bool = False
-    schedule: bool = False
-
-    @model_validator(mode="after")
-    def _check(self) -> "Interval":
-        if self.low >= self.high:
-            raise ValueError(f"low {self.low:g} must be below high {self.high:g}")
-        if self.log and self.low <= 0:
-            raise ValueError(f"low {self.low:g} must be above 0 on a logarithmic scale")
-        if self.whole and not (self.low.is_integer() and self.high.is_integer()):
-            raise ValueError(f"low {self.low:g} and high {self.high:g} must be whole numbers")
-        return self
-
-    def suggest(self, trial: Trial, name: str) -> Parameter:
-        """What a trial has under a name."""
-        if self.whole:
-            return trial.suggest_int(name, int(self.low), int(self.high), log=self.log)
-        return trial.suggest_float(name, self.low, self.high, log=self.log)
-
-    def setting(self, parameter: Any) -> Any:
-        """The value that a parameter stands for, as the settings hold it."""
-        if self.whole:
-            return parameter
-        written = f"{min(max(float(f'{parameter:.4g}'), self.low), self.high):.4g}"
-        return f"{LINEAR}{written}" if self.schedule else float(written)
-
-    def parameter(self, setting: Any) -> Parameter:
-        """The parameter that stands for a value of the settings.
-
-        :raises ValueError: the value is not among those of the space.
-        """
-        number = _number_of(setting)
-        if number is None or not self.low <= number <= self.high:
-            raise ValueError(f"{setting!r} is not between {self.low:g} and {self.high:g}")
-        return int(number) if self.whole else float(number)
 
 
-class Choice(Frozen):
-    """One of several values, which may be lists and mappings too. Its methods are those of :class:`Interval`."""
+class Factor(Frozen):
+    """A number around the one that the settings have, at most so many times as great or small."""
 
-    values: tuple[Any, ...]
-
-    @property
-    def labels(self) -> list[Parameter]:
-        """The values as Optuna holds them: plain ones as they are, others as JSON."""
-        plain = (bool, int, float, str, type(None))
-        return [value if isinstance(value, plain) else json.dumps(value, default=str) for value in self.values]
-
-    def suggest(self, trial: Trial, name: str) -> Parameter:
-        return trial.suggest_categorical(name, self.labels)
-
-    def setting(self, parameter: Any) -> Any:
-        return self.values[self.labels.index(parameter)]
-
-    def parameter(self, setting: Any) -> Parameter:
-        (label,) = Choice(values=(setting,)).labels
-        return self.labels[self.labels.index(label)]
+    around: float = Field(gt=1)
 
 
 @dataclass(frozen=True)
@@ -120,33 +58,49 @@ class SearchSpace:
 
     :param algo: the algorithm whose settings these are.
     :param base: all settings, as a search starts from them.
+    :param dimensions: what Optuna samples from. Values of lists that are no plain ones are there as JSON.
     """
 
     algo: str
     base: Mapping[str, Any]
-    dimensions: Mapping[str, Interval | Choice]
+    dimensions: Mapping[str, BaseDistribution]
 
-    def suggest(self, trial: Trial) -> dict[str, Any]:
-        """All settings of a trial: plain values, as YAML holds them."""
-        return self.settings({name: each.suggest(trial, name) for name, each in self.dimensions.items()})
-
-    def settings(self, parameters: Mapping[str, Parameter]) -> dict[str, Any]:
-        """All settings of a trial with these parameters."""
+    def settings(self, parameters: Mapping[str, Any]) -> dict[str, Any]:
+        """All settings of a trial with these parameters: plain values, as YAML holds them."""
         changed = dict(self.base)
         for name, parameter in parameters.items():
             outer, dot, inner = name.partition(".")
-            value = self.dimensions[name].setting(parameter)
+            value = self._setting(name, parameter)
             changed[outer] = {**_plain(changed.get(outer)), inner: value} if dot else value
         if MINIBATCHES in changed:  # of the same size, but for the last, which may be smaller
             changed["batch_size"] = math.ceil(_rollout(self.algo, changed) / changed.pop(MINIBATCHES))
         return changed
 
-    def start(self) -> dict[str, Parameter] | None:
+    def start(self) -> dict[str, Any] | None:
         """The parameters that stand for the settings as they are; None if one of these lies outside the space."""
-        try:
-            return {name: each.parameter(current(self.algo, self.base, name)) for name, each in self.dimensions.items()}
-        except ValueError:
-            return None
+        found: dict[str, Any] = {}
+        for name, each in self.dimensions.items():
+            value = current(self.algo, self.base, name)
+            if isinstance(each, CategoricalDistribution):
+                found[name], inside = _label(value), _label(value) in each.choices
+            else:
+                number, whole = _number_of(value), isinstance(each, IntDistribution)
+                inside = number is not None and each.low <= number <= each.high  # type: ignore[attr-defined]
+                found[name] = number if number is None else int(number) if whole else float(number)
+            if not inside:
+                return None
+        return found
+
+    def _setting(self, name: str, parameter: Any) -> Any:
+        """The value that a parameter stands for."""
+        dimension = self.dimensions[name]
+        if isinstance(dimension, CategoricalDistribution):
+            return json.loads(parameter) if isinstance(parameter, str) and parameter[:1] in ("[", "{") else parameter
+        if not isinstance(dimension, FloatDistribution):
+            return parameter
+        written = f"{min(max(float(f'{parameter:.4g}'), dimension.low), dimension.high):.4g}"
+        present = current(self.algo, self.base, name)
+        return f"{LINEAR}{written}" if isinstance(present, str) and present.startswith(LINEAR) else float(written)
 
 
 def load_space(algo: str, settings: Mapping[str, Any], source: str | Path | None = None) -> SearchSpace:
@@ -160,8 +114,7 @@ def load_space(algo: str, settings: Mapping[str, Any], source: str | Path | None
         raise ConfigError(f"{where}: must hold settings with their ranges, such as 'learning_rate: {{around: 5}}'")
     parameters = constructor_parameters(get_algorithm(algo))
     on_policy = {"n_steps", "batch_size"} <= parameters.keys() and not is_off_policy(get_algorithm(algo))
-    divides = [MINIBATCHES] if on_policy else []
-    valid = [*parameters, *JOB_SETTINGS, *divides]
+    valid = [*parameters, *JOB_SETTINGS, *([MINIBATCHES] if on_policy else [])]
     for name in content:
         outer, dot, inner = str(name).partition(".")
         if not (name in valid or (dot and inner and outer in MAPPINGS)):
@@ -184,26 +137,32 @@ def current(algo: str, settings: Mapping[str, Any], name: str) -> Any:
     return settings.get(name, default.get(name))
 
 
-def _dimension(algo: str, settings: Mapping[str, Any], name: str, given: Any, where: str) -> Interval | Choice:
-    if isinstance(given, list):
-        if not given:
-            raise ConfigError(f"{where}: the list is empty")
-        return Choice(values=tuple(given))
+def _dimension(algo: str, settings: Mapping[str, Any], name: str, given: Any, where: str) -> BaseDistribution:
+    if isinstance(given, list) and given:
+        return CategoricalDistribution([_label(value) for value in given])
     if not isinstance(given, dict):
         raise ConfigError(f"{where}: {given!r} must be {{low: …, high: …}}, {{around: …}} or a list of values")
     value = current(algo, settings, name)
     parameter = constructor_parameters(get_algorithm(algo)).get(name)
     whole = name in (MINIBATCHES, "n_envs") or (parameter is not None and takes_whole(parameter))
-    schedule = isinstance(value, str) and value.startswith(LINEAR)
-    if "around" not in given:
-        return validate(Interval, {"whole": whole, "schedule": schedule, **given}, where)
-    factor, middle = validate(Factor, given, where).around, _number_of(value)
-    if middle is None or middle <= 0:
-        raise ConfigError(f"{where}: around needs a number above 0 in the settings, not {value!r}; give low and high")
-    low, high = middle / factor, middle * factor
-    if whole:
-        low, high = max(1, math.floor(low)), math.ceil(high)
-    return Interval.model_construct(low=low, high=high, log=True, whole=whole, schedule=schedule)
+    if "around" in given:
+        factor, middle = validate(Factor, given, where).around, _number_of(value)
+        if middle is None or middle <= 0:
+            raise ConfigError(f"{where}: around needs a number above 0 in the settings, not {value!r}; give low and high")
+        bounds = Interval(low=middle / factor, high=middle * factor, log=True)
+        if whole:
+            bounds = Interval(low=max(1, math.floor(bounds.low)), high=math.ceil(bounds.high), log=True)
+    else:
+        bounds = validate(Interval, given, where)
+    whole = whole or bounds.whole
+    if whole and not (bounds.low.is_integer() and bounds.high.is_integer()):
+        raise ConfigError(f"{where}: low {bounds.low:g} and high {bounds.high:g} must be whole numbers")
+    try:
+        if whole:
+            return IntDistribution(int(bounds.low), int(bounds.high), bounds.log)
+        return FloatDistribution(bounds.low, bounds.high, bounds.log)
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}") from None
 
 
 def _rollout(algo: str, settings: Mapping[str, Any]) -> float:
@@ -215,6 +174,11 @@ def _plain(value: Any) -> dict[str, Any]:
     """A mapping of the settings with its values as they are written, also one written ``dict(…)``."""
     found = parse_value(value) if isinstance(value, str) else value
     return dict(found) if isinstance(found, dict) else {}
+
+
+def _label(value: Any) -> Any:
+    """A value of a list as Optuna holds it: a plain one as it is, others as JSON."""
+    return value if isinstance(value, (bool, int, float, str, type(None))) else json.dumps(value)
 
 
 def _number_of(value: Any) -> float | None:

@@ -57,7 +57,6 @@ BASES = {
     "sweep": "sweep.yaml --dry-run",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
     "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 --n-evaluations 1",
-    "tune-expert": "-n 1 --starts 60 --targets 1 --no-progress",
 }
 Case = tuple[str, list[str], dict[str, str]]  # what it is, a command, files
 

@@ -16,7 +16,6 @@ from stable_baselines3 import PPO
 from sb3_quad.cli.app import main
 from sb3_quad.cli.commands import plot
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.tuning.expert import ExpertSearch
 
 CORPUS = yaml.safe_load(Path(__file__).with_name("corpus.yaml").read_text(encoding="utf-8"))
 
@@ -104,12 +103,3 @@ def test_an_agent_whose_parameters_are_not_finite_is_refused(here, capsys):
     agent.save("agent.zip")
     assert main(["enjoy", "agent.zip", "--no-render"]) == 2
     assert "agent.zip: action_net.bias is not finite" in capsys.readouterr().err
-
-
-def test_a_full_disk_in_a_search_of_gains_names_the_journal(here, monkeypatch, capsys):
-    def run(search, trials, after_each):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(ExpertSearch, "run", run)
-    assert main(["tune-expert", "-n", "1", "--journal", "search.journal"]) == 2
-    assert "error: journal search.journal: cannot be written (No space left on device)" in capsys.readouterr().err

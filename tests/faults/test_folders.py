@@ -18,24 +18,20 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.evaluation.results import load_results
 from sb3_quad.report import card
-from sb3_quad.tuning.study import OWNER, open_study, retry_dead_trials
-
-
-def study_in(path):
-    return open_study("search", path, "maximize", ("begun_with", "these"), None)[0]
+from sb3_quad.tuning.search import OWNER, open_study, retry_dead_trials
 
 
 def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
     path = tmp_path / "notes.txt"
-    path.write_text("remember the milk")
+    path.write_text("buy milk")
     with pytest.raises(ConfigError, match="cannot be used"):
-        study_in(path)
-    assert path.read_text() == "remember the milk"
+        open_study("search", path)
+    assert path.read_text() == "buy milk"
 
 
 @pytest.mark.parametrize(("process", "dead"), [(os.getpid(), False), (2**22 + 1, True)], ids=("this process", "no process"))
 def test_trials_without_a_process_are_tried_again(tmp_path, process, dead):
-    study = study_in(tmp_path / "study.log")
+    study = open_study("search", tmp_path / "study.log")
     study.ask().set_user_attr(OWNER, [platform.node(), process])
     retry_dead_trials(study)
     assert [trial.state.name for trial in study.trials] == (["FAIL", "WAITING"] if dead else ["RUNNING"])

@@ -213,7 +213,7 @@ def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
     monkeypatch.chdir(own)
     parameters = load_vehicle("itm").model_dump(mode="json") | {"name": name}
     Path("foreign.yaml").write_text(json.dumps(parameters))
-    assert main(["tune-expert", "--vehicle", "foreign.yaml", "--trials", "1", "--starts", "60", "--targets", "1"]) == 2
+    assert main(["check-vehicle", "foreign.yaml"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("error: foreign.yaml: name: ")
     with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:

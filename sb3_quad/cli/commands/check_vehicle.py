@@ -47,5 +47,5 @@ def run(options: argparse.Namespace) -> int:
         true_state = {"vehicle": vehicle, "noise": 0.0}
         print_tables(controllers, true_state, options.episodes, seed_for("expert", options.seed))
         if vehicle.geometric_gains is None:
-            print(f"to search for gains, which are mostly better: sb3-quad tune-expert --vehicle {options.vehicle}")
+            print(f"to search for gains, which are mostly better: python examples/tune_expert.py {options.vehicle}")
     return 0
