@@ -311,7 +311,7 @@ def test_the_benchmark_writes_what_it_prints(tmp_path, capsys):
     arguments = ["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training"]
     assert main([*arguments, "--output", str(output)]) == 0
     content = json.loads(output.read_text())
-    assert {"processor", "cores", "versions", "threads"} <= content["machine"].keys()
+    assert {"machine", "python", "versions", "threads"} <= content["machine"].keys()
     assert [entry["n_envs"] for entry in content["results"]] == [1, 2, 2, 64, 64]
     assert all(entry["rate"] > 0 for entry in content["results"])
     assert f"{content['results'][-1]['rate']:,.0f}" in capsys.readouterr().out

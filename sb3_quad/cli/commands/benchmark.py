@@ -8,11 +8,25 @@ examples:
 """
 
 import argparse
+import itertools
 import json
-from dataclasses import asdict
+import platform
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, closing
+from functools import partial
+from importlib import metadata
+from timeit import Timer
+from typing import Any
 
 from sb3_quad.base.files import write_text
 from sb3_quad.cli.parser import YES_OR_NO, Parser, above_zero, positive
+
+ENV_ID = "QuadTargetTracking-v0"
+TRAINED = "QuadStateRecovery-v0"  # by train without arguments
+REPETITIONS = 5
+PACKAGES = ("sb3_quad", "stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
+Rates = dict[str, list[float]]  # control steps per second of each repetition, all environments together
 
 
 def add_arguments(parser: Parser) -> None:
@@ -23,35 +37,119 @@ def add_arguments(parser: Parser) -> None:
     add("--algo", nargs="+", default=["dagger", "ppo_bc"], help="algorithms of the training loops (dagger ppo_bc)")
     add("-conf", "--conf-file", metavar="FILE", help="its settings (those of train without arguments)")
     add("--training", help="only, or no, training loops: their rollouts and updates", **YES_OR_NO)
-    add("--output", metavar="FILE", help="write everything as JSON, with machine, versions and thread counts")
+    add("--output", metavar="FILE", help="write everything as JSON, with versions and thread counts")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure, print, write. Returns the exit code."""
+    """Measure one way after another, print, write. Returns the exit code."""
+    import numba
+    import numpy as np
+    import torch
+
     from sb3_quad.cli.output import console
     from sb3_quad.evaluation.tables import text_table
-    from sb3_quad.training.benchmark import TRAINED, machine, single, training_loop, vectorised
     from sb3_quad.training.config import load_config
 
-    screen = console()
+    screen, found = console(), []
     loops = [] if options.training is False else [load_config(algo, TRAINED, options.conf_file) for algo in options.algo]
-    measurements = []
-    if options.training is not True:
-        with screen.status("one PyBullet environment"):
-            measurements.extend(single(options.seconds))
-        randomize = load_config("dagger", TRAINED).env_kwargs["randomize"]
-        kinds = [("dummy", options.n_envs, None), ("subproc", options.n_envs, None)]
-        for kind, n_envs, randomized in [*kinds, *(("batch", size, randomize) for size in options.sizes)]:
-            with screen.status(f"{kind}, {n_envs}"):
-                measurements.extend(vectorised(kind, n_envs, options.seconds, randomized))
-    for config in loops:
-        with screen.status(f"training loop of {config.algo}"):
-            measurements.extend(training_loop(config))
-    first = measurements[0].rate
-    rows = [(each.name, f"{each.n_envs:,}", f"{each.rate:,.0f}", f"{each.rate / first:,.1f} x") for each in measurements]
+    with screen.status("measuring"):
+        if options.training is not True:
+            for n_envs, rates in _steps(options.sizes, options.n_envs, options.seconds):
+                found += [(name, n_envs, each) for name, each in rates.items()]
+        for config in loops:
+            found += [(f"{config.algo}, {part}", config.n_envs, each) for part, each in _loop(config).items()]
+    results = [{"name": name, "n_envs": n, "rate": float(np.median(each)), "rates": each} for name, n, each in found]
+    first = results[0]["rate"]
+    rows = [(r["name"], f"{r['n_envs']:,}", f"{r['rate']:,.0f}", f"{r['rate'] / first:,.1f} x") for r in results]
     screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
     if options.output is not None:
-        content = {"machine": machine(), "results": [asdict(each) for each in measurements]}
-        write_text(options.output, json.dumps(content, indent=2) + "\n")
+        machine = {
+            "machine": platform.platform(),
+            "python": platform.python_version(),
+            "versions": {package: metadata.version(package) for package in PACKAGES},
+            "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
+        }
+        write_text(options.output, json.dumps({"machine": machine, "results": results}, indent=2) + "\n")
         print(f"written to {options.output}")
     return 0
+
+
+def _steps(sizes: list[int], n_envs: int, seconds: float) -> Iterator[tuple[int, Rates]]:
+    """Environments with random actions: physics, noise, reward, resets, infos. By their number, the rates of each kind."""
+    import gymnasium
+    from gymnasium.wrappers import Autoreset
+
+    from sb3_quad.training.config import build_config, load_config
+    from sb3_quad.training.environments import make_environments
+
+    def vectorised(kind: str, n: int, **keywords: Any) -> Any:
+        settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": keywords}
+        return closing(make_environments(build_config("ppo", ENV_ID, settings), n, 0))
+
+    randomize = load_config("dagger", TRAINED).env_kwargs["randomize"]
+    with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
+        env.reset(seed=0)
+        yield 1, _rates({"PyBullet, one environment": env}, (4,), seconds)
+    for kind, name in (("dummy", "DummyVecEnv"), ("subproc", "SubprocVecEnv")):
+        with vectorised(kind, n_envs) as env:
+            env.reset()
+            yield n_envs, _rates({f"PyBullet, {name}": env}, (n_envs, 4), seconds)
+    for size in sizes:
+        with ExitStack() as stack:
+            still, random = (stack.enter_context(vectorised("batch", size, randomize=each)) for each in (None, randomize))
+            for env in (still, random):
+                env.reset()
+            yield size, _rates({"batch": still, "batch, random worlds": random}, (size, 4), seconds)
+
+
+def _rates(envs: dict[str, Any], shape: tuple[int, ...], seconds: float) -> Rates:
+    """Each environment for so many seconds; they take turns, since the speed of a shared machine changes by the second."""
+    import numpy as np
+
+    actions = itertools.cycle(np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32))
+    timers = {name: Timer(partial(lambda step: step(next(actions)), env.step)) for name, env in envs.items()}
+    counts = {}
+    for name, timer in timers.items():
+        timer.timeit(3)  # compiles, fills caches
+        count, elapsed = timer.autorange()
+        counts[name] = max(1, round(count * seconds / REPETITIONS / elapsed))
+    found: Rates = {name: [] for name in envs}
+    for _ in range(REPETITIONS):
+        for name, timer in timers.items():
+            found[name].append(counts[name] * int(np.prod(shape)) / shape[-1] / timer.timeit(counts[name]))
+    return found
+
+
+def _loop(config: Any) -> Rates:
+    """A whole training loop with the settings' own sizes; the first rollout and update, which compile, are left out.
+
+    :raises ConfigError: an off-policy algorithm, whose loop has no rollouts and updates to tell apart.
+    """
+    import numpy as np
+    from stable_baselines3.common.callbacks import BaseCallback
+
+    from sb3_quad.base.errors import ConfigError
+    from sb3_quad.training.environments import make_environments
+    from sb3_quad.training.job import TrainingJob
+    from sb3_quad.training.trainer import build_model
+
+    class Clock(BaseCallback):
+        """When rollouts begin and end; an update lies between two of them."""
+
+        def _note(self) -> None:
+            times.append(time.perf_counter())
+
+        _on_rollout_start = _on_rollout_end = _on_training_end = _note
+
+        def _on_step(self) -> bool:
+            return True
+
+    if config.is_off_policy:
+        raise ConfigError(f"{config.algo}: only loops of on-policy algorithms are measured, in rollouts and updates")
+    times: list[float] = []
+    with closing(make_environments(config, config.n_envs, 0)) as env:
+        steps = config.rollout_steps * config.n_envs
+        build_model(TrainingJob(config=config), env).learn(steps * (REPETITIONS + 1), callback=Clock())
+    rollout, update = np.diff(times).reshape(-1, 2)[1:].T
+    parts = {"whole loop": rollout + update, "rollout": rollout, "update": update}
+    return {name: (steps / each).tolist() for name, each in parts.items()}
