@@ -19,7 +19,7 @@ LINKS := build/type/sb3_quad
 help:
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests that a change is likely to break, in minutes"
-	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers, a browser"
+	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3 or Ray, in an environment of its own"
 	@echo "make lint           check code style, and which package imports which"

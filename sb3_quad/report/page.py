@@ -1,18 +1,14 @@
 """The one maker of pages: sections as ``report.md``, their plots as files, and all of it as one file, ``report.html``."""
 
-import base64
-import gzip
 import html
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sb3_quad.base.files import write_bytes, write_text
 from sb3_quad.base.imports import require
 from sb3_quad.evaluation.tables import Table
-from sb3_quad.report.plots import Plot, Space
+from sb3_quad.report.plots import Plot
 
 PAGE, MARKDOWN, PICTURES = "report.html", "report.md", "figures"
 
@@ -29,23 +25,23 @@ class Section:
     heading: str
     description: str = ""
     tables: Sequence[Table] = ()
-    plots: Sequence[Plot | Space] = ()
+    plots: Sequence[Plot] = ()
     facts: str = ""
 
 
 def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section]) -> Path:
-    """Write ``report.md`` with the tables, ``figures/`` with each flat plot as PNG, and the page, ``report.html``.
+    """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG, and the page, ``report.html``.
 
     The page needs no other file and no network. Files that are there are replaced.
 
     :param facts: a paragraph below the title.
     :return: the page.
     :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
-        not be written, since Jinja2 or Plotly is not installed.
+        not be written, since Jinja2 is not installed.
     """
     folder = Path(folder)
     write_text(folder / MARKDOWN, _markdown(title, sections))
-    for plot in (plot for section in sections for plot in section.plots if isinstance(plot, Plot)):
+    for plot in (plot for section in sections for plot in section.plots):
         write_bytes(folder / PICTURES / f"{plot.name}.png", plot.png)
     write_text(folder / PAGE, render(title, facts, sections))
     return folder / PAGE
@@ -54,24 +50,13 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
 def render(title: str, facts: str, sections: Sequence[Section]) -> str:
     """The page as text, which expects its plots as files in ``figures/``.
 
-    :raises MissingExtra: Jinja2 is not installed, or Plotly, where there are flights in space.
+    :raises MissingExtra: Jinja2 is not installed.
     """
     jinja2 = require("jinja2", "report", PAGE)
     loader = jinja2.PackageLoader("sb3_quad.report", "templates")
     options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
-    spaces = {plot.name: plot.drawing for section in sections for plot in section.plots if isinstance(plot, Space)}
-    text: str = (
-        jinja2.Environment(loader=loader, **options)
-        .get_template("page.html.j2")
-        .render(
-            title=title,
-            facts=facts,
-            sections=sections,
-            pictures=PICTURES,
-            spaces=_for_script(spaces),
-            plotly=_packed(require("plotly.offline", "report", PAGE).get_plotlyjs()) if spaces else "",
-        )
-    )
+    template = jinja2.Environment(loader=loader, **options).get_template("page.html.j2")
+    text: str = template.render(title=title, facts=facts, sections=sections, pictures=PICTURES)
     return text
 
 
@@ -82,13 +67,3 @@ def _markdown(title: str, sections: Sequence[Section]) -> str:
         heading, *texts = (html.escape(" ".join(text.split()), False) for text in (part.heading, part.description, part.facts))
         blocks += [f"## {heading}", *filter(None, texts), *(table.markdown() for table in part.tables)]
     return "\n\n".join(blocks) + "\n"
-
-
-def _packed(script: str) -> str:
-    """A script as gzip in base64, less than half as large, which page.js unpacks."""
-    return base64.b64encode(gzip.compress(script.encode(), mtime=0)).decode()
-
-
-def _for_script(content: Any) -> str:
-    """JSON that cannot end the ``script`` element it stands in."""
-    return json.dumps(content, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")

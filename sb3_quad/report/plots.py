@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,20 +42,8 @@ METADATA: Any = dict.fromkeys(("Date", "Creator", "Format", "Type"))  # left out
 
 
 @dataclass(frozen=True, eq=False)
-class Space:
-    """Flights in space, which can be turned in the page.
-
-    :param drawing: ``data`` and ``layout`` of Plotly; the page's script adds the colours of text and grid.
-    """
-
-    name: str
-    caption: str
-    drawing: Mapping[str, Any]
-
-
-@dataclass(frozen=True, eq=False)
 class Plot:
-    """A flat plot of a page; ``name``, unique in a page, is that of its files."""
+    """A plot of a page; ``name``, unique in a page, is that of its files."""
 
     name: str
     caption: str

@@ -21,9 +21,8 @@ from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, Section, write_page
-from sb3_quad.report.paths import paths_plot
-from sb3_quad.report.plots import Plot, Space
-from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, hits_plot
+from sb3_quad.report.plots import Plot
+from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, hits_plot, paths_plot
 from sb3_quad.simulation.noise import in_words
 
 OVERVIEW = (
@@ -80,7 +79,7 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             measured = [measured_cells(results, label, first) for label in colours]
             rows = metric_rows(first, measured, first.reference.values())
             tables = [Table(_columns(colours, first.reference, results.source), rows)]
-            plots: Sequence[Plot | Space] = _scenario_plots(results, first, colours, folder)
+            plots: Sequence[Plot] = _scenario_plots(results, first, colours, folder)
         else:
             each_of = f" in each of {len(scenarios)} cells"
             tables, plots = [], group_plots(results, scenarios, colours)
@@ -111,9 +110,7 @@ def _controller_table(records: Sequence[ControllerRecord]) -> Table:
     return text_table("", ("name", "controller", "algorithm", "SHA-256", "observation scaled by"), rows, align="left")
 
 
-def _scenario_plots(
-    results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path
-) -> list[Plot | Space]:
+def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
     entries = {label: results.entry(label, scenario.name) for label in colours}
     flights = [
         ControllerFlights(label, colours[label], entry, read_tracks(Path(folder) / entry.flights))
@@ -121,7 +118,7 @@ def _scenario_plots(
         if entry is not None
     ]
     recorded = [each for each in flights if each.tracks]
-    plots: list[Plot | Space] = [paths_plot(scenario, recorded)] if recorded else []
+    plots = [paths_plot(scenario, recorded)] if recorded else []
     if flights and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
         plots.append(arrivals_plot(scenario, flights))
     if recorded:

@@ -4,17 +4,21 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
 from sb3_quad.evaluation.results import Entry, Results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.report.plots import INK, POINTS, Plot, band, interval_ends, legend, new_axes, styled
+from sb3_quad.report.plots import HEIGHT, INK, POINTS, WIDTH, Plot, band, interval_ends, legend, new_axes, styled
 
-FORCE = "#db1a24"
+FORCE, TARGET = "#db1a24", "#1a9a45"
 LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
 LINE_POINTS = 200  # that a flight is drawn with, at most
+
+
+SHOWN_FLIGHTS = 4  # of a controller, of random episodes
 
 
 class ControllerFlights(NamedTuple):
@@ -42,6 +46,30 @@ def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> P
     legend(figure)
     caption = "Mean time until the vehicle is first within a tolerance of its target, over the flights that get there."
     return Plot(f"{scenario.name}_times", caption, figure)
+
+
+@styled
+def paths_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
+    """Flights seen from above and from the side, their targets and the pushes met, of controllers with recorded flights."""
+    count = 1 if scenario.is_fixed else SHOWN_FLIGHTS
+    figure = Figure(figsize=(2.0 * WIDTH, 1.2 * HEIGHT), layout="constrained")
+    for axes, (i, j) in zip(figure.subplots(1, 2), ((0, 1), (0, 2)), strict=True):
+        axes.set(xlabel=f"{'xyz'[i]} (m)", ylabel=f"{'xyz'[j]} (m)", aspect="equal", adjustable="datalim")
+        for each in flights:
+            for track in each.tracks[:count]:
+                path = track.position[:: -(-len(track.position) // LINE_POINTS)]
+                axes.plot(path[:, i], path[:, j], color=each.colour, label=each.label, linewidth=1.2)
+                axes.plot(*track.targets[:, [i, j]].T, "D", color=TARGET, markersize=4, label="target")
+                if track.lost:
+                    axes.plot(*track.position[-1, [i, j]], "x", color=each.colour)
+                pushed = track.wrench[:, :3].any(axis=1)
+                begins = pushed & ~np.roll(pushed, 1)
+                force = track.wrench[begins, :3] / np.linalg.norm(track.wrench[begins, :3], axis=1, keepdims=True)
+                axes.quiver(*track.position[begins][:, [i, j]].T, *force[:, [i, j]].T, color=FORCE, scale=12, width=0.006)
+    legend(figure)
+    what = "The first flight of each controller" if count == 1 else f"The first {count} flights of each controller"
+    caption = f"{what}, from above and from the side; a cross marks where one is lost, red the direction of a push."
+    return Plot(f"{scenario.name}_paths", caption, figure)
 
 
 @styled
