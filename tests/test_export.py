@@ -240,7 +240,7 @@ def test_a_file_that_computes_something_else_is_not_written(zips, tmp_path, caps
 
 @needs_compiler
 def test_a_header_that_does_not_compile_is_refused(zips, monkeypatch):
-    monkeypatch.setattr(c_header, "_comment", lambda metadata: "float unused;;")
+    monkeypatch.setattr(c_header, "_comment", lambda metadata: ["*/ float unused;; /*"])
     with pytest.raises(ExportError, match="cannot be checked"):
         export_policy(zips / "tanh.zip", "c", n_observations=100)
 
@@ -286,8 +286,8 @@ def test_settings_that_do_not_fit_the_policy_are_one_line(zips, tmp_path, capsys
 @given(st.text(max_size=200))
 def test_any_file_name_makes_a_c_name_and_a_comment(text):
     assert re.fullmatch("[A-Za-z][A-Za-z0-9_]*", c_header.c_name(text))
-    comment = c_header._comment({"policy": text})
-    assert comment.isascii() and comment.count("*/") == 1 and comment.count("/*") == 1
+    comment = "\n".join(c_header._comment({"policy": text}))
+    assert comment.isascii() and "*/" not in comment and "/*" not in comment
 
 
 class Stub(gymnasium.Env):

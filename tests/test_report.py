@@ -2,7 +2,6 @@
 
 import datetime
 import io
-import sys
 from html.parser import HTMLParser
 
 import numpy as np
@@ -262,23 +261,6 @@ def test_the_best_is_better_than_all_others_for_certain(cells, row):
         (low, high), ends = cell.ends, [other.ends for other in others]
         apart = all(low > other[1] if row == SUCCESS else high < other[0] for other in ends)
         assert cell.best == apart
-
-
-def test_without_the_extra_there_is_all_but_the_page(tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "jinja2", None)
-    suite = tmp_path / "small.yaml"
-    suite.write_text(
-        "name: small\nscenarios: [{name: hover, target: [0, 0, 15], duration: 0.1, episodes: 1, tolerances: [1]}]"
-    )
-    output = tmp_path / "out"
-    assert main(["evaluate", "pid", "--suite", str(suite), "-o", str(output)]) == 0
-    printed = capsys.readouterr()
-    assert "100.0 (" in printed.out and "results in" in printed.out
-    assert printed.err.count("pip install '.[report]'") == 1 and printed.err.count("\n") == 1
-    assert (output / "results.json").is_file() and (output / "report.md").is_file()
-    assert list((output / "figures").glob("*.png")) and not (output / "report.html").exists()
-    assert main(["report", str(output)]) == 2
-    assert "error: report.html needs" in capsys.readouterr().err
 
 
 def test_a_report_is_not_replaced_silently(folder, page, capsys):

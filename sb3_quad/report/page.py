@@ -4,9 +4,11 @@ import html
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import jinja2
 
 from sb3_quad.base.files import write_bytes, write_text
-from sb3_quad.base.imports import require
 from sb3_quad.evaluation.tables import Table
 from sb3_quad.report.plots import Plot
 
@@ -36,8 +38,7 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
 
     :param facts: a paragraph below the title.
     :return: the page.
-    :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
-        not be written, since Jinja2 is not installed.
+    :raises ConfigError: a folder that cannot be written.
     """
     folder = Path(folder)
     write_text(folder / MARKDOWN, _markdown(title, sections))
@@ -48,16 +49,11 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
 
 
 def render(title: str, facts: str, sections: Sequence[Section]) -> str:
-    """The page as text, which expects its plots as files in ``figures/``.
-
-    :raises MissingExtra: Jinja2 is not installed.
-    """
-    jinja2 = require("jinja2", "report", PAGE)
+    """The page as text, which expects its plots as files in ``figures/``."""
     loader = jinja2.PackageLoader("sb3_quad.report", "templates")
-    options = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
     template = jinja2.Environment(loader=loader, **options).get_template("page.html.j2")
-    text: str = template.render(title=title, facts=facts, sections=sections, pictures=PICTURES)
-    return text
+    return template.render(title=title, facts=facts, sections=sections, pictures=PICTURES)
 
 
 def _markdown(title: str, sections: Sequence[Section]) -> str:

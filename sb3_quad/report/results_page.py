@@ -41,8 +41,7 @@ def write_report(folder: str | Path, overwrite: bool = False) -> Path:
 
     :param overwrite: replace a report that is there.
     :return: the page.
-    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written;
-        :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could not be written.
+    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written.
     """
     results = load_results(folder)
     if not results.entries:

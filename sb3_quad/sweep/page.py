@@ -18,8 +18,7 @@ def write_report(place: SweepFolder, found: SweepResults, shown: Mapping[str, Se
 
     :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`, by scenario.
     :return: the page.
-    :raises ConfigError: a folder that cannot be written; :class:`~sb3_quad.base.errors.MissingExtra` if the page alone could
-        not be written.
+    :raises ConfigError: a folder that cannot be written.
     """
     parts = [
         Section(f"scenario-{number}", scenario, "", flown, facts=flown[0].caption)

@@ -24,7 +24,6 @@ import argparse
 import sys
 import time
 
-from sb3_quad.base.errors import MissingExtra
 from sb3_quad.cli.parser import YES_OR_NO, Parser, add_common, whole
 
 DEFAULT_FOLDER = "evaluations"
@@ -71,10 +70,7 @@ def run(options: argparse.Namespace) -> int:
     if flown:
         print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
     if options.report and flown:
-        try:
-            report(folder, overwrite=True)
-        except MissingExtra as error:
-            print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
+        report(folder, overwrite=True)
     failures = [failure for failure in results.failures if failure.controller in asked]
     for failure in failures:
         where = "" if failure.scenario is None else f", scenario {failure.scenario}"

@@ -1,10 +1,8 @@
-"""Make report.html from a results folder of evaluate: tables, plots, flights in 3-D; one file that needs no network.
+"""Make report.html from a results folder of evaluate: tables and plots; one file that needs no network.
 
 examples:
   sb3-quad report evaluations/thesis
   sb3-quad report evaluations/thesis --overwrite      again, after adding controllers
-
-Needs: pip install '.[report]' from a clone.
 """
 
 import argparse

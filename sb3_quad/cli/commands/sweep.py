@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, MissingExtra
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli.commands.train import DEFAULT_ALGO, DEFAULT_ENV, DEFAULT_PIPELINE
 from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, positive, seed
 from sb3_quad.controllers.pretrained import agent_path
@@ -140,10 +140,7 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
                 shown = tables(found)
                 for table in (table for each in shown.values() for table in each):
                     console().print(table)
-                try:
-                    write_report(place, found, shown)
-                except MissingExtra as error:
-                    print(f"{error}; report.md and figures/ are there without it", file=sys.stderr)
+                write_report(place, found, shown)
     failures = [record for record in records.values() if record.state == "failed"]
     finished = f"{found.finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
     print(f"{finished}; {time.perf_counter() - start:.1f} s")
