@@ -11,7 +11,7 @@ from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
-from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
+from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.statistics import mean, share
@@ -95,16 +95,16 @@ def test_episodes_are_those_of_the_task():
         np.testing.assert_array_equal(getattr(ours, name), getattr(plain, name))
 
 
-def test_an_impulse_is_force_times_time():
-    push = "{start: 0.1, duration: 0.05, force: [6, 0, 0], torque: [0, 0, 0.01]}"
+@pytest.mark.parametrize("factor", [1.0, -2.0])
+def test_an_impulse_is_force_times_time(factor):
+    push = f"{{start: 0.1, duration: 0.05, force: [6, 0, 0], torque: [0, 0, 0.01], factor: {factor}}}"
     entry = f"noise: 0, duration: 0.5, episodes: 2, wrenches: [{push}]"
-    factors = np.array([1.0, -2.0])
-    flights, log = fly_scenario(hover, scenario(entry), factors=factors, recorded=2)
-    np.testing.assert_allclose(log["velocity"][:, -1, 0], factors * 6 * 0.05 / 1.727, rtol=1e-4)
-    np.testing.assert_allclose(log["body_rates"][:, -1, 2], factors * 0.01 * 0.05 / 0.00996, rtol=1e-3)
+    flights, log = fly_scenario(hover, scenario(entry), recorded=2)
+    np.testing.assert_allclose(log["velocity"][:, -1, 0], factor * 6 * 0.05 / 1.727, rtol=1e-4)
+    np.testing.assert_allclose(log["body_rates"][:, -1, 2], factor * 0.01 * 0.05 / 0.00996, rtol=1e-3)
     np.testing.assert_allclose(np.diff(log["time"]), 0.02)
     impulse = 0.02 * log["wrench"][:, 1:, 0].sum(axis=1)  # means over the steps between samples
-    np.testing.assert_allclose(impulse, factors * 6 * 0.05, rtol=1e-5)
+    np.testing.assert_allclose(impulse, factor * 6 * 0.05, rtol=1e-5)
     assert flights.survival.all()
 
 
@@ -165,20 +165,6 @@ def test_the_expert_is_lost_where_the_specification_says():
 def test_the_expert_recovers_as_often_as_specified():
     success = specified("recovery", 480)[0].survival
     assert success.low - 0.02 < 0.319 < success.high + 0.02
-
-
-def test_a_hit_is_bracketed():
-    side_hit = load_suite("thesis").scenario("side_hit")
-    search = side_hit.hit_search.model_copy(update={"episodes": 4, "largest": 2.0})
-    short = side_hit.model_copy(update={"hit_search": search, "duration": 8.0})
-    limit = find_limit(PIDExpert(), short)
-    assert 0 < limit.low < limit.factor < limit.high < 1.0  # the thesis's hit itself is too much for it
-    assert limit.high - limit.low <= 0.02 * limit.high
-    for factor, survives in ((limit.low, True), (limit.high, False)):
-        flights, _ = fly_scenario(PIDExpert(), short, seeds=range(4), factors=np.full(4, factor))
-        assert (flights.survival == survives).all()
-    none = short.model_copy(update={"wrenches": (short.wrenches[0].model_copy(update={"duration": None, "start": 7.9}),)})
-    assert find_limit(PIDExpert(), none).factor is None
 
 
 def test_scaling_changes_the_position_only():

@@ -31,7 +31,7 @@ from sb3_quad.evaluation.results import (
     load_results,
     write_episodes,
 )
-from sb3_quad.evaluation.scenario_flights import find_limit, fly_scenario
+from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
 from sb3_quad.executors import Executor, start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
@@ -143,7 +143,6 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         scenario, seen = job.scenario.flown_by(job.spec.own and job.spec.own.vehicle), job.spec.observed
         controller = build(job.spec, scenario.nominal_vehicle(), job.record.offset)
         flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None, own=seen)
-        limit = find_limit(controller, scenario, job.backend, seen)
     except SB3QuadError as error:
         return _failure(job.record.label, job.scenario.name, error)
     entry = Entry(
@@ -154,7 +153,6 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         seconds=round(time.perf_counter() - start, 3),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         metrics=summarise(flights),
-        hit_limit=limit,
         flights=flights_path(job.record.label, scenario.name),
     )
     return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}

@@ -6,7 +6,6 @@ from itertools import groupby
 
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
-from sb3_quad.evaluation.scenario_flights import HitLimit
 from sb3_quad.evaluation.scenarios.load import axis_name
 from sb3_quad.evaluation.scenarios.scenario import NumberOrRange, Reference, Scenario
 from sb3_quad.evaluation.statistics import Estimate
@@ -18,9 +17,8 @@ REWARD, FLOWN = Row("mean reward"), Row("time flown", "s")
 PATH, MEDIAN, QUANTILE = Row("mean path", "m"), Row("final error, median", "m"), Row("final error, 95 %", "m")
 STABLE, SIDEWAYS = Row("mean time until stable", "s"), Row("beside the straight way", "m")
 REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
-HIT, HIT_SIZE = Row("half survive up to", "×"), Row("which is")
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
-ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED, HIT}  # also where flights are lost, which end early
+ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
 MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
@@ -33,7 +31,7 @@ def time_row(tolerance: float | str) -> Row:
     return Row(f"{TIME} {float(tolerance):g} m", "s")
 
 
-def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
+def metric_cells(metrics: Metrics) -> Cells:
     """Everything that was measured of a controller in a scenario."""
     cells = {
         SUCCESS: _share(metrics.success),
@@ -51,15 +49,13 @@ def metric_cells(metrics: Metrics, limit: HitLimit | None = None) -> Cells:
     if metrics.course is not None:
         cells[REACHED], cells[COMPLETED] = _mean(metrics.course.reached), _share(metrics.course.completed)
         cells[COURSE_TIME] = _mean(metrics.course.time, "never")
-    if limit is not None:
-        cells[HIT], cells[HIT_SIZE] = _limit(limit)
     return cells
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
     """As :func:`metric_cells`, of the controller with that label; None if it failed."""
     entry = results.entry(controller, scenario.name)
-    return None if entry is None else metric_cells(entry.metrics, entry.hit_limit)
+    return None if entry is None else metric_cells(entry.metrics)
 
 
 def reference_cells(reference: Reference) -> Cells:
@@ -151,10 +147,8 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        rows = [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
-    else:
-        rows = [SUCCESS, SURVIVAL, REWARD, *map(time_row, tolerances), PATH, SIDEWAYS, MEDIAN, QUANTILE]
-    return rows + ([] if scenario.hit_search is None else [HIT, HIT_SIZE])
+        return [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
+    return [SUCCESS, SURVIVAL, REWARD, *map(time_row, tolerances), PATH, SIDEWAYS, MEDIAN, QUANTILE]
 
 
 def _beats(cell: Cell, other: Cell, higher: bool) -> bool:
@@ -175,14 +169,6 @@ def _mean(estimate: Estimate | None, none: str = "–") -> Cell:
 def _moment(moment: Moment, verb: str = "arrive") -> Cell:
     some = moment.time is not None and moment.share.value < 1.0
     return replace(_mean(moment.time, "never"), note=f"{100 * moment.share.value:.3g} % {verb}" if some else "")
-
-
-def _limit(limit: HitLimit) -> tuple[Cell, Cell]:
-    factor = limit.trials[-1].factor if limit.factor is None else limit.factor
-    size = " and ".join(f"{factor * part:.1f} {unit}" for part, unit in ((limit.force, "N"), (limit.torque, "N m")) if part)
-    if limit.factor is None:
-        return Cell(words=f"more than {factor:g}"), Cell(words=f"more than {size}")
-    return Cell(factor, (limit.low, float("inf") if limit.high is None else limit.high)), Cell(words=size)
 
 
 def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:

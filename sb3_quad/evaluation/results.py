@@ -21,7 +21,6 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_text
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.metrics import Metrics
-from sb3_quad.evaluation.scenario_flights import HitLimit
 from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
@@ -58,7 +57,6 @@ class Entry(Frozen):
     seconds: float = Field(description="wall-clock time it took")
     date: str = Field(description="day on which it was flown, UTC, year-month-day")
     metrics: Metrics
-    hit_limit: HitLimit | None
     flights: str = Field(description="path of the .npz, relative to the folder")
 
     @property

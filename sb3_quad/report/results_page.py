@@ -22,7 +22,7 @@ from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, hits_plot, paths_plot
+from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, paths_plot
 from sb3_quad.simulation.noise import in_words
 
 OVERVIEW = (
@@ -122,8 +122,6 @@ def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, 
         plots.append(arrivals_plot(scenario, flights))
     if recorded:
         plots.append(errors_plot(scenario, recorded))
-    if any(each.entry.hit_limit is not None for each in flights):
-        plots.append(hits_plot(scenario, flights))
     return plots
 
 

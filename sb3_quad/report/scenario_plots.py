@@ -1,4 +1,4 @@
-"""The plots of a scenario: times to its target, distances from it, how large a hit is survived, what ``vary`` changes."""
+"""The plots of a scenario: paths, times to its target, distances from it, what ``vary`` changes."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -99,23 +99,6 @@ def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
     chosen = slice(None, None, -(-len(longest.times) // LINE_POINTS))
     ends = np.quantile(errors[:, chosen], (0.5, 0.0, 1.0), axis=0, method="higher")
     return longest.times[chosen], np.where(np.isfinite(ends), ends, np.nan)
-
-
-@styled
-def hits_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
-    """Shares of flights that survive, over the size of force and torque."""
-    figure, axes = new_axes("factor of force and torque", "survived (%)")
-    for each in flights:
-        if each.entry.hit_limit is not None:
-            trials = sorted(each.entry.hit_limit.trials, key=lambda trial: trial.factor)
-            factors = np.array([trial.factor for trial in trials])
-            band(axes, each.colour, each.label, factors, interval_ends([trial.survived for trial in trials], 100.0), **POINTS)
-    axes.set_xscale("log", base=2)
-    axes.set_ylim(-3.0, 103.0)
-    axes.xaxis.set_major_formatter("{x:g}")
-    legend(figure)
-    caption = "Flights that survive when force and torque are scaled by a factor, with 95 % intervals."
-    return Plot(f"{scenario.name}_limit", caption, figure)
 
 
 @styled

@@ -25,6 +25,7 @@ UNITS = dict(
     torque_to_inertia="rad/s²",
     motor_time_constant="s",
     noise="relative std",
+    factor="× the wrench",
     gusts="std, N",
     duration="s",
 )

@@ -133,6 +133,7 @@ class Wrench(Frozen):
     unit: Literal["SI", "weight"] = Field(
         default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
     )
+    factor: float = Field(default=1.0, description="multiplies force and torque alike; to vary the size of a hit")
     force_frame: Frame = Field(default="world", description="world or body: the axes of force")
     torque_frame: Frame = Field(default="body", description="world or body: the axes of torque")
 

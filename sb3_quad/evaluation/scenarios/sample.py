@@ -32,11 +32,10 @@ class Plan:
     radius: float = 0.5
 
 
-def sample_plan(scenario: Scenario, seeds: Sequence[int], factors: FloatArray | None = None) -> Plan:
+def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
     """What happens in some episodes of a scenario, beyond what its task samples.
 
     :param seeds: of the episodes, (n,).
-    :param factors: of the wrenches of each episode, (n,); None: 1.
     """
     generators = [np.random.default_rng([SCENARIO_STREAM, seed]) for seed in seeds]
     attitude, target = scenario.start.attitude, scenario.target
@@ -49,18 +48,15 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int], factors: FloatArray | 
             start[name] = _vectors(distribution, generators)
     if target.points:
         start["target"] = np.tile(np.array(target.points[0]), (len(seeds), 1))
-    wrenches = sample_wrenches(scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators, factors)
+    wrenches = sample_wrenches(scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators)
     return Plan(start, wrenches, np.array(target.waypoints or np.zeros((0, 3))), target.radius or Plan.radius)
 
 
-def sample_wrenches(
-    wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators, factors: FloatArray | None = None
-) -> dict[int, FloatArray]:
+def sample_wrenches(wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators) -> dict[int, FloatArray]:
     """The sum of some wrenches over the time of n episodes, as a :class:`Plan` holds it.
 
     :param vehicle: gives the control step, and weights their size.
     :param steps: control steps of an episode.
-    :param factors: of the wrenches of each episode, (n,); None: 1.
     """
     acting = []
     for wrench in wrenches:
@@ -69,7 +65,7 @@ def sample_wrenches(
         newton, newton_metre = wrench.units(vehicle)
         vectors = newton * _vectors(wrench.force, generators), newton_metre * _vectors(wrench.torque, generators)
         values = make_wrench(*vectors, wrench.force_frame, wrench.torque_frame).T
-        acting.append((first, first + length, values if factors is None else factors[:, None] * values))
+        acting.append((first, first + length, wrench.factor * values))
     times = sorted({time for first, last, _ in acting for time in (first, last) if time < steps})
     none = np.zeros((len(generators), WRENCH_SIZE))
     return {time: sum((values for first, last, values in acting if first <= time < last), none) for time in times}

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from pydantic import (
     Field,
     PositiveFloat,
-    PositiveInt,
     ValidationError,
     field_validator,
     model_validator,
@@ -56,14 +55,6 @@ class Reference(Frozen):
         return {f"{key:g}" if isinstance(key, float) else str(key): time for key, time in value.items()}
 
 
-class HitSearch(Frozen):
-    """Search for the factor of all wrenches, force and torque alike, at which half of the flights are lost."""
-
-    largest: PositiveFloat = Field(default=16.0, description="greatest factor that is tried")
-    resolution: Annotated[float, Field(gt=0, lt=1)] = Field(default=0.02, description="width of the answer, in its own size")
-    episodes: PositiveInt = Field(default=120, description="flights per factor")
-
-
 class Scenario(Frozen):
     """What is flown, how often, and what others measured there. Units m, s, rad, N, N m, kg."""
 
@@ -91,7 +82,6 @@ class Scenario(Frozen):
     episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(default=240, description="how many are flown")
     seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(default=0, description="from which every episode gets its own")
     tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m")
-    hit_search: HitSearch | None = Field(default=None, description="find how large the wrenches may get")
     reference: dict[str, Reference] = Field(default_factory=dict, description="from a column's title to others' metrics")
     group: str | None = Field(default=None, description="the scenario that this one is a cell of; set by vary")
     cell: dict[str, float] = Field(default_factory=dict, description="this cell's values, by key; set by vary")
@@ -126,8 +116,6 @@ class Scenario(Frozen):
             if wrench.start >= self.duration:
                 over = f"when the episode of {self.duration:g} s is over"
                 raise ValueError(f"wrenches.{number}: starts at {wrench.start:g} s, {over}")
-        if self.hit_search is not None and not self.wrenches:
-            raise ValueError("hit_search: there are no wrenches to search with")
         return self
 
     def nominal_vehicle(self) -> Vehicle:
@@ -251,11 +239,8 @@ class Suite(Frozen):
         for scenario in self.scenarios:
             if names and scenario.name not in names and scenario.group not in names:
                 continue
-            data = {**scenario.model_dump(), **changes}
-            if scenario.hit_search is not None and episodes is not None:
-                data["hit_search"]["episodes"] = min(scenario.hit_search.episodes, episodes)
             where = f"scenario {scenario.name}" + ("" if vehicle is None else f", flown by {vehicle}")
-            changed.append(validate(Scenario, data, where))
+            changed.append(validate(Scenario, {**scenario.model_dump(), **changes}, where))
         return self.model_copy(update={"scenarios": tuple(changed)})
 
     @model_validator(mode="after")
