@@ -89,7 +89,6 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
 
 def test_flags_of_a_single_run_are_refused(capsys):
     assert main(["train", "-n", "100"]) == 2 and "-n goes with a single run" in capsys.readouterr().err
-    assert main(["train", "--algo", "dagger", "--reference"]) == 2 and "--reference" in capsys.readouterr().err
 
 
 def test_moved_and_scaled_positions_are_part_of_the_actor():
@@ -125,17 +124,6 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
 
 def small_file(tmp_path):
     return write(tmp_path, [{**stage, "settings": {**TINY, **stage.get("settings", {})}} for stage in STAGES])
-
-
-def test_the_reference_agent_stands_in_the_same_table(tmp_path, capsys, monkeypatch):
-    arguments = ["train", "--conf-file", str(small_file(tmp_path)), "-f", str(tmp_path / "logs"), "--eval-episodes", "0"]
-    assert main([*arguments, "--reference"]) == 0
-    output = capsys.readouterr().out
-    (agent,) = (tmp_path / "logs" / "ppo_bc").rglob("QuadStateRecovery-v0.zip")
-    assert f"export {agent}" in output.split("next:\n")[1]
-    assert output.count("PPO only") >= 4 and output.count("fresh episodes, the same for all") == 2
-    alone = PPO.load(next((tmp_path / "logs" / "ppo").rglob("QuadStateRecovery-v0.zip")))
-    assert alone.num_timesteps >= 2 * TINY["n_timesteps"]
 
 
 def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, monkeypatch):

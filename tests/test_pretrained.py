@@ -190,10 +190,8 @@ def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
     assert main(["enjoy", "crazyflie-recovery", "-n", "40", "-o", "poses.png", "--size", "64x64"]) == 0
     assert (tmp_path / "poses.png").is_file() and "warning" not in capsys.readouterr().err
     if importlib.util.find_spec("imageio_ffmpeg") is not None:
-        assert main(["record-video", "-i", "itm-recovery", "-n", "3", "--size", "64x64"]) == 0
-        assert main(["record-video", "-i", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "a.gif"]) == 0
-        assert main(["enjoy", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "b.mp4"]) == 0
-        assert {path.suffix for path in tmp_path.iterdir()} >= {".mp4", ".gif"} and (tmp_path / "b.mp4").is_file()
+        assert main(["enjoy", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "a.gif", "b.mp4"]) == 0
+        assert (tmp_path / "a.gif").is_file() and (tmp_path / "b.mp4").is_file()
     assert sorted(FOLDER.iterdir()) == before
 
 

@@ -225,11 +225,10 @@ def test_an_interrupted_video_leaves_what_was_there(tmp_path):
     assert (tmp_path / "film.mp4").read_bytes() == b"earlier"
 
 
-@pytest.mark.parametrize("asked", [["enjoy", "pid", "-o", "film.mp4"], ["record-video", "-i", "itm-recovery"]])
-def test_missing_video_packages_are_named(asked, monkeypatch, capsys, tmp_path):
+def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    assert main(asked) == 2
+    assert main(["enjoy", "pid", "-o", "film.mp4"]) == 2
     assert "pip install '.[video]'" in capsys.readouterr().err
 
 
@@ -341,25 +340,21 @@ def test_flights_are_shown_in_a_window():
 
 
 @pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
-def test_record_video_films_the_agent_of_a_run(run_folder, tmp_path, capsys):
+def test_the_agent_of_a_run_is_filmed_and_no_film_replaced(run_folder, tmp_path, capsys):
     import imageio.v2 as imageio
 
-    logs = str(run_folder.path.parent.parent)
-    asked = ["record-video", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "-n", "10", "--size", "64x64"]
-    assert main(asked) == 0
+    logs, film = str(run_folder.path.parent.parent), tmp_path / "one.mp4"
+    asked = ["enjoy", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "-n", "10", "--size", "64x64", "-o"]
+    assert main([*asked, str(film)]) == 0
     output = capsys.readouterr().out
-    film = run_folder.path / "videos" / "best_model-QuadStateRecovery-v0-seed-0-10-steps.mp4"
     assert f"agent: {run_folder.best_model}" in output and f"saved {film}" in output
-    assert film.is_file()
     before = film.read_bytes()
-    assert main(asked) == 2
+    assert main([*asked, str(film)]) == 2
     assert "--overwrite" in capsys.readouterr().err and film.read_bytes() == before
-    side_by_side = ["-i", str(run_folder.best_model), "-o", str(tmp_path / "films"), "--n-envs", "2", "--seed", "4"]
-    assert main(["record-video", "--env", "QuadStateRecovery-v0", *side_by_side, "-n", "10", "--size", "64x64"]) == 0
+    assert main([*asked, str(tmp_path / "both.mp4"), "--n-envs", "2", "--seed", "4"]) == 0
     output = capsys.readouterr().out
-    assert "seed 4, best_model: " in output and "seed 5, best_model: " in output
-    (both,) = (tmp_path / "films").iterdir()
-    widths = [next(iter(imageio.get_reader(path))).shape[1] for path in (film, both)]
+    assert "seed 4, ppo best_model" in output and "seed 5, ppo best_model" in output
+    widths = [next(iter(imageio.get_reader(path))).shape[1] for path in (film, tmp_path / "both.mp4")]
     assert widths[1] >= 2 * widths[0]
 
 

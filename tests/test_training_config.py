@@ -238,8 +238,8 @@ def test_one_expert_is_the_default_and_the_thesiss_is_asked_for_by_name(env_id):
 
 def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
     pipeline = load_pipeline("thesis/two_stage.yml")
-    stages = {each.name: each for each in (*pipeline.stages, pipeline.reference)}
-    configs = {name: load_config(each.algo, each.env, each.conf_file) for name, each in stages.items()}
+    configs = {each.name: load_config(each.algo, each.env, each.conf_file) for each in pipeline.stages}
+    configs["PPO only"] = load_config("ppo_bc", "QuadStateRecovery-v0", "thesis/reference.yml")
     batches = {"IL-agent": 8, "RL-agent": 3, "PPO only": 3}
     epochs = {"IL-agent": 12, "RL-agent": 6, "PPO only": 6}
     rollouts = {"IL-agent": 550, "RL-agent": 2450, "PPO only": 3000}  # 4.2.3

@@ -23,7 +23,7 @@ from sb3_quad.training.runs import open_run
 ROOT = Path(__file__).resolve().parent.parent
 ENV = "QuadStateRecovery-v0"
 OURS = {"train": "train", "enjoy": "enjoy", "plot_from_file": "plot", "plot_train": "plot", "all_plots": "plot"}
-OURS |= {"record_video": "record-video", "benchmark": "evaluate"}
+OURS |= {"record_video": "enjoy", "benchmark": "evaluate"}
 SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file", "record_video", "record_training", "benchmark")
 SETTINGS = {
     "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.Tanh)",

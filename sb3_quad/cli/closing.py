@@ -17,7 +17,7 @@ from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.pipeline import REFERENCE, PipelineResult
+from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
 from sb3_quad.training.trainer import TrainingResult
 
@@ -89,12 +89,12 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     flown = result.job.flight_settings
     controllers = {"expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle)}
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
-    beside = ("expert", "IL-agent", "RL-agent", REFERENCE.name)
+    beside = ("expert", "IL-agent", "RL-agent")
     print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print(f"saved in {result.folder}, {seconds:.0f} s in all")
-    _print_next(open_run([stage for name, stage in result.stages.items() if name != REFERENCE.name][-1].run))
+    _print_next(open_run([*result.stages.values()][-1].run))
     return 0
 
 

@@ -75,16 +75,10 @@ class Stage(Frozen):
         return self
 
 
-REFERENCE = Stage(name="PPO only", algo="ppo", env="QuadStateRecovery-v0", begin="new")
-
-
 class Pipeline(Frozen):
     """The stages, in order."""
 
     stages: tuple[Stage, ...] = Field(min_length=1)
-    reference: Stage = Field(
-        default=REFERENCE, description="a further stage, by --reference, on as many timesteps as the others"
-    )
 
 
 class Status(Pipeline):
@@ -138,18 +132,6 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
     :raises ConfigError: an unreadable file, or a key that is unknown, missing or out of range.
     """
     return validate(Pipeline, *SETTINGS.read(conf_file))
-
-
-def with_reference(pipeline: Pipeline) -> Pipeline:
-    """The same and its reference as a last stage, on as many timesteps as the others together, in the same environments.
-
-    :raises ConfigError: settings that do not fit, named with their stage.
-    """
-    configs = [load_config(each.algo, each.env, each.conf_file, each.settings) for each in pipeline.stages]
-    shared = {"n_timesteps": sum(each.n_timesteps for each in configs), "vec_env": configs[0].vec_env}
-    own = {"env_kwargs": configs[0].flight_settings.in_any_task()}
-    reference = pipeline.reference.model_copy(update={"settings": {**shared, **own, **pipeline.reference.settings}})
-    return pipeline.model_copy(update={"stages": (*pipeline.stages, reference)})
 
 
 def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:

@@ -52,7 +52,6 @@ BASES = {
     "export": "itm-recovery --format torchscript",
     "plot": "a=no_run",
     "publish": "itm-recovery --name mine --episodes 1",
-    "record-video": "pid -n 3 --size 64x64",
     "report": "no_results",
     "sweep": "sweep.yaml --dry-run",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",

@@ -50,7 +50,7 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.evaluation.tables import text_table
     from sb3_quad.training.config import load_config
 
-    screen, found = console(), []
+    screen, found = console(), list[tuple[str, int, list[float]]]()
     loops = [] if options.training is False else [load_config(algo, TRAINED, options.conf_file) for algo in options.algo]
     with screen.status("measuring"):
         if options.training is not True:
@@ -58,9 +58,9 @@ def run(options: argparse.Namespace) -> int:
                 found += [(name, n_envs, each) for name, each in rates.items()]
         for config in loops:
             found += [(f"{config.algo}, {part}", config.n_envs, each) for part, each in _loop(config).items()]
-    results = [{"name": name, "n_envs": n, "rate": float(np.median(each)), "rates": each} for name, n, each in found]
-    first = results[0]["rate"]
-    rows = [(r["name"], f"{r['n_envs']:,}", f"{r['rate']:,.0f}", f"{r['rate'] / first:,.1f} x") for r in results]
+    median = [float(np.median(each)) for _, _, each in found]
+    texts = [(f"{rate:,.0f}", f"{rate / median[0]:,.1f} x") for rate in median]
+    rows = [(name, f"{n:,}", *text) for (name, n, _), text in zip(found, texts, strict=True)]
     screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
     if options.output is not None:
         machine = {
@@ -69,6 +69,7 @@ def run(options: argparse.Namespace) -> int:
             "versions": {package: metadata.version(package) for package in PACKAGES},
             "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
         }
+        results = [{"name": name, "n_envs": n, "rates": each} for name, n, each in found]
         write_text(options.output, json.dumps({"machine": machine, "results": results}, indent=2) + "\n")
         print(f"written to {options.output}")
     return 0

@@ -32,33 +32,14 @@ SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, an
 
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
-    parser.set_defaults(trained_agent=None)
-    parser.add_argument("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
-    task = add_flight_arguments(parser)
-    task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery, instead of --env")
-    task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of --env")
     add = parser.add_argument
     vector: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
-    add("-n", "--n-timesteps", type=positive, metavar="N", help="control steps, in as many episodes as needed (one episode)")
-    add("--no-render", action="store_true", help="only fly and print how it went")
-    add("--target", help="where to fly to, m", **vector)
-    add("--force", help="an external force, world frame, N", **vector)
-    add("--torque", help="an external torque, body frame, N m", **vector)
-    add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
-    add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
-    output = "write films (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
-    add("-o", "--output", nargs="+", default=[], metavar="FILE", help=output)
-
-
-def add_flight_arguments(parser: Parser) -> Any:
-    """Add the flags of rl-zoo's ``enjoy.py`` for an agent and its episodes, and those of a film.
-
-    :return: the group of flags that say what is flown, one of which may be given.
-    """
-    add = parser.add_argument
+    add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
     add("--algo", help="algorithm of a trained agent, looked up in the log folder")
     task = parser.add_mutually_exclusive_group()
     task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
+    task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery, instead of --env")
+    task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of --env")
     add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
     add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")
     which = parser.add_mutually_exclusive_group()
@@ -66,16 +47,24 @@ def add_flight_arguments(parser: Parser) -> Any:
     which.add_argument("--load-best", help="the best agent of the evaluations", **best)
     which.add_argument("--load-checkpoint", dest="which", type=whole, metavar="N", help="the checkpoint after N timesteps")
     which.add_argument("--load-last-checkpoint", help=f"the {LAST}", **{**best, "const": LAST})
+    add("-n", "--n-timesteps", type=positive, metavar="N", help="control steps, in as many episodes as needed (one episode)")
     add("--n-envs", type=positive, default=1, metavar="N", help="episodes side by side, with consecutive seeds (1)")
     add("--seed", type=natural, default=0, metavar="N", help="seed of the first episode (0); later ones count up")
     actions = parser.add_mutually_exclusive_group()
     actions.add_argument("--deterministic", action="store_true", help="fly the mean of a policy's actions (default)")
     actions.add_argument("--stochastic", action="store_true", help="sample from a policy's actions")
     add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
+    add("--target", help="where to fly to, m", **vector)
+    add("--force", help="an external force, world frame, N", **vector)
+    add("--torque", help="an external torque, body frame, N m", **vector)
+    add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
+    add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
+    add("--no-render", action="store_true", help="only fly and print how it went")
+    output = "write films (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
+    add("-o", "--output", nargs="+", default=[], metavar="FILE", help=output)
     add("--size", type=_size, metavar="WxH", help="size of one controller's panel, pixels")
     add("--speed", type=above_zero, default=1.0, metavar="X", help="playback speed of film and window; 0.5 is slow motion (1)")
     add_common(parser, "trust", "overwrite", "progress")
-    return task
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -116,30 +105,17 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def known_environment(options: argparse.Namespace) -> str:
-    """The environment that is asked for.
-
-    :raises ConfigError: it is not of this package.
-    """
-    env_id = options.env or DEFAULT_ENV
-    if env_id not in ENVIRONMENTS:
-        raise ConfigError(unknown("environment", env_id, ENVIRONMENTS) + "; others are shown by rl_zoo3.enjoy")
-    return str(env_id)
-
-
-def chosen_agent(options: argparse.Namespace) -> tuple[str, str]:
-    """Name and path of the agent of ``-i``, else of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
+def _agent_of_run(options: argparse.Namespace, env_id: str) -> tuple[str, str]:
+    """Name and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
 
     :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that enjoy does not have.
     """
     from sb3_quad.training.algorithms import get_algorithm
     from sb3_quad.training.runs import find_run
 
-    if options.trained_agent is not None:
-        return Path(options.trained_agent).stem, options.trained_agent
     if not (Path(options.folder) / options.algo).is_dir():
         get_algorithm(options.algo)  # raises if there is none of that name
-    run = find_run(options.folder, options.algo, known_environment(options), options.exp_id)
+    run = find_run(options.folder, options.algo, env_id, options.exp_id)
     if isinstance(options.which, int):
         path = run.checkpoint(options.which)
     elif options.which == LAST:
@@ -162,7 +138,7 @@ def _check(options: argparse.Namespace, window: bool) -> None:
     from sb3_quad.show.film import check_film
     from sb3_quad.simulation.checks import check_size
 
-    if not (options.controllers or options.algo or options.trained_agent):
+    if not (options.controllers or options.algo):
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
     if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
         raise ConfigError("--at and --for say when --force and --torque act; give one of these")
@@ -183,9 +159,11 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
     from sb3_quad.simulation.settings import FlightSettings
 
-    env_id, specs = known_environment(options), parse_controllers(options.controllers)
-    if options.algo or options.trained_agent:
-        specs.insert(0, ControllerSpec(*chosen_agent(options)))
+    env_id, specs = options.env or DEFAULT_ENV, parse_controllers(options.controllers)
+    if env_id not in ENVIRONMENTS:
+        raise ConfigError(unknown("environment", env_id, ENVIRONMENTS) + "; others are shown by rl_zoo3.enjoy")
+    if options.algo:
+        specs.insert(0, ControllerSpec(*_agent_of_run(options, env_id)))
         print(f"agent: {specs[0].spec}")
     agents = [spec.own for spec in specs if spec.own is not None]  # the first says how all are flown
     push = given(options, "force", "torque", "start", "duration")

@@ -6,7 +6,6 @@ examples:
   sb3-quad train --conf-file nominal/two_stage.yml        both stages for one vehicle in still air
   sb3-quad train --conf-file pid/two_stage.yml            both stages from the PID expert
   sb3-quad train --conf-file thesis/two_stage.yml         the thesis's recipe as it prints it; hours
-  sb3-quad train --reference                              plus PPO alone on the same budget, in the same tables
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
@@ -30,7 +29,7 @@ from sb3_quad.training.options import JobOptions, SettingsOptions
 DEFAULT_PIPELINE = "imitation.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 KEPT_BY_RESUME = (
-    *("algo", "env", "conf_file", "hyperparams", "eval_env_kwargs", "trained_agent", "log_folder", "seed", "reference"),
+    *("algo", "env", "conf_file", "hyperparams", "eval_env_kwargs", "trained_agent", "log_folder", "seed"),
     *SettingsOptions.model_fields,
 )
 
@@ -58,9 +57,6 @@ def add_arguments(parser: Parser) -> None:
     add("--seed", type=seed, metavar="N", help="seed (0); negative: a random one, recorded in args.yml")
     add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
     add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose")
-    add(
-        "--reference", action="store_true", default=None, help="with a pipeline: also PPO alone on the same budget, to compare"
-    )
     add("--resume", metavar="RUN_FOLDER", help="continue an interrupted or killed run with all its settings")
 
 
@@ -90,11 +86,8 @@ def run(options: argparse.Namespace) -> int:
                 own = f"a pipeline's stages have their own in {conf_file}"
                 raise ConfigError(f"{flag} goes with a single run (--algo, --env); {own}")
         pipeline = stages.with_settings(stages.load_pipeline(conf_file), changed_settings(options))
-        pipeline = stages.with_reference(pipeline) if options.reference else pipeline
         finished = stages.run_pipeline(pipeline, arguments, Path(conf_file).stem)
         return close_pipeline(finished, time.perf_counter() - start)
-    if options.reference:
-        raise ConfigError("--reference goes with a pipeline, such as train without --algo and --env")
     job = validate(TrainingJob, {"config": make_config(options), **arguments}, "command line")
     print(describe(job))
     return close_run(train(job))
