@@ -20,7 +20,7 @@ import sb3_quad
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
 DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
-APART = ("zoo", "ray", "sweep")  # extras in the environment of make test-zoo
+APART = ("zoo", "ray")  # extras in the environment of make test-zoo
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 

@@ -21,10 +21,9 @@ from sb3_quad.base.errors import WorkerDied
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
 from sb3_quad.executors import start_executor
-from sb3_quad.sweep.compare import over_seeds
 from sb3_quad.sweep.expand import expand
 from sb3_quad.sweep.folder import Plan, SweepFolder
-from sb3_quad.sweep.results import verdict
+from sb3_quad.sweep.results import over_seeds, verdict
 from sb3_quad.sweep.run import digest
 from sb3_quad.sweep.spec import SWEEPS, SweepSpec, load_sweep
 

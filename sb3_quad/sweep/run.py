@@ -1,6 +1,9 @@
-"""What a worker does: train a run of a sweep as ``train`` does, or what is left of it, and fly its agent."""
+"""Doing the runs of a sweep by an executor, and what a worker does of it: train as ``train`` does, and fly the agent."""
 
 import hashlib
+from collections import Counter
+from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import closing
 from pathlib import Path
 
@@ -9,18 +12,20 @@ import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_quad.base.cores import use_cpus
-from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
 from sb3_quad.base.files import one_line, write_text
 from sb3_quad.base.imports import import_packages
 from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.signals import StopSignals
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec, build
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import Suite
+from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.sweep.expand import Run
-from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, RunRecord
+from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, Plan, RunRecord, SweepFolder
 from sb3_quad.sweep.spec import Evaluation
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
@@ -28,7 +33,63 @@ from sb3_quad.training.pipeline import STATUS_FILE, Pipeline, PipelineResult, re
 
 EPISODES = 240  # of each task, where no suite is named
 TASKS = ("state_recovery", "target_tracking")
+TRIES = 2  # of a run whose worker process dies
+Show = Callable[[int, int, str], None]  # runs that ended, runs in all, what they are called
 LOG = "log.txt"  # what the training reports, in the run's folder
+
+
+def execute(
+    place: SweepFolder, plan: Plan, executor: Executor, signals: StopSignals, show: Show, report: Callable[[str], None]
+) -> dict[str, RunRecord]:
+    """Do all runs that are not finished.
+
+    A run whose worker process ends is tried once more, from its snapshot; one that fails is left, and the others go on.
+    After a signal, the runs under way save and end.
+
+    :param report: told of each event in one line.
+    :return: the records of all runs that ended, those of earlier calls included, by name.
+    :raises ConfigError: a folder that cannot be written, a full disk.
+    """
+    known = place.records(plan.runs)
+    records = {name: record for name, record in known.items() if record.state == "finished"}
+    calls, tries = dict["Future[RunRecord]", Run](), Counter[str]()
+
+    def submit(run: Run) -> None:
+        calls[executor.submit(work, run, str(place.run(run)), plan.suite, plan.spec.evaluation)] = run
+        tries[run.name] += 1
+
+    def next_step(run: Run) -> str:
+        return "goes on where it was left" if pipeline_folder(place.run(run)) is not None else "begins again"
+
+    for run in plan.runs:
+        if run.name in records:
+            continue
+        if run.name in known:
+            report(f"{run.name}: failed before ({known[run.name].message}); {next_step(run)}")
+        elif pipeline_folder(place.run(run)) is not None:
+            report(f"{run.name}: {next_step(run)}")
+        submit(run)
+    show(len(records), len(plan.runs), "runs")
+    for run, future in as_they_end(executor, calls, signals, report):
+        try:
+            record = future.result()
+        except WorkerDied as died:
+            if signals.received is not None:
+                continue
+            if tries[run.name] < TRIES:
+                report(f"{run.name}: {died}; {next_step(run)}")
+                submit(run)
+                continue
+            record = RunRecord(**run.identity, state="failed", message=str(died))
+        if record.state == "interrupted":
+            report(f"{run.name}: interrupted; {next_step(run)} with --resume")
+            continue
+        place.add(record)
+        records[run.name] = record
+        how = f"failed: {record.message}" if record.state == "failed" else f"finished in {record.seconds:.1f} s"
+        report(f"{run.name}: {how} ({len(records)} of {len(plan.runs)})")
+        show(len(records), len(plan.runs), "runs")
+    return records
 
 
 def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> RunRecord:
