@@ -22,7 +22,6 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
-from sb3_quad.base.signals import StopSignals
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
@@ -243,19 +242,6 @@ def retry_dead_trials(study: optuna.Study) -> None:
                 study.enqueue_trial(trial.params)
             except PermissionError:  # another user's
                 pass
-
-
-def try_one_of(
-    job: TrainingJob, space: SearchSpace, name: str, storage: str | Path, study: tuple[str, str, int, int], most: int | None
-) -> int | None:
-    """In a worker: one trial of a study that several share, see :meth:`Search.try_one`.
-
-    :param study: sampler, pruner, n_startup_trials, n_evaluations, as for :class:`Search`.
-    :return: its number.
-    """
-    with StopSignals():
-        trial = Search(job, space, name, storage, *study).try_one(most)
-    return None if trial is None else trial.number
 
 
 def check_hopeless(ended: Sequence[FrozenTrial]) -> None:

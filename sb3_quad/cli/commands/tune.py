@@ -6,7 +6,6 @@ examples:
   sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler random --pruner none --seed 1
   sb3-quad tune --algo dagger --storage logs/my_study.log           again or in another terminal: continues that study
   sb3-quad tune --algo dagger --storage sqlite:///study.db --study-name noise_free --env-kwargs noise:0
-  sb3-quad tune --algo dagger -n 250000 --n-trials 30 --workers 4   four trials side by side
   sb3-quad tune --algo dagger --search-space my_space.yml --hyperparams n_epochs:4
   sb3-quad train --algo dagger --env QuadTargetTracking-v0 --conf-file logs/tune/dagger/QuadTargetTracking-v0_1/best.yml
 
@@ -14,16 +13,14 @@ The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. N
 """
 
 import argparse
-import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import SB3QuadError, WorkerDied
+from sb3_quad.base.errors import SB3QuadError
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
-from sb3_quad.cli.parser import Parser, add_common, given, natural, positive, seed, whole
+from sb3_quad.cli.parser import Parser, given, natural, positive, seed, whole
 
 JOURNAL = "study.log"
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
@@ -35,8 +32,6 @@ def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("--n-trials", type=natural, default=500, metavar="N", help="trials of this process (500); 0: only write results")
     add("--max-total-trials", type=positive, metavar="N", help="trials of the whole study, failed ones excluded (no limit)")
-    add("--workers", type=positive, default=1, metavar="N", help="trials side by side, one core each (1)")
-    add_common(parser, "executor")
     add("--sampler", default="tpe", metavar="NAME", help="proposes the trials: tpe (default), random or cmaes")
     add("--pruner", default="median", metavar="NAME", help="cuts poor trials short: median (default), halving or none")
     add("--n-startup-trials", type=whole, default=10, metavar="N", help="random trials before sampler and pruner start (10)")
@@ -59,51 +54,23 @@ def run(options: argparse.Namespace) -> int:
     with StopSignals() as signals:
         search = _make_search(options)
         print(f"study {search.name} in {search.storage}: {count_trials(search)}; results go to {search.job.log_folder}")
+        ended = list[Any]()
         with progress_bar(options.progress) as show:
-            ended = list[Any]()
-            show(0, options.n_trials, "trials")
-
-            def after_each(trial: Any) -> None:
-                ended.append(trial)
-                write_results(search)
-                print(trial_line(search, trial))
-                show(len(ended), options.n_trials, "trials")
-                check_hopeless(ended)
-
             try:
-                _try(options, search, signals, after_each)
+                show(0, options.n_trials, "trials")
+                while len(ended) < options.n_trials and signals.received is None:
+                    trial = search.try_one(options.max_total_trials)
+                    if trial is None:
+                        break
+                    ended.append(trial)
+                    write_results(search)
+                    print(trial_line(search, trial))
+                    show(len(ended), options.n_trials, "trials")
+                    check_hopeless(ended)
             finally:
                 write_results(search)
     _print_results(search)
     return signals.exit_code
-
-
-def _try(options: argparse.Namespace, search: Any, signals: StopSignals, after_each: Callable[[Any], None]) -> None:
-    """Train the trials: here one by one, or by workers, each of which opens the study."""
-    from sb3_quad.executors import as_they_end, start_executor
-    from sb3_quad.tuning.search import try_one_of
-
-    if options.workers == 1 and options.executor == "local" and options.address is None:
-        for _ in range(options.n_trials):
-            trial = search.try_one(options.max_total_trials)
-            if trial is None:
-                return
-            after_each(trial)
-            if signals.received is not None:
-                return
-        return
-    study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
-    arguments = search.job, search.space, search.name, search.storage, study, options.max_total_trials
-    with start_executor(options.executor, options.workers, options.address) as executor:
-        calls = {executor.submit(try_one_of, *arguments): number for number in range(options.n_trials)}
-        for _, future in as_they_end(executor, calls, signals, print):
-            try:
-                number = future.result()
-            except WorkerDied as error:
-                print(f"a trial is lost, and tried again by whoever goes on: {error}", file=sys.stderr)
-                continue
-            if number is not None:
-                after_each(search.study.get_trials(deepcopy=False)[number])
 
 
 def _make_search(options: argparse.Namespace) -> Any:
