@@ -1,6 +1,5 @@
 """What all environments have in common: their spaces, and what they can be asked and told in flight."""
 
-import copy
 import functools
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
@@ -52,9 +51,6 @@ class BatchEnv:
         """Make the batch of n rows that fly as the keywords say; errors name the environment's class."""
         settings = validate(FlightSettings, keywords, type(self).__name__)
         self.batch = QuadcopterBatch(n, settings, seed, n_threads, autoreset)
-
-    def __copy__(self) -> Any:
-        return copy.deepcopy(self)  # two environments that share a batch would fly each other's rows
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         """A copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""

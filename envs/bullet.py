@@ -1,11 +1,8 @@
 """PyBullet's part of ``QuadcopterEnv``: the rigid body, and pictures of its flight."""
 
 import sys
-import tempfile
 import time
 import weakref
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -110,20 +107,6 @@ class BulletBody:
         state[POSITION, 0], state[QUATERNION, 0], state[VELOCITY, 0] = position, (w, x, y, z), velocity
         state[BODY_RATES, 0] = np.array(angular_velocity) @ np.array(rotation_rows(w, x, y, z))  # from the world's axes
 
-    def save(self) -> bytes:
-        """The whole simulation, to the bit: poses that PyBullet gives and takes are rounded."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "simulation.bullet"
-            p.saveBullet(str(path), physicsClientId=self.client)
-            return path.read_bytes()
-
-    def restore(self, saved: bytes) -> None:
-        """Put everything where :meth:`save` found it, in a simulation of the same bodies."""
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "simulation.bullet"
-            path.write_bytes(saved)
-            p.restoreState(fileName=str(path), physicsClientId=self.client)
-
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""
         self._close()
@@ -133,15 +116,15 @@ class Renderer:
     """Draws one vehicle, its target and the wrench that acts on it; the flight is the same with and without it.
 
     :param width: of the pictures, pixels; ``height`` likewise.
-    :param body: the simulation, if PyBullet flies. If it has a window, that is drawn into, in real time.
+    :param body: the simulation. If it has a window, that is drawn into, in real time.
     """
 
-    def __init__(self, vehicle: Vehicle, width: int, height: int, body: BulletBody | None = None) -> None:
-        self.vehicle, self.scene = vehicle, Scene(vehicle, None if body is None else body.client)
-        self.size, self.human = (width, height), body is not None and body.has_window
+    def __init__(self, vehicle: Vehicle, width: int, height: int, body: BulletBody) -> None:
+        self.vehicle, self.scene = vehicle, Scene(vehicle, body.client)
+        self.size, self.human = (width, height), body.has_window
         self.shown_at, self.frames_due = time.perf_counter(), 1.0
-        if body is not None:  # PyBullet would draw the collision sphere
-            p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client)
+        # PyBullet would draw the collision sphere.
+        p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client)
         self.reset(np.zeros(STATE_SIZE))
         if self.human:
             start_drawing(self.scene.client)
@@ -175,13 +158,6 @@ class Renderer:
         else:
             self.shown_at -= ahead  # too slow for real time: do not hurry afterwards
         return None
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("scene", "shown_at")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """A renderer that goes on as another one did, in a scene of its own."""
-        vars(self).update(vars(Renderer(state["vehicle"], *state["size"])) | state)
 
     def _place(self, state: FloatArray, wrench: FloatArray) -> None:
         self.scene.place([Pose(state, wrench, self.rotor_angles)], state[None, TARGET])

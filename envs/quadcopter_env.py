@@ -143,7 +143,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `set_task(task, task_kwargs)` | the task from the next reset on |
 
     `true_state()`, `target`, `wrench`, `noise`, `observation_mean`, `observation_std`, `task`, `task_kwargs` and `vehicle`
-    tell what holds. A copy, or what is unpickled, flies on from the same state in a PyBullet client of its own.
+    tell what holds.
 
     ## Version History
 
@@ -243,21 +243,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     def _draw(self) -> Image | None:
         return None if self._renderer is None else self._renderer.render(self.batch.state[:, 0], self.wrench)
-
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle is made of; it flies on in a simulation of its own."""
-        values = {name: value for name, value in vars(self).items() if name not in ("_body", "_renderer")}
-        camera = None if self._renderer is None else self._renderer.__getstate__()
-        return {**values, "saved": (self._body.save() if self._body.connected else None, camera)}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        body, camera = state.pop("saved")
-        vars(self).update(state)
-        self._open()
-        if body is not None:
-            self._body.restore(body)
-        if self._renderer is not None and camera is not None:
-            vars(self._renderer).update(camera)
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""

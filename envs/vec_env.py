@@ -2,8 +2,8 @@
 
 import secrets
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,15 +12,10 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
 
-from sb3_quad.base.arrays import Image
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.batch_env import BatchEnv, quadcopter_spaces
-from sb3_quad.simulation.checks import check_size
 from sb3_quad.simulation.tasks import TaskSpec
-
-if TYPE_CHECKING:
-    from sb3_quad.envs.bullet import Renderer
 
 _SETTABLE = ("target", "noise", "observation_mean", "observation_std", "task")
 _OF_ROWS = ("target", "noise", "additive_noise", "observation_mean", "observation_std", "wrench")
@@ -49,16 +44,13 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
     within the same step, and its info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``,
     ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
     infos of other rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are
-    fresh. A copy, or what is unpickled, flies on from the same state, and apart.
+    fresh.
 
     Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
     :param n_envs: number of rows; ``seed`` and ``n_threads`` as of :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
     :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over ``max_episode_steps``, so
         that the mean return and success of a training are of all its episodes, not at first of crashes alone.
-    :param render_mode: ``"rgb_array"``: :meth:`render` gives pictures, without a display; None: it gives none.
-    :param render_rows: the rows that are drawn; :meth:`render` tiles their pictures into one.
-    :param render_width: of one row's picture, pixels; ``render_height`` likewise.
     :raises ConfigError: an argument that does not fit.
     """
 
@@ -68,35 +60,17 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         task: TaskSpec = "target_tracking",
         task_kwargs: Mapping[str, Any] | None = None,
         staggered: bool = False,
-        render_mode: str | None = None,
-        render_rows: Sequence[int] = (0,),
-        render_width: int = 640,
-        render_height: int = 480,
         seed: int | None = None,
         n_threads: int | None = None,
         **keywords: Any,
     ) -> None:
         self._make_batch(n_envs, seed, n_threads, autoreset=True, task=task, task_kwargs=task_kwargs, **keywords)
-        self.render_mode, self._staggered = render_mode, staggered
-        self._renderers = self._make_renderers(render_rows, render_width, render_height)
+        self.render_mode, self._staggered = None, staggered  # QuadcopterEnv draws
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
         self._start = time.time()
         super().__init__(self.batch.n, *quadcopter_spaces(self.batch.observation.size))
-        fps: Any = round(1.0 / self.vehicle.control_step)  # SB3's type of it knows lists alone
-        self.metadata["render_fps"] = fps
-
-    def _make_renderers(self, rows: Sequence[int], width: int, height: int) -> "dict[int, Renderer]":
-        if self.render_mode is None:
-            return {}
-        if self.render_mode != "rgb_array":
-            raise ConfigError(f"render_mode {self.render_mode!r}: the batched environment has 'rgb_array' only")
-        check_size(width, height)
-        from sb3_quad.envs.bullet import Renderer  # not at the top: trainings need no PyBullet
-
-        vehicles = self.batch.vehicle_list
-        return {row: Renderer(vehicles[row], width, height) for row in self.batch.rows(rows).tolist()}
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, 18)."""
@@ -107,7 +81,6 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
             self.batch.seed(self._seeds)
             self._reset_seeds()
         observations = self.batch.reset()
-        self._follow(range(self.batch.n))
         if self._staggered:
             self.batch.stagger()
         return observations
@@ -124,7 +97,6 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         rows = np.flatnonzero(dones)
         self._ended = ended = rows.tolist()
         if ended:
-            self._follow(ended)
             elapsed = round(time.time() - self._start, 6)
             outcomes, last = self.batch.outcome[rows].tolist(), self.batch.last_observations[rows]  # copies
             for row, outcome, observation in zip(ended, outcomes, last, strict=True):
@@ -141,21 +113,8 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
                 }
         return observations, rewards, dones, self._infos
 
-    def _follow(self, rows: Iterable[int]) -> None:
-        """Let the cameras of rows that have just begun an episode jump there."""
-        for row in self._renderers.keys() & rows:
-            self._renderers[row].reset(self.batch.state[:, row])
-
-    def get_images(self) -> list[Image | None]:
-        """A picture of each of ``render_rows``, uint8 (height, width, 3)."""
-        batch = self.batch
-        return [renderer.render(batch.state[:, row], batch.wrench[:, row]) for row, renderer in self._renderers.items()]
-
     def close(self) -> None:
-        """Give back what draws; calling it twice is fine."""
-        for renderer in self._renderers.values():
-            renderer.scene.close()
-        self._renderers = {}
+        """There is nothing to give back."""
 
     @property
     def max_episode_steps(self) -> int | list[int]:

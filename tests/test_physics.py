@@ -162,7 +162,7 @@ def test_flight_of_the_shipped_vehicles_is_pybullets(name, seed, tmp_path):
     assert worst_difference(vehicle, tmp_path, state, actions, wrench).max() < 1e-9
 
 
-@pytest.mark.parametrize("physics_step", [0.001, 0.005, 0.01])
+@pytest.mark.parametrize("physics_step", [0.0005, 0.001, 0.002])
 def test_other_physics_steps(physics_step, tmp_path):
     vehicle = ITM.model_copy(update={"physics_step": physics_step, "control_step": 0.01})
     rng = np.random.default_rng(3)
@@ -179,14 +179,6 @@ def test_velocities_are_cut_as_pybullet_cuts_them(tmp_path):
     assert np.abs(flown[:, VELOCITY]).max() == 100.0
     assert np.linalg.norm(flown[:, BODY_RATES], axis=1).max() > 100.0
     assert worst_difference(ITM, tmp_path, state, actions, wrench).max() < 1e-9
-
-
-def test_large_steps_cut_the_angle_as_pybullet_does(tmp_path):
-    vehicle = ITM.model_copy(update={"physics_step": 0.01})
-    state = random_state(np.random.default_rng(1), vehicle, rates=0.0)
-    state[BODY_RATES] = 70.0, -50.0, 60.0  # more than pi / 4 in one physics step
-    actions = np.zeros((20, 4), dtype=np.float32)
-    assert worst_difference(vehicle, tmp_path, state, actions, np.zeros(12)).max() < 1e-9
 
 
 def test_rows_do_not_depend_on_the_batch():

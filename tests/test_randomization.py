@@ -1,7 +1,5 @@
 """Randomization and vehicle distributions: the same in both environments, of the row's own stream, within their ranges."""
 
-import copy
-
 import gymnasium
 import numpy as np
 import pytest
@@ -113,17 +111,6 @@ def test_an_episode_is_random_within_the_ranges():
     assert force.max() <= 5 and np.median(force[force > 0]) == pytest.approx(2.5, abs=0.3)
     torque = np.abs(batch.wrench[W.torque_body : W.torque_body + 3]).max(axis=1)
     assert torque[:2] == pytest.approx(0.1, abs=0.01) and torque[2] == pytest.approx(0.033, abs=0.003)
-
-
-def test_a_copy_on_pybullet_flies_on_with_its_vehicle():
-    env = QuadcopterEnv(randomize={"mass": [0.5, 0.6], "inertia": [0.5, 0.6]}, noise=0.0)
-    env.reset(seed=1)
-    env.step(np.full(4, 0.3, np.float32))
-    other = copy.deepcopy(env)
-    for _ in range(20):
-        np.testing.assert_array_equal(*(each.step(np.full(4, 0.3, np.float32))[0] for each in (env, other)))
-    env.close()
-    other.close()
 
 
 def test_a_share_of_zero_changes_no_flight():

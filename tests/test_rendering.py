@@ -1,22 +1,16 @@
 """Pictures: without a display, of the asked size, showing what is there, and without touching the flight."""
 
-import sys
-from pathlib import Path
-from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 import pytest
-from stable_baselines3.common.vec_env import VecVideoRecorder
 
 from sb3_quad.base.bullet import p
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.bullet import BulletBody
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
-from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 HOVER = np.zeros(4, dtype=np.float32)
@@ -103,38 +97,6 @@ def test_human_mode_without_a_display_flies_on(monkeypatch: pytest.MonkeyPatch, 
     env.reset(seed=0)
     assert np.isfinite(env.step(HOVER)[0]).all() and env.render() is None
     env.close()
-
-
-def test_sb3_films_the_batched_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    clips: list[Any] = []
-
-    def clip(frames: list[Picture], fps: int) -> Any:
-        clips.append((np.array(frames), fps))
-        return SimpleNamespace(write_videofile=lambda path: None)
-
-    for name in ("moviepy", "moviepy.video", "moviepy.video.io"):  # what SB3 encodes by; a large package
-        monkeypatch.setitem(sys.modules, name, ModuleType(name))
-    monkeypatch.setitem(sys.modules, "moviepy.video.io.ImageSequenceClip", SimpleNamespace(ImageSequenceClip=clip))
-    size = {"render_width": 160, "render_height": 120}
-    plain = QuadcopterVecEnv(5, noise=0.0, seed=0, max_episode_steps=4)
-    batch = QuadcopterVecEnv(5, noise=0.0, seed=0, max_episode_steps=4, render_mode="rgb_array", render_rows=(0, 3), **size)
-    env = VecVideoRecorder(batch, str(tmp_path), lambda step: step == 0, video_length=6)
-    np.testing.assert_array_equal(env.reset(), plain.reset())
-    for _ in range(6):
-        np.testing.assert_array_equal(env.step(np.zeros((5, 4)))[0], plain.step(np.zeros((5, 4)))[0])
-    (frames, fps), *_ = clips
-    assert frames.shape == (7, 240, 160, 3) and frames.dtype == np.uint8 and fps == 100
-    assert all(_orange(half).sum() > 20 for half in np.split(frames[3], 2))
-    assert np.abs(frames[4].astype(float) - frames[3]).mean() > 3 * np.abs(frames[3].astype(float) - frames[2]).mean()
-    single = QuadcopterEnv(noise=0.0, render_mode="rgb_array", **size)
-    single.reset(seed=row_seeds(0, 5)[3])
-    np.testing.assert_array_equal(frames[0][120:], single.render())
-    for each in (env, env, single):
-        each.close()
-    with pytest.raises(ConfigError, match="render_mode 'human'"):
-        QuadcopterVecEnv(2, render_mode="human")
-    with pytest.raises(ConfigError, match="0 to 1"):
-        QuadcopterVecEnv(2, render_mode="rgb_array", render_rows=(2,))
 
 
 def test_render_without_a_mode_warns() -> None:

@@ -324,16 +324,6 @@ class QuadcopterBatch:
             }
             vars(self).update(replaced, _arrays=BatchArrays(*(values[name] for name in BatchArrays._fields)))
 
-    def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle is made of: arrays of its own."""
-        with self.lock:
-            values = {name: value for name, value in vars(self).items() if name not in ("lock", "_arrays")}
-            return {name: value.copy() if isinstance(value, np.ndarray) else value for name, value in values.items()}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, lock=batch_lock())
-        self._bind()
-
 
 def _steps_of_rows(settings: FlightSettings, n: int) -> IntArray:
     """``max_episode_steps`` of n rows, (n,)."""

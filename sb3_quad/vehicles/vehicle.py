@@ -16,6 +16,7 @@ from sb3_quad.vehicles.gains import GeometricGains
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 MAX_SUBSTEPS = 1000  # physics steps in a control step
+MAX_PHYSICS_STEP = 0.0025  # s, for which the compiled rotation is exact
 PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
@@ -61,7 +62,7 @@ class Vehicle(Frozen):
     )
     rotor_thrust_limits: Limits | None = Field(default=None, exclude=True, description="the same in N")
     rotor_speed_limits: Limits | None = Field(default=None, exclude=True, description="the same as rotor speeds, rad/s")
-    physics_step: PositiveFloat = Field(default=0.0025, description="s")
+    physics_step: PositiveFloat = Field(default=0.0025, le=MAX_PHYSICS_STEP, description="s; at most 0.0025")
     control_step: PositiveFloat = Field(default=0.01, description="s; a whole number of physics steps")
     delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
     collision_radius: PositiveFloat = Field(description="radius of the collision sphere at the centre of mass, m")
