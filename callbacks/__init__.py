@@ -2,7 +2,7 @@
 
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.coefficient_schedule import CoefficientSchedule
-from sb3_quad.callbacks.episodes import EpisodeLog, FlightMetrics
+from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
 
@@ -11,7 +11,6 @@ __all__ = [
     "Checkpoint",
     "CoefficientSchedule",
     "EpisodeLog",
-    "FlightMetrics",
     "LastGoodModel",
     "StopOnSignal",
 ]

@@ -72,6 +72,10 @@ def test_own_callback(run):
     assert "episodes crashed, beta 0.80" in output
 
 
+def test_flight_metrics(run):
+    assert "rollout/collision_rate: " in run("flight_metrics.py", "--timesteps", "24000")
+
+
 def test_trajectory_plots(run, tmp_path):
     assert "tb/" in run("trajectory_plots.py", *SHORT)
     assert list(tmp_path.glob("tb/*/events*"))

@@ -3,13 +3,13 @@
 import gymnasium
 import numpy as np
 import pytest
+from flight_metrics import FlightMetrics
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.env_util import make_vec_env
 
 import sb3_quad  # noqa: F401
 from sb3_quad import DAgger, GeometricExpert
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.callbacks import FlightMetrics
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 
