@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+import jinja2
+
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
@@ -15,35 +17,6 @@ N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 DISTANCES = (10.0, 15.0, 20.0)  # m
 RECOVERY, NEAR = "state recovery", time_row(0.1)
 SHOWN = (SUCCESS, SURVIVAL, REWARD, NEAR, MEDIAN, QUANTILE)
-CARD = """# {name}
-
-A policy for {vehicle}: it recovers from random attitudes, velocities and body rates, and flies
-to targets. It reads the 18 features of `sb3_quad`'s environments, scaled as there, and gives four actions in
-[-1, 1], the thrusts of the rotors.{memory}
-
-## Measured
-
-{recoveries:,} fresh recoveries and {targets:,} fresh targets at each distance; {noise} observation noise, the mean action.
-95 % intervals.
-
-{table}
-
-## How it was trained
-
-```bash
-{command}
-```
-
-{facts}
-
-## Loading it
-
-```python
-from stable_baselines3 import PPO
-
-model = PPO.load("{name}.zip", device="cpu")  # the file beside this card
-```
-"""
 
 
 def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Metrics]:
@@ -78,17 +51,19 @@ def write_card(
             cells[NEAR] = Cell(words="–")
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))
     columns = [Column(row.heading) for row in SHOWN]
-    remembered = ObservationSettings.model_validate(
+    seen = ObservationSettings.model_validate(
         {key: settings[key] for key in ObservationSettings.model_fields if key in settings}
     )
-    kept = ", ".join(f"{key}={value!r}" for key, value in remembered.model_dump(exclude_defaults=True).items())
-    return CARD.format(
+    loader = jinja2.PackageLoader("sb3_quad.report", "templates")
+    options: Any = {"undefined": jinja2.StrictUndefined, "keep_trailing_newline": True}
+    template = jinja2.Environment(loader=loader, **options).get_template("card.md.j2")
+    return template.render(
         name=name,
-        memory=f" It also reads what they were before, as these `env_kwargs` say:\n`{kept}`." if kept else "",
+        frames=", ".join(f"{key}={value!r}" for key, value in seen.model_dump(exclude_defaults=True).items()),
         vehicle=f"the vehicle `{settings['vehicle']}`" if settings.get("vehicles") is None else str(settings["vehicles"]),
         noise=in_words(settings["noise"]),
-        recoveries=measured[RECOVERY].n,
-        targets=next(metrics.n for task, metrics in measured.items() if task != RECOVERY),
+        recoveries=f"{measured[RECOVERY].n:,}",
+        targets=f"{next(metrics.n for task, metrics in measured.items() if task != RECOVERY):,}",
         table=Table(columns, rows).markdown(),
         command=command,
         facts=text_table("", ("", ""), facts.items()).markdown(),
