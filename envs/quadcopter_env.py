@@ -11,10 +11,13 @@ from sb3_quad.base.arrays import Float32Array, FloatArray, Image
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
-from sb3_quad.envs.reset_options import fixed_rows
-from sb3_quad.simulation.checks import check_size
+from sb3_quad.simulation.checks import check_size, per_row
 from sb3_quad.simulation.settings import ENDLESS
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY
 from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.vehicles.vehicle import Vehicle
+
+_START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
 
 
 class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
@@ -190,7 +193,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         :raises ConfigError: an unknown option, or a value that is no start.
         """
         super().reset(seed=seed)
-        fixed = fixed_rows(options, self.vehicle)
+        fixed = _fixed_rows(options, self.vehicle)
         batch = self.batch
         if seed is not None:
             batch.seed([seed])
@@ -223,10 +226,9 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         if not np.isfinite(array).all():
             raise ValueError(f"action {array.tolist()}: every number must be finite")
         batch = self.batch
-        with batch.lock:
-            self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0])
-            self._body.read(batch.state)
-            observations, _, _ = batch.score(array[None])
+        self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0])
+        self._body.read(batch.state)
+        observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":
             self._draw()
         info = self._info()
@@ -260,3 +262,29 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         return np.asarray(super()._by_row(columns)[0])
+
+
+def _fixed_rows(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
+    """The rows of the state that ``options`` of a reset fix, and their values."""
+    given = dict(options or {})
+    start = given.pop("state", None) or {}
+    if not isinstance(start, Mapping):
+        raise ConfigError(f"options: state {start!r}: must hold some of {', '.join(_START)}")
+    for parts, known in ((given, ("target", "state")), (start, _START)):
+        for key in parts:
+            if key not in known:
+                raise ConfigError(f"options: {unknown('key', key, known)}")
+    fixed = []
+    for name, rows in {"target": TARGET, **_START}.items():
+        value = (given if name == "target" else start).get(name)
+        if value is None:
+            continue
+        values = per_row(f"options: {name}", value, 1, rows.stop - rows.start)[:, 0]
+        if name == "position" and values[2] <= vehicle.collision_radius:
+            raise ConfigError(f"position {values.tolist()}: touches the ground; z must exceed {vehicle.collision_radius} m")
+        if name == "quaternion":
+            if np.linalg.norm(values) < 1e-6:
+                raise ConfigError("options: quaternion: must not be zero")
+            values = values / np.linalg.norm(values)
+        fixed.append((rows, values))
+    return fixed

@@ -19,7 +19,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.compiled import _tell, first_call
+from sb3_quad.simulation.compiled import _tell, compile_notice
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("target_tracking", "state_recovery")
@@ -194,13 +194,13 @@ def test_compiling_is_told_where_something_is_compiled_and_nowhere_else(capsys):
         return x + x
 
     _tell.cache_clear()
-    with first_call(doubled):
+    with compile_notice():
         pass
     assert capsys.readouterr().err == ""
-    with first_call(doubled):
+    with compile_notice():
         assert (doubled(1), doubled(1.0)) == (2, 2.0)  # compiled twice
     assert capsys.readouterr().err.count("sb3_quad: compiling") == 1
-    with first_call(doubled):
+    with compile_notice():
         doubled(1)
     assert capsys.readouterr().err == ""
 

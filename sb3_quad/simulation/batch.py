@@ -12,7 +12,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
-from sb3_quad.simulation.compiled import first_call
+from sb3_quad.simulation.compiled import compile_notice
 from sb3_quad.simulation.frames import PositionIntegral, new_frames
 from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, rotor_wrenches, step
 from sb3_quad.simulation.noise import levels
@@ -23,7 +23,7 @@ from sb3_quad.simulation.sampling import GUST_FORCE, GUST_SIZE
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
-from sb3_quad.simulation.threads import batch_lock, share_out
+from sb3_quad.simulation.threads import share_out
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -100,11 +100,10 @@ class QuadcopterBatch:
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
-        self.lock = batch_lock()  # held while compiled code reads and writes the arrays, and while some are replaced
         self._bind()
         self.set_noise(settings.noise)
         self.set_observation_scaling(settings.observation_mean, settings.observation_std)
-        with first_call(step):
+        with compile_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
 
@@ -160,8 +159,7 @@ class QuadcopterBatch:
 
     def _step(self, mode: int, *arrays: npt.NDArray[Any]) -> bool:
         chunks = min(self.threads, self.n // CHUNK)
-        with self.lock:
-            return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
+        return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
 
     def turn_rotors(self, actions: npt.NDArray[Any]) -> FloatArray:
         """The rotors' part of a control step of row 0, for another simulator, whose part :meth:`score` judges.
@@ -171,9 +169,8 @@ class QuadcopterBatch:
             wrench has in the world frame acts besides.
         """
         wrenches = np.empty((self.vehicle_list[0].substeps, 2, 3))
-        with self.lock:
-            a = self._arrays
-            rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, a.physics_step, a.own_delays)
+        a = self._arrays
+        rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, a.physics_step, a.own_delays)
         return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
@@ -208,25 +205,23 @@ class QuadcopterBatch:
 
     def snapshot(self) -> Arrays:
         """Copies of all that future flight depends on, by name."""
-        with self.lock:
-            return {name: getattr(self, name).copy() for name in _KEPT}
+        return {name: getattr(self, name).copy() for name in _KEPT}
 
     def restore(self, snapshot: Arrays) -> None:
         """Undo what has happened since :meth:`snapshot`.
 
         :raises ConfigError: the snapshot is of other environments.
         """
-        with self.lock:
-            for name, array in snapshot.items():
-                own = getattr(self, name) if name in _KEPT else np.empty(0)
-                fits = (array.dtype, array.shape) == (own.dtype, own.shape)
-                if not fits or (name == "task_index" and (array >= self.tasks.weights.size).any()):
-                    raise ConfigError(
-                        "the saved state of the environments does not fit these "
-                        f"({name}: {array.dtype} of shape {array.shape}); use the run's own settings"
-                    )
-            for name, array in snapshot.items():
-                getattr(self, name)[...] = array
+        for name, array in snapshot.items():
+            own = getattr(self, name) if name in _KEPT else np.empty(0)
+            fits = (array.dtype, array.shape) == (own.dtype, own.shape)
+            if not fits or (name == "task_index" and (array >= self.tasks.weights.size).any()):
+                raise ConfigError(
+                    "the saved state of the environments does not fit these "
+                    f"({name}: {array.dtype} of shape {array.shape}); use the run's own settings"
+                )
+        for name, array in snapshot.items():
+            getattr(self, name)[...] = array
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
         """Move targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
@@ -290,39 +285,36 @@ class QuadcopterBatch:
                 "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
             )
         new = resolve_tasks(task, task_kwargs)
-        with self.lock:
-            used, index = np.unique(self.task_index, return_inverse=True)
-            parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
-            # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
-            weights = np.concatenate([np.zeros(used.size), new.weights])
-            table = TaskTable(parameters, weights)
-            self._bind(task=task, task_kwargs=dict(task_kwargs or {}), tasks=table, task_index=index.astype(np.int64))
+        used, index = np.unique(self.task_index, return_inverse=True)
+        parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
+        # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
+        weights = np.concatenate([np.zeros(used.size), new.weights])
+        table = TaskTable(parameters, weights)
+        self._bind(task=task, task_kwargs=dict(task_kwargs or {}), tasks=table, task_index=index.astype(np.int64))
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
         """The columns of noise level and scaling to write for some rows, which are set apart unless one serves all."""
-        with self.lock:
-            if self.mean.shape[1] < self.n:
-                if rows is None and one_for_all:
-                    return np.zeros(1, dtype=np.int64)
-                mean, std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-                relative, additive = (np.repeat(each, self.n) for each in (self.noise_level, self.additive_level))
-                self._bind(noise_level=relative, additive_level=additive, mean=mean, std=std)
+        if self.mean.shape[1] < self.n:
+            if rows is None and one_for_all:
+                return np.zeros(1, dtype=np.int64)
+            mean, std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
+            relative, additive = (np.repeat(each, self.n) for each in (self.noise_level, self.additive_level))
+            self._bind(noise_level=relative, additive_level=additive, mean=mean, std=std)
         return self.rows(rows)
 
     def _bind(self, **replaced: Any) -> None:
         """Replace attributes, and note all arrays for the compiled step: all of it at once, or nothing."""
-        with self.lock:
-            values = {**vars(self), **replaced}
-            first, table = values["vehicle_list"][0], values["tasks"]
-            values |= {
-                "task_parameters": table.parameters,
-                "task_weights": table.weights,
-                "physics_step": first.physics_step,
-                "substeps": first.substeps,
-                "own_delays": self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any()),
-                "own_arms": self.base_vehicles.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
-            }
-            vars(self).update(replaced, _arrays=BatchArrays(*(values[name] for name in BatchArrays._fields)))
+        values = {**vars(self), **replaced}
+        first, table = values["vehicle_list"][0], values["tasks"]
+        values |= {
+            "task_parameters": table.parameters,
+            "task_weights": table.weights,
+            "physics_step": first.physics_step,
+            "substeps": first.substeps,
+            "own_delays": self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any()),
+            "own_arms": self.base_vehicles.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
+        }
+        vars(self).update(replaced, _arrays=BatchArrays(*(values[name] for name in BatchArrays._fields)))
 
 
 def _steps_of_rows(settings: FlightSettings, n: int) -> IntArray:

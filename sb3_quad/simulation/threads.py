@@ -1,4 +1,4 @@
-"""Threads that share a compiled function's work in chunks, and the locks of batches.
+"""Threads that share a compiled function's work in chunks.
 
 Whoever comes takes the next chunk: a thread that is late, or never comes, costs time but changes nothing. Numba's own pools do
 not suit: one spins between calls and fights torch for the cores, and forbids fork.
@@ -7,9 +7,7 @@ not suit: one spins between calls and fights torch for the cores, and forbids fo
 import os
 import queue
 import threading
-import weakref
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -48,7 +46,6 @@ class _Pool:
 
 
 _pool = _Pool()
-_locks: weakref.WeakSet[Any] = weakref.WeakSet()
 
 
 def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> Any:
@@ -75,18 +72,9 @@ def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> An
     return result
 
 
-def batch_lock() -> AbstractContextManager[Any]:
-    """A lock for a batch, which one thread may take several times; free in a forked child, whatever the parent was at."""
-    lock = threading.RLock()
-    _locks.add(lock)
-    return lock
-
-
 def _renew() -> None:
     global _pool
     _pool = _Pool()  # a forked child has no threads but the one that forked
-    for lock in _locks:
-        lock._at_fork_reinit()
 
 
 if hasattr(os, "register_at_fork"):
