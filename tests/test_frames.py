@@ -82,7 +82,7 @@ def test_the_integral_is_that_of_what_is_observed_near_the_target():
     assert used > 50
 
 
-def test_a_snapshot_and_a_copy_keep_the_frames_and_looking_changes_nothing():
+def test_a_snapshot_keeps_the_frames_and_looking_changes_nothing():
     env = QuadcopterVecEnv(
         5, seed=0, history=[0, 2, 7], last_action=True, position_integral={}, randomize={"mass": [0.9, 1.1]}
     )
@@ -92,9 +92,8 @@ def test_a_snapshot_and_a_copy_keep_the_frames_and_looking_changes_nothing():
         seen = env.step(action)[0]
         for _ in range(2):
             np.testing.assert_array_equal(env.batch.observe(), seen)
-    saved, copied = env.batch.snapshot(), env.__copy__()
+    saved = env.batch.snapshot()
     ahead = [env.step(action)[0] for action in actions[30:]]
-    np.testing.assert_array_equal(ahead, [copied.step(action)[0] for action in actions[30:]])
     env.batch.restore(saved)
     np.testing.assert_array_equal(ahead, [env.step(action)[0] for action in actions[30:]])
 

@@ -8,9 +8,8 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.layout import row_slices
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
-from sb3_quad.simulation.state import STATE, QuadcopterState
+from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
 
 # What a control step gives: observations, (n, 18) or what else the agent is to see; rewards, (n,); which rows are lost, on the
 # ground or out of range, and which on the ground; |r - r_T|, m; which would be a success if they ended now.

@@ -9,9 +9,19 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, WRENCH_SIZE, P, QuadcopterState, W
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    TARGET,
+    VELOCITY,
+    WRENCH_SIZE,
+    P,
+    QuadcopterState,
+    W,
+    first_rows,
+)
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
 

@@ -11,7 +11,7 @@ from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS,
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.noise import in_words
+from sb3_quad.simulation.settings import in_words
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 DISTANCES = (10.0, 15.0, 20.0)  # m

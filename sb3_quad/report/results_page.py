@@ -23,7 +23,7 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, Section, write_page
 from sb3_quad.report.plots import Plot
 from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, paths_plot
-from sb3_quad.simulation.noise import in_words
+from sb3_quad.simulation.settings import in_words
 
 OVERVIEW = (
     "Success: the flight ends within 0.1 m of its target, or, where it starts at its target, within 0.25 m and tilted by at"

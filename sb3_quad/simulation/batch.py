@@ -15,12 +15,11 @@ from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_n
 from sb3_quad.simulation.compiled import compile_notice
 from sb3_quad.simulation.frames import PositionIntegral, new_frames
 from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, rotor_wrenches, step
-from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.sampling import GUST_FORCE, GUST_SIZE
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
 from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
 from sb3_quad.simulation.threads import share_out

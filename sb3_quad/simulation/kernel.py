@@ -12,13 +12,12 @@ import numpy as np
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
-from sb3_quad.simulation.episodes import count_episode, start_episode
 from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
 from sb3_quad.simulation.observation import NORMALS, OBSERVATION_SIZE, WORDS, observe
 from sb3_quad.simulation.physics import command_rotors, fly, moment, turn_rotors
 from sb3_quad.simulation.random import STEP
 from sb3_quad.simulation.reward import score, succeeds
-from sb3_quad.simulation.sampling import add_gusts, advance_gusts, sample_episode
+from sb3_quad.simulation.sampling import add_gusts, advance_gusts, count_episode, sample_episode, start_episode
 from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE, P, W, X
 from sb3_quad.simulation.tasks import SCORED, S, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish

@@ -10,9 +10,9 @@ import numpy as np
 from numba import float32
 
 from sb3_quad.simulation.compiled import LANES, compiled
-from sb3_quad.simulation.layout import first_rows, row_slices
 from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.simulation.random import random_words, standard_normals
+from sb3_quad.simulation.state import first_rows, row_slices
 
 
 class Feature(NamedTuple):
@@ -92,7 +92,7 @@ def _disturb_and_scale(b):
 
 @compiled(inline="always")
 def observe(b):
-    """``b.feature``: the observations of a loaded block, disturbed by :mod:`.noise`, scaled.
+    """``b.feature``: the observations of a loaded block, disturbed by the noise and scaled.
 
     The noise belongs to the row's episode and step: it is the same until the stream counts on.
     """

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, NonNegativeFloat
 
-from sb3_quad.base.validate import validate
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.noise import NoiseLevel
 from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
@@ -19,6 +19,19 @@ Steps = Annotated[int, Field(gt=0, le=ENDLESS)]
 AsList = BeforeValidator(lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value)
 Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
+
+
+class Noise(Frozen):
+    """Standard deviations of a feature x with scale σ (Eq. 3.16): √((relative x)² + (additive σ)²).
+
+    That is the sum of two independent normal disturbances; one number for short is ``relative``.
+    """
+
+    relative: NonNegativeFloat = Field(default=0.0, description="in shares of the feature itself, 0.05 in the thesis")
+    additive: NonNegativeFloat = Field(default=0.0, description="in shares of σ, the same wherever the vehicle is")
+
+
+NoiseLevel = NonNegativeFloat | list[NonNegativeFloat] | Noise
 
 
 class FlightSettings(ObservationSettings):
@@ -87,3 +100,15 @@ class FlightSettings(ObservationSettings):
         layout = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
         changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles, "rotor_layout": layout}
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
+
+
+def levels(noise: Any) -> tuple[FloatArray, FloatArray]:
+    """The relative and the additive level of a valid ``NoiseLevel``, () or (rows,) each."""
+    relative, additive = (noise.relative, noise.additive) if isinstance(noise, Noise) else (noise, 0.0)
+    return np.asarray(relative, np.float64), np.asarray(additive)
+
+
+def in_words(noise: Any) -> str:
+    """Such as ``5 %``, or ``5 % and 2 % of σ``; of several rows the mean."""
+    relative, additive = (100 * level.mean() for level in levels(noise))
+    return f"{relative:g} %" + (f" and {additive:g} % of σ" if additive else "")

@@ -8,17 +8,37 @@ A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N)
 three rows each, all at the centre of mass.
 """
 
-from collections.abc import Callable, Sequence
+from collections import namedtuple
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.simulation.layout import first_rows, row_slices
 from sb3_quad.simulation.physics import rotation_rows
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
+
+
+def first_rows(sizes: Mapping[str, int]) -> Any:
+    """The first row of each quantity, by its name, where ``sizes`` are how many rows each takes.
+
+    Compiled code reads the numbers as constants, and none is counted by hand.
+
+    >>> first_rows({"position": 3, "quaternion": 4})
+    Rows(position=0, quaternion=3)
+    """
+    starts = [0, *accumulate(sizes.values())]
+    rows: Any = namedtuple("Rows", list(sizes))  # type: ignore[misc]
+    return rows._make(starts[:-1])
+
+
+def row_slices(sizes: Mapping[str, int]) -> dict[str, slice]:
+    """The rows of each quantity, by its name."""
+    return {name: slice(start, start + sizes[name]) for name, start in first_rows(sizes)._asdict().items()}
+
 
 STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}
 STATE_SIZE = sum(STATE.values())

@@ -1,6 +1,6 @@
 """The tasks (thesis 4.2): where an episode starts, what a control step is worth and when the episode is over.
 
-A task is data. :mod:`.episodes` begins episodes by it, :mod:`.reward` scores their control steps.
+A task is data. :mod:`.sampling` begins episodes by it, :mod:`.reward` scores their control steps.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, mo
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import Frozen, validate
-from sb3_quad.simulation.layout import first_rows
+from sb3_quad.simulation.state import first_rows
 
 
 class Task(Frozen):

@@ -17,10 +17,9 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.layout import first_rows
 from sb3_quad.simulation.random import DESIGN, uniforms
-from sb3_quad.simulation.ranges import FIXED, FIXED_NUMBERS, PositiveRange, Range, between
-from sb3_quad.simulation.state import P
+from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, PositiveRange, Range, between
+from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.vehicles.distributions")

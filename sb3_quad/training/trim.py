@@ -28,9 +28,8 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly
 from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
-from sb3_quad.simulation.noise import levels
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import first_vehicle
 

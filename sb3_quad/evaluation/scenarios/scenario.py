@@ -18,8 +18,8 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
-from sb3_quad.simulation.noise import Noise
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.settings import Noise
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
