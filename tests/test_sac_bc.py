@@ -16,7 +16,6 @@ from sb3_quad.training import transfer
 from sb3_quad.training.transfer import transfer_policy
 
 SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 32, "buffer_size": 2000, "seed": 3, "device": "cpu"}
-ALL = {"expert_timesteps": 64, "expert_fraction": 0.25, "bc_coef": 0.5, "expert_proposal": True}
 
 
 def swing_up(observation):
@@ -48,35 +47,15 @@ def test_without_additions_it_is_sac_bit_for_bit(monkeypatch, settings):
             assert ours.logger.name_to_value[name] == pytest.approx(value), name
 
 
-def test_the_expert_flies_first_and_its_share_of_a_batch_is_its_own():
-    model = pendulum(expert_timesteps=40, expert_fraction=0.25).learn(400)
-    buffer = model.expert_buffer
-    assert buffer.size() * 4 == 40 and buffer.full and not model.expert_flies
-    assert model.replay_buffer.size() * 4 == 360  # and nothing of it in the agent's own
-    flown = buffer.observations.reshape(-1, 3)
-    np.testing.assert_allclose(2.0 * buffer.actions.reshape(-1, 1), swing_up(flown), atol=1e-6)
-    data = model._sample(32)
-    of_expert = (data.observations[:, None] == th.as_tensor(flown)).all(dim=2).any(dim=1)
-    assert data.observations.shape == (32, 3)
-    assert of_expert.tolist() == [False] * 24 + [True] * 8
-
-
 def test_labels_go_with_n_step_returns():
-    data = pendulum(bc_coef=0.5, n_steps=3).learn(400)._sample(300)
+    data = pendulum(bc_coef=0.5, n_steps=3).learn(400).replay_buffer.sample(300)
     np.testing.assert_allclose(2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5)
     assert (data.discounts.numpy() < 0.99).any()
 
 
-def test_labels_lie_beside_the_actions_of_the_same_state_and_of_the_next():
-    model = pendulum(bc_coef=0.5, expert_proposal=True).learn(1200)  # the episodes end after 800
-    data, buffer = model._sample(500), model.replay_buffer
+def test_labels_lie_beside_the_actions_of_the_same_state():
+    data = pendulum(bc_coef=0.5).learn(1200).replay_buffer.sample(500)  # the episodes end after 800
     np.testing.assert_allclose(2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5)
-    known = data.next_is_labelled.flatten()
-    ended = buffer.dones[:300].astype(bool)
-    np.testing.assert_array_equal(buffer.next_is_labelled[:300, :, 0], ~ended)  # no state is left to ask about
-    assert ended.sum() == 4 and known.float().mean() > 0.9
-    following = 2.0 * data.next_expert_actions[known].numpy()
-    np.testing.assert_allclose(following, swing_up(data.next_observations[known].numpy()), atol=1e-5)
 
 
 def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone():
@@ -126,32 +105,6 @@ def test_the_q_filter_clones_where_the_critic_prefers_the_expert(prefers):
     assert model._bc_loss(th.zeros(2, 3), th.zeros(2, 1), labels)[1] == 1.0
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_proposal_of_greater_q_is_flown(sign):
-    model = pendulum(expert_proposal=True, train_freq=1, gradient_steps=0, expert=lambda seen: np.full((len(seen), 1), 1.0))
-    model.critic_target.forward = lambda observations, actions: (sign * actions,) * 2
-    model.learn(400)
-    flown = model.replay_buffer.actions[:100, :, 0]
-    assert (flown >= 0.5).all() if sign > 0 else (flown <= 0.5).all()  # 1 of 2 is 0.5 of 1
-    assert 0.2 < (flown == 0.5).mean() < 0.8  # each is taken at times
-
-
-def test_the_target_bootstraps_from_the_better_proposal():
-    model = pendulum(expert_proposal=True, gradient_steps=0, ent_coef=0.0, gamma=0.5, critic_warmup=10**6).learn(80)
-    data = model._sample(32)._replace(rewards=th.zeros(32, 1), dones=th.zeros(32, 1))
-    model._sample = lambda batch_size: data
-    model.critic_target.forward = lambda observations, actions: (actions, actions)
-    nothing = 0.0 * sum(parameter.sum() for parameter in model.critic.parameters())  # for the backward pass to go through
-    model.critic.forward = lambda observations, actions: (nothing + actions,)
-    own = []
-    sample = model.actor.action_log_prob
-    model.actor.action_log_prob = lambda observations: (own.append(sample(observations)), own[-1])[1]
-    model.train(1, 32)
-    target = 0.5 * th.max(own[1][0], data.next_expert_actions)
-    expected = 0.5 * (data.actions - target).square().mean()
-    assert model.logger.name_to_value["train/critic_loss"] == pytest.approx(expected.item(), rel=1e-5)
-
-
 def test_a_loss_that_is_not_finite_ends_the_training_and_other_arguments_are_sacs():
     theirs, ours = (inspect.signature(each).parameters for each in (SAC, SACBC))
     assert all(ours[name].default == theirs[name].default for name in theirs)
@@ -173,7 +126,7 @@ def test_while_the_critic_warms_up_the_actor_stands_still():
 
 def test_a_loaded_agent_is_the_same_and_needs_its_expert_to_go_on(tmp_path):
     """A run that goes on with its buffers: tests/test_value_based.py."""
-    straight = pendulum(**ALL).learn(320)
+    straight = pendulum(bc_coef=0.5).learn(320)
     straight.save(tmp_path / "agent.zip")
     loaded = SACBC.load(tmp_path / "agent.zip", device="cpu", expert=swing_up, env=straight.get_env())
     assert th.equal(parameters(straight.policy), parameters(loaded.policy)) and loaded.expert is swing_up
@@ -184,12 +137,13 @@ def test_a_loaded_agent_is_the_same_and_needs_its_expert_to_go_on(tmp_path):
 def test_the_batch_gives_the_buffer_what_sb3_wants_of_ends():
     """A time limit is no end of the values; the state before it is the last of the same flight."""
     env = QuadcopterVecEnv(4, "target_tracking", seed=0, max_episode_steps=6)
-    model = SACBC("MlpPolicy", env, expert=PIDExpert(), **{**SMALL, **ALL, "expert_timesteps": 48, "learning_starts": 0})
-    model.learn(48)
-    buffer = model.expert_buffer
-    assert buffer.dones[:, 0].nonzero()[0].tolist() == [5, 11] and (buffer.dones == buffer.timeouts).all()
-    assert (model.expert_buffer.sample(64).dones == 0).all()
-    same = np.isclose(buffer.next_observations[:-1], buffer.observations[1:]).all(axis=(1, 2))
+    buffer = (
+        SACBC("MlpPolicy", env, expert=PIDExpert(), bc_coef=0.5, **{**SMALL, "learning_starts": 0}).learn(48).replay_buffer
+    )
+    flown = slice(0, 12)
+    assert buffer.dones[flown, 0].nonzero()[0].tolist() == [5, 11] and (buffer.dones == buffer.timeouts).all()
+    assert (buffer.sample(64).dones == 0).all()
+    same = np.isclose(buffer.next_observations[:11], buffer.observations[1:12]).all(axis=(1, 2))
     assert same.tolist() == [True] * 5 + [False] + [True] * 5
 
 
@@ -197,9 +151,6 @@ def test_the_batch_gives_the_buffer_what_sb3_wants_of_ends():
     ("settings", "error", "message"),
     [
         ({"bc_loss": "nll"}, ConfigError, "bc_loss"),
-        ({"expert_fraction": 1.5, "expert_timesteps": 8}, ConfigError, "from 0 to 1"),
-        ({"expert_fraction": 0.5}, ConfigError, "expert_timesteps is 0"),
-        ({"expert_proposal": True, "n_steps": 3}, ConfigError, "n_steps 1"),
         ({"bc_coef": 0.5, "expert": None}, ExpertError, "needs an expert"),
         ({"bc_coef": 0.5, "replay_buffer_class": HerReplayBuffer}, ConfigError, "has no room"),
     ],
@@ -233,7 +184,7 @@ def test_an_actor_takes_over_what_an_on_policy_zip_flies(tmp_path, monkeypatch, 
 
 @pytest.mark.slow
 def test_it_learns_pendulum_from_its_expert_in_seconds():
-    settings = {**ALL, "bc_coef": 5.0, "expert_timesteps": 1600, "learning_rate": 3e-3, "batch_size": 128}
+    settings = {"bc_coef": 5.0, "learning_rate": 3e-3, "batch_size": 128}
     settings |= {"gradient_steps": 16, "train_freq": 8, "policy_kwargs": {"net_arch": [64, 64]}, "ent_coef": 0.01}
     model = pendulum(8, **settings).learn(8000)
     agent, new = (evaluate_policy(each, make_vec_env("Pendulum-v1", 16, seed=1), 16)[0] for each in (model, pendulum()))

@@ -50,12 +50,7 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
         assert model.ep_info_buffer  # it is saved too, so it must not be empty here
         FlightSettings(vehicle="crazyflie", noise=0.1 * number, observation_mean=np.full(18, 0.5)).write_into(model)
         model.save(tmp_path / f"{number}.zip")
-    additions = {
-        "expert_timesteps": 64,
-        "expert_fraction": 0.25,
-        "bc_coef": LinearSchedule(0.5, 0.0, 1.0),
-        "expert_proposal": True,
-    }
+    additions = {"bc_coef": LinearSchedule(0.5, 0.0, 1.0)}
     sac = SACBC("MlpPolicy", env, expert=PIDExpert(), buffer_size=2000, learning_starts=0, seed=0, device="cpu", **additions)
     sac.learn(320)
     FlightSettings().write_into(sac)

@@ -11,7 +11,7 @@ from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, Ro
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array, IntArray
+from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_arrays
 
@@ -49,10 +49,7 @@ class ExpertRolloutBuffer(RolloutBuffer):
 
 
 class ExpertReplaySamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions for a state and the next one.
-
-    ``next_is_labelled``, bool (b, 1), says where there are expert actions for the next state.
-    """
+    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions."""
 
     observations: th.Tensor
     actions: th.Tensor
@@ -61,38 +58,32 @@ class ExpertReplaySamples(NamedTuple):
     rewards: th.Tensor
     discounts: th.Tensor | None
     expert_actions: th.Tensor
-    next_expert_actions: th.Tensor
-    next_is_labelled: th.Tensor
 
 
 class ExpertReplayBuffer(ReplayBuffer):
-    """SB3's replay buffer with the expert's scaled actions for each state and for the next one.
+    """SB3's replay buffer with the expert's scaled actions for each state.
 
     The algorithm calls :meth:`label` before it calls :meth:`add` for the same step.
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
-        shape = (self.buffer_size, self.n_envs, self.action_dim)
-        self.expert_actions, self.next_expert_actions = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        self.next_is_labelled = np.zeros((*shape[:2], 1), np.bool_)
+        self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), np.float32)
 
-    def label(self, actions: Float32Array, next_actions: Float32Array, next_is_labelled: BoolArray) -> None:
-        """Set the expert's actions (n_envs, action_dim) for the row that is added next, and the next states that have one."""
-        self.expert_actions[self.pos], self.next_expert_actions[self.pos] = actions, next_actions
-        self.next_is_labelled[self.pos] = next_is_labelled[:, None]
+    def label(self, actions: Float32Array) -> None:
+        """Set the expert's actions (n_envs, action_dim) for the row that is added next."""
+        self.expert_actions[self.pos] = actions
 
     def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> ExpertReplaySamples:  # type: ignore[override]
         # SB3 samples each row's environment itself and keeps it to itself: the same numbers are sampled twice.
         before = np.random.get_state()  # noqa: NPY002
         at = batch_inds, np.random.randint(0, high=self.n_envs, size=batch_inds.shape)  # noqa: NPY002
         np.random.set_state(before)  # noqa: NPY002
-        labels = self.expert_actions[at], self.next_expert_actions[at], self.next_is_labelled[at]
-        return ExpertReplaySamples(*super()._get_samples(batch_inds, env), *map(self.to_torch, labels))
+        return ExpertReplaySamples(*super()._get_samples(batch_inds, env), self.to_torch(self.expert_actions[at]))
 
 
 class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
-    """The same with SB3's n-step returns; the next state's labels are those one step on."""
+    """The same with SB3's n-step returns."""
 
 
 class AggregatedDataset:

@@ -1,4 +1,4 @@
-"""Soft actor-critic that also learns from an expert: a value-based stage two."""
+"""Soft actor-critic that also clones an expert: a value-based stage two."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import ContinuousCritic
-from stable_baselines3.common.type_aliases import GymEnv, ReplayBufferSamples, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from stable_baselines3.common.utils import FloatSchedule, polyak_update
 from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
@@ -24,43 +24,36 @@ from sb3_quad.controllers.controller import Controller
 
 BC_LOSSES: tuple[CloningLoss, ...] = ("mse", "huber", "huber_mse")
 BC_FILTERS = ("none", "q", "agreement")
-LABELS = "labels"  # in the state of the expert: its actions for the present states
+STARTS = "starts"  # in the state of the expert: the rows that have just begun an episode
 
 
 class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
-    """Soft Actor-Critic with an expert (SAC+BC): its transitions, its actions and its proposals, each a switch of its own.
+    """Soft Actor-Critic with a cloning term in the actor's loss (SAC+BC).
 
     All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the additions at their defaults it is
     SAC, bit for bit. A saved model loads with ``SAC.load``, even where this package is not installed. For any environment with
-    a Box action space; with an addition, observations that are no Dict.
+    a Box action space; with cloning, observations that are no Dict.
 
     What is added, with its source:
 
     =====================  ============================================================================================
-    ``expert_fraction``    a share of each mini-batch from the expert's own flights: RLPD, https://arxiv.org/abs/2302.02948
-    ``critic_layer_norm``  layer-normalised critics, which overestimate unseen actions less: RLPD
+    ``critic_layer_norm``  layer-normalised critics, which overestimate unseen actions less: RLPD,
+                           https://arxiv.org/abs/2302.02948
     ``bc_coef``            a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089; weighed by
                            the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every
                            state that is visited, as in DAgger, not its own flights alone
     ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair et al.
-    ``expert_proposal``    the expert's action and the agent's are both proposed, and the one of greater Q is flown, and
-                           bootstrapped from: IBRL, https://arxiv.org/abs/2311.02198
     =====================  ============================================================================================
 
-    :param expert: who flies first, labels and proposes: an object with ``actions(state)`` on the true state of our
+    :param expert: who labels: an object with ``actions(state)`` on the true state of our
         environments, an SB3 model, or a function from observations to actions. It is never saved. Needed when learning starts
-        with any of the additions.
-    :param expert_timesteps: the first timesteps of the training, over all environments, which the expert flies; nothing is
-        learnt meanwhile. They are kept in a buffer of their own, ``expert_buffer``. Random actions follow only if
-        ``learning_starts`` is more than that.
-    :param expert_fraction: the share of each mini-batch that comes from ``expert_buffer``, 0 to 1 (RLPD: a half).
+        with cloning.
     :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a schedule of the remaining
         progress.
     :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear beyond 0.05;
         ``"huber_mse"``, that and three times the squared error. Actions are those of the policy, within -1 and 1.
     :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's action is greater than Q of the
         policy's mean action; ``"agreement"``, where both differ by less than 0.3, as of :class:`PPOBC`.
-    :param expert_proposal: whether the expert's action is proposed beside the agent's. Needs ``n_steps=1``.
     :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that comes from imitation is
         not moved by a critic that has learnt nothing yet.
     :param critic_layer_norm: whether the critics normalise the inputs of their activations, without parameters: in stock
@@ -100,12 +93,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         seed: int | None = None,
         device: th.device | str = "auto",
         expert: Any = None,
-        expert_timesteps: int = 0,
-        expert_fraction: float = 0.0,
         bc_coef: float | Schedule = 0.0,
         bc_loss: CloningLoss = "mse",
         bc_filter: str = "none",
-        expert_proposal: bool = False,
         critic_warmup: int = 0,
         critic_layer_norm: bool = False,
         _init_setup_model: bool = True,
@@ -143,22 +133,15 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         for name, value, valid in (("bc_loss", bc_loss, BC_LOSSES), ("bc_filter", bc_filter, BC_FILTERS)):
             if value not in valid:
                 raise ConfigError(unknown(name, value, valid))
-        if not 0.0 <= expert_fraction <= 1.0:
-            raise ConfigError(f"expert_fraction is {expert_fraction}, must be from 0 to 1")
-        if expert_fraction > 0.0 and expert_timesteps == 0:
-            raise ConfigError(f"expert_fraction is {expert_fraction}, but expert_timesteps is 0: the expert has flown nothing")
         self.expert = expert
-        self.expert_timesteps = expert_timesteps
-        self.expert_fraction = expert_fraction
         self.bc_coef = bc_coef
         self.bc_loss: CloningLoss = bc_loss
         self.bc_filter = bc_filter
-        self.expert_proposal = expert_proposal
         self.critic_warmup = critic_warmup
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
-        self.expert_buffer: ReplayBuffer | None = None
         self._labels: Float32Array | None = None  # (n_envs, action_dim): its scaled actions for the present states
+        self._starts: BoolArray | None = None  # (n_envs,): which rows have just begun an episode; None: all
 
         if _init_setup_model:
             self._setup_model()
@@ -166,34 +149,19 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
     def _setup_model(self) -> None:
         self.bc_coef = FloatSchedule(self.bc_coef)
         self._clones = is_ever_nonzero(self.bc_coef)
-        if self.will_clone():
+        if self._clones:
             self._refuse_dict_observations()
-        if self.expert_proposal and self.n_steps != 1:
-            raise ConfigError(f"expert_proposal needs n_steps 1, not {self.n_steps}: it proposes for the next state")
-        if self._clones or self.expert_proposal:
             if self.replay_buffer_class not in (None, ReplayBuffer, NStepReplayBuffer):
                 raise ConfigError(f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's actions")
-            self.replay_buffer = self._new_buffer(self.buffer_size)
+            kind = ExpertReplayBuffer if self.n_steps == 1 else ExpertNStepReplayBuffer
+            returns = {} if self.n_steps == 1 else {"n_steps": self.n_steps, "gamma": self.gamma}
+            spaces = self.observation_space, self.action_space
+            memory = self.device, self.n_envs, self.optimize_memory_usage
+            self.replay_buffer = kind(self.buffer_size, *spaces, *memory, **self.replay_buffer_kwargs, **returns)
         super()._setup_model()
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
             _normalise_layers(self.critic_target)
-        if self.expert_timesteps > 0:
-            self.expert_buffer = self._new_buffer(-(-self.expert_timesteps // self.n_envs) * self.n_envs)
-
-    def _new_buffer(self, size: int) -> ReplayBuffer:
-        """SB3's replay buffer, with the expert's actions beside those flown where they are used."""
-        kind, keywords = self.replay_buffer_class or ReplayBuffer, {**self.replay_buffer_kwargs}
-        if self._clones or self.expert_proposal:
-            kind = ExpertReplayBuffer if self.n_steps == 1 else ExpertNStepReplayBuffer
-            keywords |= {} if self.n_steps == 1 else {"n_steps": self.n_steps, "gamma": self.gamma}
-        arguments = size, self.observation_space, self.action_space, self.device, self.n_envs, self.optimize_memory_usage
-        return kind(*arguments, **keywords)
-
-    @property
-    def expert_flies(self) -> bool:
-        """Whether the training is still in its first ``expert_timesteps``."""
-        return self.expert_buffer is not None and not self.expert_buffer.full
 
     @property
     def policy_is_idle(self) -> bool:
@@ -201,45 +169,19 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         return 0 < self.critic_warmup >= self._n_updates
 
     def will_clone(self) -> bool:
-        """Whether the expert is needed at all, for whichever of the additions."""
-        return self._clones or self.expert_proposal or self.expert_timesteps > 0
-
-    @property
-    def _needs_labels(self) -> bool:
-        """Whether the expert is asked about the present states."""
-        return self._clones or self.expert_proposal or self.expert_flies
-
-    def _ask(self, observation: Any, episode_start: BoolArray | None) -> Float32Array:
-        """The expert's actions for the present states, scaled to -1 to 1 as a replay buffer holds actions: (n_envs, dim)."""
-        assert self.env is not None
-        self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
-        labels = self._labeller.labels(observation, episode_start)
-        scaled = self.policy.scale_action(labels.reshape(-1, *self.action_space.shape))  # type: ignore[misc]
-        return np.asarray(scaled, dtype=np.float32).reshape(len(labels), -1)
+        """Whether the expert is needed at all."""
+        return self._clones
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        shape = (n_envs, *self.action_space.shape)  # type: ignore[misc]
-        if self._labels is None and self._needs_labels:
-            self._labels = self._ask(self._last_obs, None)
-        if self.expert_flies:
-            assert self._labels is not None
-            scaled = self._labels.reshape(shape)
-            return self.policy.unscale_action(scaled), scaled
-        action, scaled = super()._sample_action(learning_starts, action_noise, n_envs)
-        if not self.expert_proposal or self.num_timesteps < learning_starts:
-            return action, scaled
-        assert self._labels is not None
-        own, theirs = (th.as_tensor(each.reshape(n_envs, -1), device=self.device) for each in (scaled, self._labels))
-        with th.no_grad():
-            observations, _ = self.policy.obs_to_tensor(self._last_obs)  # type: ignore[arg-type]
-            better = self._least_q(self.critic_target, observations, theirs) > self._least_q(
-                self.critic_target, observations, own
-            )
-        chosen = th.where(better, theirs, own).cpu().numpy().reshape(shape)
-        self.logger.record_mean("rollout/expert_fraction", float(better.float().mean()))
-        return self.policy.unscale_action(chosen), chosen
+        if self._clones:  # before the step: an expert that sees the true state labels the present one
+            assert self.env is not None and self._last_obs is not None
+            self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
+            labels = self._labeller.labels(self._last_obs, self._starts)  # type: ignore[arg-type]
+            scaled = self.policy.scale_action(labels.reshape(n_envs, *self.action_space.shape))  # type: ignore[misc]
+            self._labels = np.asarray(scaled, dtype=np.float32).reshape(n_envs, -1)
+        return super()._sample_action(learning_starts, action_noise, n_envs)
 
     def _store_transition(
         self,
@@ -250,23 +192,10 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         dones: npt.NDArray[Any],
         infos: list[dict[str, Any]],
     ) -> None:
-        buffer = self.expert_buffer if self.expert_flies and self.expert_buffer is not None else replay_buffer
-        if self._labels is not None:
-            following = self._ask(new_obs, dones)
-            if isinstance(buffer, ExpertReplayBuffer):
-                buffer.label(self._labels, following, ~dones)  # the expert cannot see the state in which an episode has ended
-            self._labels = following
-        super()._store_transition(buffer, buffer_action, new_obs, reward, dones, infos)
-        if not self._needs_labels:
-            self._labels = None
-
-    def _sample(self, batch_size: int) -> ReplayBufferSamples | ExpertReplaySamples:
-        """A mini-batch, of which ``expert_fraction`` comes from the expert's own flights."""
-        n_expert = round(batch_size * self.expert_fraction)
-        buffers = [(self.replay_buffer, batch_size - n_expert), (self.expert_buffer, n_expert)]
-        parts = [buffer.sample(n, env=self._vec_normalize_env) for buffer, n in buffers if buffer is not None and n > 0]
-        joined: list[Any] = [None if column[0] is None else th.cat(column) for column in zip(*parts, strict=True)]
-        return parts[0] if len(parts) == 1 else type(parts[0])(*joined)
+        if isinstance(replay_buffer, ExpertReplayBuffer) and self._labels is not None:
+            replay_buffer.label(self._labels)
+        self._starts = dones
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     @staticmethod
     def _least_q(critic: Any, observations: Any, actions: th.Tensor) -> th.Tensor:
@@ -275,8 +204,7 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         """Updates on the replay buffer: SAC's loop, with what is added to it marked by ``+``."""
-        if self.replay_buffer is None or self.replay_buffer.size() == 0:  # + the expert flies
-            return
+        assert self.replay_buffer is not None
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
@@ -290,7 +218,7 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
                 monitored.setdefault(name, []).append(value.item())
 
         for gradient_step in range(gradient_steps):
-            data = self._sample(batch_size)  # + from both buffers, with the expert's actions
+            data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # + with the expert's actions
             discounts = data.discounts if data.discounts is not None else self.gamma
             if self.use_sde:
                 self.actor.reset_noise()
@@ -318,9 +246,6 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
                 next_actions, next_log_prob = self.actor.action_log_prob(data.next_observations)
                 next_q = self._least_q(self.critic_target, data.next_observations, next_actions)
                 next_values = next_q - ent_coef * next_log_prob.reshape(-1, 1)
-                if self.expert_proposal and isinstance(data, ExpertReplaySamples):  # + where there is one and it is better
-                    proposed = self._least_q(self.critic_target, data.next_observations, data.next_expert_actions)
-                    next_values = th.where(data.next_is_labelled & (proposed > next_q), proposed, next_values)
                 targets = data.rewards + (1 - data.dones) * discounts * next_values
 
             current = self.critic(data.observations, data.actions)
@@ -376,18 +301,18 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         if self.will_clone() and self.expert is None:
             raise ExpertError("SACBC needs an expert: SACBC(..., expert=GeometricExpert()) or model.set_expert(...)")
         if anew or self._last_obs is None:  # the environments begin anew
-            self._labels = self._labeller = None
+            self._starts = self._labeller = None
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "expert_buffer", "_labels"]
+        return [*super()._excluded_save_params(), "_labels", "_starts"]
 
     def expert_state(self) -> Arrays:
-        """As of any algorithm with an expert, and its actions for the present states."""
-        return super().expert_state() | ({} if self._labels is None else {LABELS: self._labels})
+        """As of any algorithm with an expert, and which rows have just begun an episode."""
+        return super().expert_state() | ({} if self._starts is None else {STARTS: self._starts})
 
     def restore_expert_state(self, state: Arrays) -> None:
-        self._labels = state.get(LABELS)
-        super().restore_expert_state({name: array for name, array in state.items() if name != LABELS})
+        self._starts = state.get(STARTS)
+        super().restore_expert_state({name: array for name, array in state.items() if name != STARTS})
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:

@@ -45,7 +45,7 @@ MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as
 LIMITS = {
     "learning_rate": (0, 1),
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)),
-    **dict.fromkeys(("bc_coef", "l2_coef", "clip_range_vf", "beta_decay", "critic_warmup", "expert_timesteps"), (0, 2**40)),
+    **dict.fromkeys(("bc_coef", "l2_coef", "clip_range_vf", "beta_decay", "critic_warmup"), (0, 2**40)),
 }
 """Of keywords of the algorithms: the least and the greatest."""
 

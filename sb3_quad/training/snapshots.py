@@ -145,7 +145,7 @@ def _part(state: Arrays, prefix: str) -> Arrays:
 
 def _replay_buffers(model: Any) -> dict[str, ReplayBuffer]:
     """By name; those of an off-policy algorithm."""
-    buffers = {name: getattr(model, name, None) for name in ("replay_buffer", "expert_buffer")}
+    buffers = {"replay_buffer": getattr(model, "replay_buffer", None)}
     return {name: buffer for name, buffer in buffers.items() if isinstance(buffer, ReplayBuffer)}
 
 
