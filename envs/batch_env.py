@@ -60,8 +60,6 @@ class BatchEnv:
     set_target = _of_batch(QuadcopterBatch.set_target)
     set_wrench = _of_batch(QuadcopterBatch.set_wrench)
     set_noise = _of_batch(QuadcopterBatch.set_noise)
-    set_observation_scaling = _of_batch(QuadcopterBatch.set_observation_scaling)
-    set_task = _of_batch(QuadcopterBatch.set_task)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -80,7 +78,7 @@ class BatchEnv:
 
     @property
     def task(self) -> TaskSpec:
-        """The task of the episodes that begin from now on, as it was given; ``task_kwargs`` replace fields of it."""
+        """The task, as it was given; ``task_kwargs`` replace fields of it."""
         return self.batch.task
 
     @property
@@ -92,11 +90,6 @@ class BatchEnv:
     def noise(self) -> Any:
         """Relative standard deviations of the observation noise, (n,)."""
         return self._by_row(self.batch.noise_level)
-
-    @property
-    def additive_noise(self) -> Any:
-        """Standard deviations of the additive noise, in σ, (n,)."""
-        return self._by_row(self.batch.additive_level)
 
     @property
     def observation_mean(self) -> FloatArray:

@@ -142,8 +142,6 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `set_wrench(force, torque, force_frame, torque_frame)` | an external force (N) and torque (N m) at the centre of mass; |
     | | where `randomize` has some, the next episode brings its own |
     | `set_noise(level)` | the relative standard deviation of the observation noise |
-    | `set_observation_scaling(mean, std)` | mean and std of Eq. 3.16, (18,) each; `None` leaves one as it is |
-    | `set_task(task, task_kwargs)` | the task from the next reset on |
 
     `true_state()`, `target`, `wrench`, `noise`, `observation_mean`, `observation_std`, `task`, `task_kwargs` and `vehicle`
     tell what holds.

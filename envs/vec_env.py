@@ -17,9 +17,8 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.batch_env import BatchEnv, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
-_SETTABLE = ("target", "noise", "observation_mean", "observation_std", "task")
-_OF_ROWS = ("target", "noise", "additive_noise", "observation_mean", "observation_std", "wrench")
-_METHODS = ("set_target", "set_wrench", "set_noise", "set_observation_scaling", "set_task")
+_OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench")
+_METHODS = ("set_target", "set_wrench", "set_noise")
 
 
 class RowSeeds(VecEnv):
@@ -133,15 +132,10 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         return [value[row] if attr_name in _OF_ROWS else value for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set ``target``, ``noise``, ``observation_mean``, ``observation_std``; of all ``task``, ``max_episode_steps``."""
-        if attr_name == "max_episode_steps":
-            self.batch.set_max_episode_steps(value)
-        elif attr_name not in _SETTABLE:
-            raise AttributeError(f"{attr_name!r} cannot be set; these can: {', '.join(_SETTABLE)}, max_episode_steps")
-        elif attr_name.startswith("observation_"):
-            self.set_observation_scaling(**{attr_name.removeprefix("observation_"): value}, indices=indices)
-        else:
-            self.env_method(f"set_{attr_name}", value, indices=indices)
+        """Set ``target`` or ``noise``."""
+        if attr_name not in ("target", "noise"):
+            raise AttributeError(f"{attr_name!r} cannot be set; these can: target, noise")
+        self.env_method(f"set_{attr_name}", value, indices=indices)
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any

@@ -165,20 +165,12 @@ def test_setters_act_while_flying(env: QuadcopterEnv) -> None:
     env.reset(seed=0)
     env.set_target((1.0, 2.0, 20.0))
     np.testing.assert_array_equal(env.target, [1.0, 2.0, 20.0])
-    mean, std = np.linspace(-1, 1, 18), np.linspace(1, 2, 18)
     plain, *_ = env.step(np.zeros(4, dtype=np.float32))
     features = plain * env.observation_std + env.observation_mean
     np.testing.assert_allclose(features[:3], env.true_state().position[0] - env.target, atol=1e-5)
-    env.set_observation_scaling(mean, std)
-    scaled, *_ = env.step(np.zeros(4, dtype=np.float32))
-    np.testing.assert_allclose(scaled, (features - mean) / std, atol=1e-5)
     env.set_noise(0.5)
     noisy, *_ = env.step(np.zeros(4, dtype=np.float32))
-    assert env.noise == 0.5 and not np.allclose(noisy, scaled, atol=1e-3)
-    env.set_task("state_recovery")
-    env.reset()
-    np.testing.assert_array_equal(env.target, [0.0, 0.0, 15.0])
-    assert np.abs(env.true_state().body_rates).max() > 0
+    assert env.noise == 0.5 and not np.allclose(noisy, plain, atol=1e-3)
 
 
 def test_wrench_pushes_until_set_anew(env: QuadcopterEnv) -> None:
@@ -234,8 +226,8 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: env.set_wrench(force=(1, 2)), r"force of shape \(2,\): must be \(3,\)"),
         (lambda env: env.set_wrench(force=(1, 2, 3), force_frame="wrld"), "force_frame 'wrld'"),
         (lambda env: env.set_noise(-1), "noise"),
-        (lambda env: env.set_observation_scaling(std=np.zeros(18)), "observation_std"),
-        (lambda env: env.set_task("target_trackin"), "did you mean 'target_tracking'"),
+        (lambda env: QuadcopterEnv(observation_std=np.zeros(18)), "observation_std"),
+        (lambda env: QuadcopterEnv(task="target_trackin"), "did you mean 'target_tracking'"),
         (lambda env: QuadcopterEnv(noize=0), "QuadcopterEnv: unknown key 'noize': did you mean 'noise'"),
         (lambda env: QuadcopterEnv(vehicle="itn"), "did you mean 'itm'"),
         (lambda env: QuadcopterEnv(render_mode="rgb_aray"), "did you mean 'rgb_array'"),

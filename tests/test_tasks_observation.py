@@ -111,9 +111,9 @@ def test_additive_noise_does_not_vanish_at_the_target():
     assert np.std(seen[:, :3]) == pytest.approx(0.1, rel=0.03)  # r = r_T there, in σ
     spread = np.hypot(0.05 * true[:, 12:], 0.1)
     assert np.std((seen - true)[:, 12:] / spread) == pytest.approx(1.0, rel=0.02)
-    assert env.get_attr("additive_noise")[0] == 0.1
+    assert env.batch.additive_level.tolist() == [0.1]
     env.set_noise(0.0)
-    assert env.get_attr("additive_noise")[0] == 0.0
+    assert env.batch.additive_level.tolist() == [0.0]
 
 
 def test_noise_is_the_same_on_pybullet_and_for_short():

@@ -1,6 +1,6 @@
 """n quadcopters as arrays: what all environments are made of."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -21,7 +21,7 @@ from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.sampling import GUST_FORCE, GUST_SIZE
 from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
-from sb3_quad.simulation.tasks import TaskSpec, TaskTable, resolve_tasks
+from sb3_quad.simulation.tasks import TaskSpec, resolve_tasks
 from sb3_quad.simulation.threads import share_out
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -86,7 +86,9 @@ class QuadcopterBatch:
         self.task_kwargs = dict(settings.task_kwargs or {})
         self.tasks = resolve_tasks(self.task, self.task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
-        self.max_steps = _steps_of_rows(settings, n)
+        steps = settings.max_episode_steps
+        steps_of_rows = repeated("max_episode_steps", steps if isinstance(steps, list) else [steps], n)
+        self.max_steps = np.array(steps_of_rows, dtype=np.int64)
         self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
         self.state = np.zeros((STATE_SIZE, n))
         longest = int(self.randomize.delay.high) if self.randomize.delay else 0  # delay, control steps
@@ -101,7 +103,7 @@ class QuadcopterBatch:
         self.outcome = np.zeros(n, dtype=OUTCOME)
         self._bind()
         self.set_noise(settings.noise)
-        self.set_observation_scaling(settings.observation_mean, settings.observation_std)
+        self._set_scaling(settings)
         with compile_notice():
             self.observe()
         self.seed([None] * n if seed is None else row_seeds(seed, n))
@@ -253,43 +255,17 @@ class QuadcopterBatch:
         columns = self._columns(indices, one_for_all=not isinstance(noise, list))
         self.noise_level[columns], self.additive_level[columns] = relative[: columns.size], additive[: columns.size]
 
-    def set_observation_scaling(self, mean: Any = None, std: Any = None, indices: Rows = None) -> None:
-        """Set μ and σ of Eq. 3.16, (18,) or (rows, 18) each; None leaves one as it is."""
-        chosen = self.rows(indices)
-        given = {"mean": mean, "std": std}
-        arrays = {
-            name: per_row(f"observation_{name}", values, chosen.size, OBSERVATION_SIZE)
-            for name, values in given.items()
-            if values is not None
-        }
-        if (arrays.get("std", np.ones(1)) <= 0).any():
-            raise ConfigError("observation_std: every value must be positive")
-        columns = self._columns(indices, one_for_all=max(np.ndim(mean), np.ndim(std)) < 2)
-        for name, values in arrays.items():
+    def _set_scaling(self, settings: FlightSettings) -> None:
+        """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; None leaves one as it is."""
+        given = {"mean": settings.observation_mean, "std": settings.observation_std}
+        for name, value in given.items():
+            if value is None:
+                continue
+            values = per_row(f"observation_{name}", value, self.n, OBSERVATION_SIZE)
+            if name == "std" and (values <= 0).any():
+                raise ConfigError("observation_std: every value must be positive")
+            columns = self._columns(None, one_for_all=np.ndim(value) < 2)
             getattr(self, name)[:, columns] = values[:, : columns.size]
-
-    def set_max_episode_steps(self, steps: int | Sequence[int]) -> None:
-        """Control steps after which an episode is truncated, for all rows from the next step on; several numbers repeat."""
-        settings = validate(FlightSettings, {"max_episode_steps": steps}, "set_max_episode_steps")
-        most = _steps_of_rows(settings, self.n)
-        self._bind(max_steps=most, limits=most.copy())
-
-    def set_task(self, task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None, indices: Rows = None) -> None:
-        """Set the task of all episodes that begin from now on; episodes under way end as they began.
-
-        :raises ConfigError: an unknown task, or ``indices`` of less than all rows.
-        """
-        if np.unique(self.rows(indices)).size < self.n:
-            raise ConfigError(
-                "set_task: holds for all rows; give a mixture such as {'target_tracking': 1, 'state_recovery': 1}"
-            )
-        new = resolve_tasks(task, task_kwargs)
-        used, index = np.unique(self.task_index, return_inverse=True)
-        parameters = np.concatenate([self.tasks.parameters[used], new.parameters])
-        # A cumulative weight of 0 is never sampled: the old tasks stay in the table only for rows still flying them.
-        weights = np.concatenate([np.zeros(used.size), new.weights])
-        table = TaskTable(parameters, weights)
-        self._bind(task=task, task_kwargs=dict(task_kwargs or {}), tasks=table, task_index=index.astype(np.int64))
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
         """The columns of noise level and scaling to write for some rows, which are set apart unless one serves all."""
@@ -314,9 +290,3 @@ class QuadcopterBatch:
             "own_arms": self.base_vehicles.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
         }
         vars(self).update(replaced, _arrays=BatchArrays(*(values[name] for name in BatchArrays._fields)))
-
-
-def _steps_of_rows(settings: FlightSettings, n: int) -> IntArray:
-    """``max_episode_steps`` of n rows, (n,)."""
-    steps = settings.max_episode_steps
-    return np.array(repeated("max_episode_steps", steps if isinstance(steps, list) else [steps], n), dtype=np.int64)

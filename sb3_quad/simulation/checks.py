@@ -47,11 +47,10 @@ def repeated(name: str, values: Sequence[Any], n: int) -> list[Any]:
 
 def load_vehicles(sources: Sequence[Any], layout: str | Path | Vehicle | None = None) -> list[Vehicle]:
     """Vehicles whose time steps agree, with rotors in the layout of another vehicle if one is named."""
-    loaded = {key: load_vehicle(each) for key, each in {id(each): each for each in sources}.items()}  # each file once
+    vehicles = [load_vehicle(each) for each in sources]
     if layout is not None:
         wanted = load_vehicle(layout)
-        loaded = {key: each.in_layout_of(wanted) for key, each in loaded.items()}
-    vehicles = [loaded[id(each)] for each in sources]
+        vehicles = [each.in_layout_of(wanted) for each in vehicles]
     for row, each in enumerate(vehicles):
         if (each.physics_step, each.substeps) != (vehicles[0].physics_step, vehicles[0].substeps):
             raise ConfigError(f"vehicle of row {row}: physics_step and control_step must be those of row 0")

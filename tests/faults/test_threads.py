@@ -34,8 +34,6 @@ for interrupt in range(400):
         while True:
             batch.step(actions)
             batch.observe()
-            if steps % 50 == 0:
-                batch.set_max_episode_steps(200)
             steps += 1
     except KeyboardInterrupt:
         pass
