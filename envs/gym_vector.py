@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
-import gymnasium
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -30,7 +29,6 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
     :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. ``"SameStep"``: a row that ends returns the
         first observation and infos of its next episode, and the last ones are in ``final_obs[i]`` and ``final_info``.
         ``"NextStep"``: it returns its last ones, and the next step begins its next episode, whatever its action is.
-        ``"Disabled"``: it is to be reset by ``options["reset_mask"]`` before the next step.
     :raises ConfigError: an argument that does not fit.
     """
 
@@ -49,7 +47,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
     ) -> None:
         if render_mode is not None:
             raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
-        modes = {mode.value: mode for mode in AutoresetMode}
+        modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
         name = getattr(autoreset_mode, "value", autoreset_mode)
         if name not in modes:
             raise ConfigError(unknown("autoreset_mode", name, modes))
@@ -57,7 +55,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}  # type: ignore[misc]
         self._make_batch(num_envs, seed, n_threads, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords)
         self.num_envs = self.batch.n
-        self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step, or by the user
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step
         self.single_observation_space, self.single_action_space = quadcopter_spaces(self.batch.observation.size)
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -65,34 +63,26 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
     def reset(
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float32Array, dict[str, Any]]:
-        """Begin new episodes in all rows, or where ``options["reset_mask"]``, bool (n,), says so.
+        """Begin new episodes in all rows.
 
         :param seed: one number, from which each row gets its own stream, or a number for each row; None: the next episodes.
         """
-        n, options = self.num_envs, dict(options or {})
+        n = self.num_envs
+        for key in options or {}:
+            raise ConfigError(f"reset option {key!r}: the batched environment takes none; call set_target after it")
         seeds = [None] * n if seed is None else seed
         seeds = row_seeds(int(seeds), n) if isinstance(seeds, (int, np.integer)) else list(seeds)
         if len(seeds) != n:
             raise ConfigError(f"seed: {len(seeds)} numbers for {n} environments; give one, or one for each")
-        mask = np.asarray(options.pop("reset_mask", np.ones(n, dtype=np.bool_)))
-        for key in options:
-            raise ConfigError(f"reset option {key!r}: the only one is 'reset_mask', bool of shape ({n},)")
-        if mask.shape != (n,) or mask.dtype != np.bool_:
-            raise ConfigError(f"reset_mask: must be bool of shape ({n},)")
-        seeded = [row for row in np.flatnonzero(mask).tolist() if seeds[row] is not None]
-        if seeded:
-            self.batch.seed([seeds[row] for row in seeded], seeded)
-        self._ended[mask] = False
-        return self._begin(mask), self._infos(mask)
+        rows = [row for row, each in enumerate(seeds) if each is not None]
+        if rows:
+            self.batch.seed([seeds[row] for row in rows], rows)
+        self._ended[:] = False
+        return self._begin(~self._ended), self._infos()
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
         """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos."""
         before, final = self._ended, {}
-        if self._mode is AutoresetMode.DISABLED and before.any():
-            rows = np.flatnonzero(before).tolist()
-            raise gymnasium.error.ResetNeeded(
-                f"rows {rows} have ended; call reset(options={{'reset_mask': ...}}) before step()"
-            )
         observations, rewards, done = self.batch.step(actions)
         if self._mode is AutoresetMode.NEXT_STEP and before.any():
             observations = self._begin(before)

@@ -213,7 +213,7 @@ def test_reward_and_ends_of_each_task():
     rows = start(300, {"target_tracking": 1.0, "state_recovery": 1.0})
     rng = np.random.default_rng(0)
     rows.state[:3] += rng.normal(size=(3, 300)) * 12
-    rows.tasks.parameters[1, T.tilt_cost] = 0.5
+    rows.task_parameters[1, T.tilt_cost] = 0.5
     got, state = scores(rows), QuadcopterState(rows.state)
     tilt_cost = np.where(rows.task_index == 1, 0.5, 0.002)
     collided, away = state.position[:, 2] <= 0.135, state.distance > 30.0
@@ -245,12 +245,12 @@ def test_precision_is_half_due_at_its_range_and_steepest_at_the_target():
 
 def test_task_specifications():
     own = Task(name="own", target_distance=3.0)
-    np.testing.assert_array_equal(resolve_tasks(own).parameters, own.parameters()[None])
+    np.testing.assert_array_equal(resolve_tasks(own)[0], own.parameters()[None])
     assert list(TASK)[-len(SCORED) :] == SCORED  # the kernel copies them as one piece
-    table = resolve_tasks({"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50})
-    assert table.weights.tolist() == [0.25, 1.0]
-    assert table.parameters[:, T.max_distance].tolist() == [50.0, 50.0]
-    assert table.parameters.shape == (2, sum(TASK.values()))
+    parameters, weights = resolve_tasks({"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50})
+    assert weights.tolist() == [0.25, 1.0]
+    assert parameters[:, T.max_distance].tolist() == [50.0, 50.0]
+    assert parameters.shape == (2, sum(TASK.values()))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice
-from sb3_quad.simulation.frames import PositionIntegral, new_frames
+from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, rotor_wrenches, step
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
@@ -76,7 +76,8 @@ class QuadcopterBatch:
         self.gust = np.zeros((GUST_SIZE, 0 if self.randomize.gusts is None else n))
 
         integral = self.observation.position_integral
-        self.frames = new_frames(self.observation, n)
+        depth = self.observation.ages[-1] + 1 if self.observation.is_extended else 0
+        self.frames = np.zeros((n, depth, self.observation.frame_size), dtype=np.float32)
         self.ages = np.array(self.observation.ages, dtype=np.int64)
         self.integral = np.zeros((0 if integral is None else 3, n))
         self.integral_numbers = np.array((integral or PositionIntegral()).numbers(vehicles[0].control_step))
@@ -84,7 +85,7 @@ class QuadcopterBatch:
 
         self.task: TaskSpec = settings.task
         self.task_kwargs = dict(settings.task_kwargs or {})
-        self.tasks = resolve_tasks(self.task, self.task_kwargs)
+        self.task_parameters, self.task_weights = resolve_tasks(self.task, self.task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
         steps = settings.max_episode_steps
         steps_of_rows = repeated("max_episode_steps", steps if isinstance(steps, list) else [steps], n)
@@ -101,6 +102,9 @@ class QuadcopterBatch:
         self.std = DEFAULT_STD[:, None].copy()
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
+        self.physics_step, self.substeps = vehicles[0].physics_step, vehicles[0].substeps
+        self.own_delays = self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any())
+        self.own_arms = len(columns) > 1 or self.distribution is not None or self.randomize.sets_arms
         self._bind()
         self.set_noise(settings.noise)
         self._set_scaling(settings)
@@ -169,7 +173,7 @@ class QuadcopterBatch:
         :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame, (substeps, 2, 3); what the
             wrench has in the world frame acts besides.
         """
-        wrenches = np.empty((self.vehicle_list[0].substeps, 2, 3))
+        wrenches = np.empty((self.substeps, 2, 3))
         a = self._arrays
         rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, a.physics_step, a.own_delays)
         return wrenches
@@ -216,7 +220,7 @@ class QuadcopterBatch:
         for name, array in snapshot.items():
             own = getattr(self, name) if name in _KEPT else np.empty(0)
             fits = (array.dtype, array.shape) == (own.dtype, own.shape)
-            if not fits or (name == "task_index" and (array >= self.tasks.weights.size).any()):
+            if not fits or (name == "task_index" and (array >= self.task_weights.size).any()):
                 raise ConfigError(
                     "the saved state of the environments does not fit these "
                     f"({name}: {array.dtype} of shape {array.shape}); use the run's own settings"
@@ -272,21 +276,11 @@ class QuadcopterBatch:
         if self.mean.shape[1] < self.n:
             if rows is None and one_for_all:
                 return np.zeros(1, dtype=np.int64)
-            mean, std = (np.repeat(array, self.n, axis=1) for array in (self.mean, self.std))
-            relative, additive = (np.repeat(each, self.n) for each in (self.noise_level, self.additive_level))
-            self._bind(noise_level=relative, additive_level=additive, mean=mean, std=std)
+            parts = ("mean", "std", "noise_level", "additive_level")
+            vars(self).update({name: np.repeat(getattr(self, name), self.n, axis=-1) for name in parts})
+            self._bind()
         return self.rows(rows)
 
-    def _bind(self, **replaced: Any) -> None:
-        """Replace attributes, and note all arrays for the compiled step: all of it at once, or nothing."""
-        values = {**vars(self), **replaced}
-        first, table = values["vehicle_list"][0], values["tasks"]
-        values |= {
-            "task_parameters": table.parameters,
-            "task_weights": table.weights,
-            "physics_step": first.physics_step,
-            "substeps": first.substeps,
-            "own_delays": self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any()),
-            "own_arms": self.base_vehicles.shape[1] > 1 or self.distribution is not None or self.randomize.sets_arms,
-        }
-        vars(self).update(replaced, _arrays=BatchArrays(*(values[name] for name in BatchArrays._fields)))
+    def _bind(self) -> None:
+        """Note all arrays for the compiled step."""
+        self._arrays = BatchArrays(*(getattr(self, name) for name in BatchArrays._fields))

@@ -4,11 +4,9 @@ A frame is the scaled features of a control step, with ``last_action`` followed 
 the frames of some ages, one after the other. The compiled functions keep the frames of a row and make observations of them.
 """
 
-import numpy as np
 from numba import float32
 from pydantic import Field, PositiveFloat, field_validator
 
-from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.validate import Frozen
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.observation import OBSERVATION_SIZE, F
@@ -136,9 +134,3 @@ def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, 
             for k in range(size):
                 out[i, at + k] = 0.0
         at += size
-
-
-def new_frames(observation: ObservationSettings, n: int) -> Float32Array:
-    """Room for the frames of n rows, (n, depth, frame_size); depth 0 where an observation is the present features."""
-    depth = observation.ages[-1] + 1 if observation.is_extended else 0
-    return np.zeros((n, depth, observation.frame_size), dtype=np.float32)

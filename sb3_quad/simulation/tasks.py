@@ -4,7 +4,7 @@ A task is data. :mod:`.sampling` begins episodes by it, :mod:`.reward` scores th
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, field_validator, model_validator
@@ -93,15 +93,9 @@ TASKS: Mapping[str, Task] = {
 TaskSpec: TypeAlias = "str | Task | Mapping[str, float]"
 
 
-class TaskTable(NamedTuple):
-    """The tasks an environment samples from at each reset; K rows."""
-
-    parameters: FloatArray  # (K, columns), see TASK
-    weights: FloatArray  # (K,), cumulative, the last one 1
-
-
-def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> TaskTable:
-    """The table of a task by name, of a :class:`Task`, or of a mixture ``{name: weight}``.
+def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) -> tuple[FloatArray, FloatArray]:
+    """The K tasks of a name, a :class:`Task` or a mixture ``{name: weight}``: parameters (K, columns), see :data:`TASK`, and
+    cumulative weights (K,), the last one 1.
 
     :param task_kwargs: fields of :class:`Task` to override, in every task of a mixture.
     :raises ConfigError: an unknown name or field, or a value or weight out of range.
@@ -118,7 +112,7 @@ def resolve_tasks(task: TaskSpec, task_kwargs: Mapping[str, Any] | None = None) 
         raise ConfigError(f"task: the weights {shares.tolist()} must be finite, not negative and not all zero")
     cumulative = np.cumsum(shares / shares.sum())
     cumulative[-1] = 1.0
-    return TaskTable(parameters, cumulative)
+    return parameters, cumulative
 
 
 def _resolve(entry: Any, overrides: dict[str, Any]) -> Task:
