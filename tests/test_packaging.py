@@ -202,7 +202,6 @@ def test_the_wheel_works_from_another_folder(installed, tmp_path):
     code = """
 import importlib, importlib.resources, json, pkgutil, sys, sb3_quad
 names = [found.name for found in pkgutil.walk_packages(sb3_quad.__path__, "sb3_quad.") if "__main__" not in found.name]
-names.remove("sb3_quad.zoo")  # needs rl_zoo3
 for name in names: importlib.import_module(name)
 configs = importlib.resources.files("sb3_quad.zoo_configs")
 print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs.joinpath("dagger.yml").read_text()]))
