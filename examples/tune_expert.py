@@ -19,8 +19,8 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.evaluation.expert_metrics import measure_expert
 from sb3_quad.evaluation.flights import Hook, fly_settings
+from sb3_quad.evaluation.metrics import measure_expert
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics

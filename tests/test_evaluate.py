@@ -24,7 +24,6 @@ from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.results import load_results
 from sb3_quad.evaluation.scaling import measure_mean
-from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.simulation.settings import FlightSettings
@@ -297,7 +296,7 @@ def test_an_agent_sees_its_own_scaling(here, capsys):
     rewards = {name: results.entry(name, "tracking").metrics.reward.value for name in ("silent", "telling")}
     (tracking,) = load_suite("small.yaml").with_changes(["tracking"], 3).scenarios
     for name, scaling in (("silent", {}), ("telling", {"observation_std": std})):
-        settings = flown_as(tracking).with_changes(**scaling)
+        settings = tracking.flown_as.with_changes(**scaling)
         flights = fly_settings(model, settings, tracking.episode_seeds(), plan=sample_plan(tracking, tracking.episode_seeds()))
         assert rewards[name] == pytest.approx(flights.reward.mean())
     assert rewards["silent"] != pytest.approx(rewards["telling"])

@@ -9,7 +9,7 @@ import pytest
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.scenarios.load import parse_suite
 from sb3_quad.vehicles.vehicle import load_vehicle
 

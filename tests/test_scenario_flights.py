@@ -7,11 +7,11 @@ import pytest
 
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import seed_for
+from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
-from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.statistics import mean, share

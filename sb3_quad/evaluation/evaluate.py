@@ -3,7 +3,7 @@
 import hashlib
 import shutil
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -17,7 +17,8 @@ from sb3_quad.base.version import __version__
 from sb3_quad.envs import registration
 from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
 from sb3_quad.evaluation.fleets import FLEETS
-from sb3_quad.evaluation.flightlog import episode_arrays
+from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
+from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.results import (
     FLIGHTS,
@@ -31,11 +32,13 @@ from sb3_quad.evaluation.results import (
     load_results,
     write_episodes,
 )
-from sb3_quad.evaluation.scenario_flights import fly_scenario
+from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
 from sb3_quad.executors import Executor, start_executor
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
+PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
+RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most
 Progress = Callable[[int, int, str], None]  # jobs done, jobs in all, what was done last
 
 
@@ -134,6 +137,35 @@ def evaluate(
             write_episodes(place, results(None).entries)  # in the order of the suite, whoever was done first
             write_text(place / RESULTS, results(None).model_dump_json(indent=2))
     return results(None)
+
+
+def fly_scenario(
+    controller: Any,
+    scenario: Scenario,
+    backend: str = "batch",
+    recorded: int | None = 0,
+    own: Mapping[str, Any] | None = None,
+) -> tuple[Flights, Arrays]:
+    """Fly a scenario's episodes; the same ones for every controller and either backend.
+
+    :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
+    :param recorded: flights to sample; None: all of a scenario that is the same each time, the first few of others.
+    :param own: changes to how it is flown that go with the controller: ``observation_mean``, ``observation_std``.
+    :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
+    :raises ConfigError: an unknown backend, or a controller that cannot be asked.
+    :raises ControllerError: a controller that fails in flight.
+    """
+    seeds = scenario.episode_seeds()
+    if recorded is None:
+        recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
+    size, settings = PART_SIZES.get(backend, 1), scenario.flown_as.with_changes(**(own or {}))
+    parts, recorder = [], Recorder(recorded)
+    for first in range(0, len(seeds), size):
+        part = slice(first, first + size)
+        plan = sample_plan(scenario, seeds[part])
+        hooks = [recorder] if recorded and first == 0 else []
+        parts.append(fly_settings(controller, settings, seeds[part], backend, scenario.tolerances, hooks, plan))
+    return Flights.concatenate(parts), recorder.arrays() if recorded else {}
 
 
 def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:

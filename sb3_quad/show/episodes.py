@@ -14,7 +14,6 @@ from sb3_quad.base.validate import validate
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Hook, fly_settings
-from sb3_quad.evaluation.scenario_flights import flown_as
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.parts import Wrench
 from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan, sample_wrenches
@@ -118,7 +117,7 @@ def scenario_setting(text: str, own: Any = None) -> Setting:
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).scenario(name).flown_by(own)
-    return Setting(scenario.nominal_vehicle(), flown_as(scenario), lambda seed: sample_plan(scenario, [seed]))
+    return Setting(scenario.nominal_vehicle(), scenario.flown_as, lambda seed: sample_plan(scenario, [seed]))
 
 
 def fly_all(

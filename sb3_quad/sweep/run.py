@@ -19,8 +19,8 @@ from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec, build
+from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flights import Flights, fly_settings
-from sb3_quad.evaluation.scenario_flights import fly_scenario
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.executors import Executor, as_they_end
 from sb3_quad.simulation.settings import FlightSettings

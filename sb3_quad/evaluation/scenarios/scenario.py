@@ -19,7 +19,7 @@ from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.validate import Frozen, explain, validate
 from sb3_quad.evaluation.scenarios.parts import Start, Target, VehicleChanges, Wrench
 from sb3_quad.simulation.randomization import Randomization
-from sb3_quad.simulation.settings import Noise
+from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
@@ -172,6 +172,18 @@ class Scenario(Frozen):
             body_rates_std=self.start.body_rates.std or 0.0,
             max_distance=self.max_distance,
             **({} if self._is_flown_to() else RECOVERED),
+        )
+
+    @property
+    def flown_as(self) -> FlightSettings:
+        """How the episodes are flown."""
+        return FlightSettings(
+            task=self.task,
+            vehicle=self.flown_vehicle(),
+            noise=self.noise,
+            vehicles=self.vehicles,
+            randomize=self.randomize,
+            max_episode_steps=self.steps,
         )
 
     def _is_flown_to(self) -> bool:
