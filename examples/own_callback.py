@@ -7,10 +7,10 @@ The callbacks that come with sb3_quad: docs/callbacks.md.
 
 import argparse
 
+from coefficient_schedule import CoefficientSchedule
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad import DAgger, GeometricExpert
-from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs import QuadcopterVecEnv
 
 

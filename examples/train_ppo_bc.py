@@ -8,8 +8,10 @@ The best agent by success in recoveries is kept as best_model.zip, with a curve 
 
 import argparse
 
+from coefficient_schedule import CoefficientSchedule
+
 from sb3_quad import PPOBC, GeometricExpert
-from sb3_quad.callbacks import BestModel, CoefficientSchedule, StopOnSignal
+from sb3_quad.callbacks import BestModel, StopOnSignal
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.training.transfer import transfer_policy
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from coefficient_schedule import CoefficientSchedule
 from hypothesis import given
 from hypothesis import strategies as st
 from stable_baselines3 import PPO, SAC
@@ -9,7 +10,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad import PPOBC, DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
@@ -119,7 +119,7 @@ def test_a_run_of_a_configuration_file_follows_the_reward_against_the_expert(tmp
         "n_epochs": 1,
         "eval_expert": True,
         "env_kwargs": {"max_episode_steps": 20},
-        "callback": [{"sb3_quad.callbacks.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
+        "callback": [{"coefficient_schedule.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
     }
     config = build_config("dagger", "QuadTargetTracking-v0", settings)
     result = train(

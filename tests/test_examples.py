@@ -72,6 +72,10 @@ def test_own_callback(run):
     assert "episodes crashed, beta 0.80" in output
 
 
+def test_coefficient_schedule(run):
+    assert "beta 1.00" in run("coefficient_schedule.py", "--timesteps", "12000")
+
+
 def test_flight_metrics(run):
     assert "rollout/collision_rate: " in run("flight_metrics.py", "--timesteps", "24000")
 

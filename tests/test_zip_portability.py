@@ -6,12 +6,12 @@ import sys
 
 import numpy as np
 import pytest
+from coefficient_schedule import CoefficientSchedule
 from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_quad
 from sb3_quad import PPOBC, SACBC, DAgger, PIDExpert
-from sb3_quad.callbacks import CoefficientSchedule
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import pretrained_names
 from sb3_quad.envs.vec_env import QuadcopterVecEnv

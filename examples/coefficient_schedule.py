@@ -1,5 +1,11 @@
-"""A coefficient of the algorithm that follows how well the training goes."""
+"""A callback by which a coefficient of the algorithm follows how well the training goes; docs/callbacks.md says more.
 
+    python examples/coefficient_schedule.py
+
+In a settings file, with ``PYTHONPATH=examples``: ``callback: {coefficient_schedule.CoefficientSchedule: {…}}``.
+"""
+
+import argparse
 import math
 import warnings
 from collections.abc import Mapping, Sequence
@@ -10,7 +16,9 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
 from stable_baselines3.common.utils import FloatSchedule
 
+from sb3_quad import DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.envs import QuadcopterVecEnv
 
 PROGRESS = "progress"
 
@@ -20,16 +28,7 @@ class CoefficientSchedule(BaseCallback):
 
     Made for DAgger's ``beta`` (how often the expert flies) and PPOBC's ``bc_coef`` (weight of the cloning term); with any
     algorithm, for any of its numbers that are given as floats or schedules: ``ent_coef``, ``clip_range``, ``learning_rate``,
-    SAC's ``tau``. Here β falls from 1 to 0 while the share of training episodes that succeed goes from 50 % to 95 %:
-
-    >>> from sb3_quad import DAgger, PIDExpert
-    >>> from sb3_quad.envs import QuadcopterVecEnv
-    >>> env = QuadcopterVecEnv(8, task_kwargs={"target_distance": 0.05}, max_episode_steps=50, seed=0)
-    >>> model = DAgger("MlpPolicy", env, PIDExpert(), n_steps=50, batch_size=100, n_epochs=1, seed=0, device="cpu")
-    >>> schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95))
-    >>> _ = model.learn(1200, callback=schedule)
-    >>> model.current_beta
-    0.0
+    SAC's ``tau``.
 
     It is set after a rollout, holds for the next one and is logged as ``schedule/<coefficient>``. A model's zip holds the
     present number, nothing of this package; a training that continues from the zip continues from that number.
@@ -141,3 +140,16 @@ class _LastLogged(KVWriter):
 
     def close(self) -> None:
         """Nothing to close."""
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--timesteps", type=int, default=240_000, help="over all environments (%(default)s)")
+    arguments = parser.parse_args()
+
+    env = QuadcopterVecEnv(48, max_episode_steps=500, seed=0)
+    model = DAgger("MlpPolicy", env, PIDExpert(), n_steps=250, batch_size=2000, n_epochs=2, seed=0, device="cpu")
+    # β falls from 1 to 0 while the share of training episodes that succeed goes from 50 % to 95 %.
+    schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95))
+    model.learn(arguments.timesteps, callback=schedule)
+    print(f"beta {model.current_beta:.2f}")
