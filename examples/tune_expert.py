@@ -11,6 +11,7 @@ the search has not seen. Ctrl-C writes the best so far; the study is kept in OUT
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import optuna
@@ -23,7 +24,7 @@ from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.evaluation.metrics import measure_expert
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains, GeometricMetrics
+from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 NEAR = 0.1  # m
@@ -85,10 +86,10 @@ def with_values(gains: GeometricGains, values: dict[str, float]) -> GeometricGai
     return GeometricGains.model_validate({**gains.model_dump(exclude={"measured"}), **rounded})
 
 
-def fresh_cost(metrics: GeometricMetrics) -> float:
+def fresh_cost(metrics: dict[str, Any]) -> float:
     """What gains cost on fresh episodes, with the same weights, s."""
-    lost = LOST * (1.0 - metrics.recovery_survival)
-    return lost + metrics.time_to_0_1_m - TRACKING_REWARD * metrics.tracking_reward
+    lost = LOST * (1.0 - metrics["recovery_survival"])
+    return lost + metrics["time_to_0_1_m"] - TRACKING_REWARD * metrics["tracking_reward"]
 
 
 def main() -> None:

@@ -103,7 +103,7 @@ def test_tune_expert(run, tmp_path):
     costs = [float(re.search(r"\d gains tried, least cost (-?[\d.]+); saved tuned.yaml", text)[1]) for text in printed]
     assert costs[1] <= costs[0]
     tuned = load_vehicle("tuned.yaml")
-    assert tuned.geometric_gains.measured.recovery_episodes == 64
+    assert tuned.geometric_gains.measured["recovery_episodes"] == 64
     assert tuned.model_copy(update={"geometric_gains": poor}) == slow
 
 

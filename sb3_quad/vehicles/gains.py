@@ -1,32 +1,12 @@
 """The gains of the geometric expert as a vehicle's YAML holds them, and how well the expert flies with them."""
 
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, PositiveFloat, field_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
-
-Share = Annotated[float, Field(ge=0, le=1)]
-
-
-class GeometricMetrics(Frozen):
-    """What :class:`GeometricGains` reached on episodes that no search over them had seen; true state, no other noise."""
-
-    recovery_survival: Share = Field(description="share of recovery episodes with neither collision nor out of range")
-    recovery_episodes: PositiveInt = Field(description="recovery episodes flown")
-    tracking_survival: Share = Field(description="share of tracking episodes with neither collision nor out of range")
-    tracking_episodes: PositiveInt = Field(description="tracking episodes flown, targets 10 m away")
-    time_to_0_1_m: PositiveFloat = Field(description="mean time until 0.1 m from the target, of the tracking episodes, s")
-    tracking_reward: float = Field(description="mean reward of the tracking episodes (Eqs. 4.5-4.9)")
-    observation_noise: NonNegativeFloat = Field(description="relative, on what the expert sees")
-    seeds: tuple[int, ...] = Field(min_length=1, description="seed of each set of episodes")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _former_names(cls, data: Any) -> Any:  # of the zips of policies that come with the package
-        return {str(key).replace("_success", "_survival"): value for key, value in dict(data).items()}
 
 
 class GeometricGains(Frozen):
@@ -47,7 +27,14 @@ class GeometricGains(Frozen):
     descent_deceleration: PositiveFloat = Field(
         description="the same from above: less, so that an agent that imitates it imprecisely does not overshoot, m/s²"
     )
-    measured: GeometricMetrics | None = Field(default=None, description="what these gains reached")
+    measured: dict[str, Any] | None = Field(
+        default=None, description="what these gains reached, as ``evaluation.metrics.measure_expert`` gives it"
+    )
+
+    @field_validator("measured", mode="before")
+    @classmethod
+    def _former_names(cls, data: Any) -> Any:  # of the zips of policies that come with the package
+        return data and {str(key).replace("_success", "_survival"): value for key, value in dict(data).items()}
 
     def values(self) -> FloatArray:
         """The gains alone, in the order of the fields."""
