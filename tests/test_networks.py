@@ -132,8 +132,6 @@ def test_compiled_gradients_are_those_of_autograd(loss, with_critic):
     for name, parameter in policy.named_parameters():  # no gradient is one of zero
         one, other = (th.zeros_like(parameter) if each[name] is None else each[name] for each in (compiled, plain))
         th.testing.assert_close(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()) + 1e-8)
-    norms = [networks.gradient_norms(each, loss, actor, critic) for each in (network, policy)]
-    assert norms[0] == pytest.approx(norms[1], rel=1e-4)
 
 
 @pytest.mark.parametrize(("bc_filter", "kept"), [("none", [0, 1, 2]), ("negative_advantage", [1]), ("agreement", [0, 1])])

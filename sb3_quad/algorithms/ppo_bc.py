@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, parameters_of_both
-from sb3_quad.algorithms.networks.gradients import act, gradient_norms, gradients, network_of
+from sb3_quad.algorithms.networks.gradients import act, gradients, network_of
 from sb3_quad.algorithms.networks.losses import BC_FILTERS, CLONING_LOSSES, CloningLoss, Loss
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
@@ -291,14 +291,11 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         network, (actor, _) = network_of(self.policy) if adds else self.policy, parameters_of_both(self.policy)
 
         monitored: dict[str, list[float]] = {}  # by name: the term of each mini-batch
-        grad_norms: dict[str, float] = {}
         continue_training = True
 
         for epoch in range(self.n_epochs):
             approx_kl_divs = []
             for batch, for_critic in buffer.get(self.batch_size, self.shuffle):
-                if adds and not monitored:  # +
-                    grad_norms = gradient_norms(network, loss, batch, for_critic)
                 terms = gradients(network, loss, batch, for_critic)
                 for name, term in terms.items():
                     monitored.setdefault(name, []).append(term)
@@ -339,5 +336,3 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         if clip_range_vf is not None:
             self.logger.record("train/clip_range_vf", clip_range_vf)
         self.logger.record("train/bc_coef", self._rollout_bc_coef)  # +
-        for name, grad_norm in grad_norms.items():  # +
-            self.logger.record(f"train/grad_norm_{name}", grad_norm)

@@ -121,19 +121,6 @@ def gradients(network: Network, loss: Loss, actor: Batch, critic: Batch | None) 
     return {"loss": sum(weighted), **terms}
 
 
-def gradient_norms(network: Network, loss: Loss, actor: Batch, critic: Batch) -> Terms:
-    """The norm of each term's own gradient over all parameters: which pulls how hard, and whether one starves the others."""
-    norms = {}
-    for name, coefficient in COEFFICIENTS.items():
-        if getattr(loss, coefficient) != 0.0:
-            others: dict[str, Any] = {other: 0.0 for other in COEFFICIENTS.values() if other != coefficient}
-            alone = loss._replace(**others)
-            gradients(network, alone, actor, critic if name == "value_loss" else None)
-            own = [each.grad.norm() for each in network.parameters() if each.grad is not None]
-            norms[name.removesuffix("_loss").removesuffix("_gradient")] = float(th.stack(own).norm())
-    return norms
-
-
 def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Batch | None) -> Terms:
     observations, targets = actor.tensors(policy.device)
     kind, a = losses.CLONING_LOSSES[loss.bc_loss], get_action_dim(policy.action_space)

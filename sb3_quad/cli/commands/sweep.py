@@ -118,8 +118,7 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
     from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
     from sb3_quad.sweep.folder import SweepFolder
-    from sb3_quad.sweep.page import write_report
-    from sb3_quad.sweep.results import evaluate, tables, write_results
+    from sb3_quad.sweep.results import evaluate, tables, write_report, write_results
     from sb3_quad.sweep.run import execute
     from sb3_quad.training.runs import claim_folder
 
