@@ -1,30 +1,24 @@
-"""What a search leaves: the best settings as YAML, all trials as CSV and as plots."""
+"""What a search leaves: the best settings as YAML, all trials as CSV."""
 
 import csv
 import io
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
-from matplotlib import pyplot
 from optuna.trial import FrozenTrial
-from optuna.visualization.matplotlib import plot_optimization_history, plot_slice
 
-from sb3_quad.base.files import write_bytes, write_text
-from sb3_quad.report.plots import picture
+from sb3_quad.base.files import write_text
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
 
 BEST, TRIALS = "best.yml", "trials.csv"
 STATES = {"COMPLETE": "finished", "PRUNED": "pruned", "FAIL": "failed"}
-PLOTS: dict[str, Callable[..., Any]] = {"trials.png": plot_slice, "history.png": plot_optimization_history}
 
 
 def write_results(search: Search) -> None:
-    """Write, or renew, the files of a search in its job's folder, less the plots.
+    """Write, or renew, the files of a search in its job's folder.
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
@@ -95,15 +89,3 @@ def train_command(search: Search) -> str:
     config, file = search.job.config, Path(search.job.log_folder, BEST)
     start = f" -i {search.job.trained_agent}" if search.job.trained_agent else ""
     return f"sb3-quad train --algo {config.algo} --env {config.env_id} --conf-file {file}{start}"
-
-
-def write_plots(search: Search) -> None:
-    """Plot the mean rewards of the finished trials in order, and against each setting, as Optuna does; PNG.
-
-    :raises ConfigError: a folder that cannot be written, a full disk.
-    """
-    for name, plot in PLOTS.items():
-        axes = plot(search.study, target=lambda trial: trial.user_attrs[REWARD], target_name="mean reward")
-        figure = np.ravel(axes)[0].figure
-        write_bytes(Path(search.job.log_folder, name), picture(figure, "png", dpi=110, bbox_inches="tight"))
-        pyplot.close(figure)

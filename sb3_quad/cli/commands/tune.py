@@ -109,12 +109,11 @@ def _print_results(search: Any) -> None:
     from sb3_quad.controllers.zips import load_model
     from sb3_quad.training.config import build_config
     from sb3_quad.training.runs import open_run
-    from sb3_quad.tuning.results import count_trials, settings_of, train_command, trial_line, write_plots
+    from sb3_quad.tuning.results import count_trials, settings_of, train_command, trial_line
     from sb3_quad.tuning.search import RUN
 
     known, best = search.job.config, search.best
     if best is not None:
-        write_plots(search)
         print(f"the best: {trial_line(search, best)}")
         path = Path(best.user_attrs[RUN])
         if known.task is not None and path.is_dir():  # a process elsewhere may have trained it
