@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import publish
 import pytest
 import torch
 import yaml
@@ -254,7 +255,7 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     assert main(["evaluate", str(run.path), *small]) == 0
     output = capsys.readouterr()
     assert run.path.name in output.out and f"{run.path.name} flies heavy, the reference flies itm" in output.err
-    assert main(["publish", str(run.path), "--name", "mine", "--episodes", "2"]) == 0
+    assert publish.main([str(run.path), "--name", "mine", "--episodes", "2"]) == 0
     card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
     facts = (
         "vehicle `heavy`",

@@ -107,6 +107,13 @@ def test_tune_expert(run, tmp_path):
     assert tuned.model_copy(update={"geometric_gains": poor}) == slow
 
 
+def test_publish(run, tmp_path):
+    """More of it: tests/test_pretrained.py."""
+    with pytest.raises(SystemExit) as left:
+        run("publish.py", "itm-imitation", "--name", "mine", "--episodes", "1")
+    assert left.value.code == 0 and {"mine.zip", "mine.md"} == {path.name for path in tmp_path.iterdir()}
+
+
 def test_robustness_plot(run, tmp_path):
     asked = ["--suite", "robustness", "--scenario", "mass", "--episodes", "2", "-o", "results", "--no-report"]
     assert main(["evaluate", "pid", *asked]) == 0

@@ -1,4 +1,4 @@
-"""Policies that come with the package, and the command that makes them."""
+"""Policies that come with the package, and the script that makes them."""
 
 import base64
 import importlib.util
@@ -9,6 +9,7 @@ import zipfile
 from pathlib import Path
 
 import numpy as np
+import publish
 import pytest
 from stable_baselines3 import PPO
 
@@ -146,8 +147,8 @@ def test_names_stand_where_zips_do(capsys):
 def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_run, tmp_path, capsys, observations):
     source = dagger_run / "QuadStateRecovery-v0.zip"
     (dagger_run / "QuadStateRecovery-v0" / "command.txt").write_text("typed\n```\nso\n")
-    command = ["publish", str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
-    assert main(command) == 0
+    command = [str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
+    assert publish.main(command) == 0
     card = (tmp_path / "mine.md").read_text(encoding="utf-8")
     for part in (
         "# mine",
@@ -165,7 +166,7 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_ru
         )
     assert (tmp_path / "mine.zip").stat().st_size < 0.5 * source.stat().st_size
     before = (tmp_path / "mine.zip").read_bytes()
-    assert main(command) == 2
+    assert publish.main(command) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert (tmp_path / "mine.zip").read_bytes() == before
 
@@ -198,7 +199,7 @@ def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
 def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
     env = QuadcopterVecEnv(2, seed=0)
     PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).save(tmp_path / "alone.zip")
-    assert main(["publish", str(tmp_path / "alone.zip"), "--name", "x", "-o", str(tmp_path), "--episodes", "2"]) == 0
+    assert publish.main([str(tmp_path / "alone.zip"), "--name", "x", "-o", str(tmp_path), "--episodes", "2"]) == 0
     card = (tmp_path / "x.md").read_text()
     for part in ("`PPO`, 0 timesteps", "| run | not recorded |", "# not recorded", "not recorded; measured on `itm`"):
         assert part in card
@@ -215,6 +216,6 @@ def test_publish_refuses_what_it_cannot_describe(dagger_run, tmp_path, capsys):
         ([str(source), "--name", "a/b"], "without folders"),
         ([str(source), "--name", "x", "--episodes", "0"], "must be at least 1"),
     ):
-        assert main(["publish", *arguments, "--command", "typed so", "-o", str(tmp_path / "out")]) == 2
+        assert publish.main([*arguments, "--command", "typed so", "-o", str(tmp_path / "out")]) == 2
         assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists() or not list(Path(tmp_path / "out").iterdir())

@@ -1,15 +1,12 @@
-"""A trained zip for others: as a file that flies by itself, checked, or as a small zip of stock PPO."""
+"""A trained zip as a file that flies by itself, checked."""
 
 import hashlib
-import io
 import re
 import warnings
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
-
-from stable_baselines3 import PPO
+from typing import NamedTuple
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.version import __version__
@@ -18,9 +15,8 @@ from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load
 from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
-from sb3_quad.export.network import Network, build_network, check_policy, write_onnx, write_torchscript
+from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
@@ -116,30 +112,3 @@ def _describe(path: Path, algorithm: str, network: Network, reference: Reference
         "network": f"{'-'.join(map(str, sizes))}, hidden layers {hidden}, {n_parameters} float32 parameters",
         "check": "pending",
     }
-
-
-def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> bytes:
-    """The zip of a stock PPO model with the policy of an on-policy agent's zip, to hand on; SB3 2.4 and later read it.
-
-    Gone are the optimizer's moments, the last observations and the episodes' statistics; the settings are PPO's own, as plain
-    numbers, since SB3's classes of schedules differ from version to version. The weights are the same.
-
-    :param settings: how it flies, for the zip to say; None: it says nothing.
-    :raises ConfigError: a file that cannot be read, or whose policy is not ``MlpPolicy`` of an on-policy algorithm.
-    """
-    source: Any = load_model(path)
-    check_policy(source.policy, f"model {path}")
-    if source.use_sde:
-        raise ConfigError(f"model {path}: was trained with gSDE (use_sde), which is not handed on")
-    kwargs = {key: value for key, value in source.policy_kwargs.items() if key in ("net_arch", "activation_fn")}
-    model: Any = PPO("MlpPolicy", None, policy_kwargs=kwargs, device="cpu", _init_setup_model=False)  # type: ignore[arg-type]
-    model.observation_space, model.action_space, model.n_envs = source.observation_space, source.action_space, 1
-    model._setup_model()
-    model.policy.load_state_dict(source.policy.state_dict())
-    model.num_timesteps = source.num_timesteps
-    if settings is not None:
-        settings.write_into(model)
-    model.clip_range = 0.2  # plain numbers, of which loading makes the schedules of its own version
-    buffer = io.BytesIO()
-    model.save(buffer, exclude=["lr_schedule", "clip_range_vf", "start_time"])
-    return buffer.getvalue()

@@ -51,7 +51,6 @@ BASES = {
     "evaluate": "pid --suite suite.yaml --no-report",
     "export": "itm-recovery --format torchscript",
     "plot": "a=no_run",
-    "publish": "itm-recovery --name mine --episodes 1",
     "report": "no_results",
     "sweep": "sweep.yaml --dry-run",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",

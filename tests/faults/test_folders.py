@@ -11,13 +11,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import publish
 import pytest
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.evaluation.results import load_results
-from sb3_quad.report import card
 from sb3_quad.tuning.search import OWNER, open_study, retry_dead_trials
 
 
@@ -109,9 +109,9 @@ def disk_full(*arguments, **settings):
 @pytest.mark.parametrize(("fault", "code"), [(interrupted, 130), (disk_full, 2)])
 def test_publish_replaces_both_the_zip_and_its_card_or_neither(tmp_path, monkeypatch, fault, code):
     command = ["--name", "mine", "-o", str(tmp_path), "--episodes", "1"]
-    assert main(["publish", "itm-imitation", *command]) == 0
+    assert publish.main(["itm-imitation", *command]) == 0
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
     assert len(before) == 2
-    monkeypatch.setattr(card, "measure" if code == 130 else "write_card", fault)
-    assert main(["publish", "itm-recovery", *command, "--overwrite"]) == code
+    monkeypatch.setattr(publish, "measure" if code == 130 else "write_card", fault)
+    assert publish.main(["itm-recovery", *command, "--overwrite"]) == code
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -113,7 +113,6 @@ def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
         ),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
         ("export foreign.zip --format torchscript", "observation_space"),
-        ("publish foreign.zip --name mine", "policy_kwargs"),
         ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "action_space"),
         ("train --algo dagger --expert foreign.zip -n 100 --eval-episodes 0", "policy.pth"),
         ("train --algo ppo -i foreign.zip -n 100 --eval-episodes 0", "policy.pth"),

@@ -1,7 +1,7 @@
 """Trained policies that come with the package: for each ``NAME.zip``, for stock PPO, a card ``NAME.md``.
 
 The card says what it flies, how it was trained (command, seed, commit) and what was measured.
-``sb3-quad publish`` writes both.
+``examples/publish.py`` writes both.
 """
 
 from pathlib import Path
