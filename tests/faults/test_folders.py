@@ -59,7 +59,8 @@ def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypa
     (tmp_path / "space.yml").write_text("gamma: {low: 0.5, high: 1.0}\n")
     command = ["tune", "--algo", "ppo", "--env", "Pendulum-v1", "--conf-file", "small.yml", "--search-space", "space.yml"]
     command += shlex.split("--eval-episodes 1 --n-evaluations 1 --no-progress --storage study.log --sampler random")
-    path = os.pathsep.join([str(Path(__file__).parents[2]), str(Path(__file__).parent)])
+    here = Path(__file__).parent
+    path = os.pathsep.join(map(str, (here.parents[1], here.parents[1] / "examples", here)))
     environment = {**os.environ, "KILL": "yes", "PYTHONPATH": path}
     killed = subprocess.run([sys.executable, "-m", "sb3_quad.cli", *command], env=environment, check=False)
     assert killed.returncode == -signal.SIGKILL
