@@ -60,7 +60,6 @@ class Stage(Frozen):
     seed_offset: NonNegativeInt = Field(
         default=0, description="added to the seed, so that a stage sees other episodes than one before it on the same task"
     )
-    begin: Literal["before", "new"] = Field(default="before", description="from the agent of the stage before, or a new one")
     pass_on: Literal["best", "last"] = Field(default="best", description="the best evaluation, by success, then by reward")
     trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
@@ -220,7 +219,7 @@ def _train_stages(
                 if run is not None and run.timesteps >= job.config.n_timesteps:
                     timesteps, seconds = run.timesteps, read_curve(run.path).seconds[-1] if run.evaluations.is_file() else 0.0
                 else:
-                    start = job.model_copy(update={"trained_agent": agent}) if agent and stage.begin == "before" else job
+                    start = job.model_copy(update={"trained_agent": agent}) if agent else job
                     report(f"{stage.name}: {describe(start)}")
                     begun = run is not None and (run.not_begun or run.resume_state.is_file())
                     trained = (
