@@ -98,7 +98,7 @@ json.dump(found, open("flags.json", "w"))
 
 def run(*arguments, cwd, **environment):
     """Output of a command of this interpreter that must succeed."""
-    path = os.pathsep.join(map(str, (ROOT, ROOT / "examples" / "rl_zoo3")))
+    path = os.pathsep.join(map(str, (ROOT, ROOT / "examples" / "zoo_bridge")))
     given = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", **environment}
     command = [sys.executable, *map(str, arguments)]
     result = subprocess.run(command, cwd=cwd, env=given, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
