@@ -10,7 +10,6 @@ from typing_extensions import Self
 
 from sb3_quad.algorithms.networks.gradients import network_of
 from sb3_quad.algorithms.networks.perceptron import one_torch_thread
-from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.controller import Controller
 
@@ -18,10 +17,10 @@ _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  
 
 
 class ExpertMixin:
-    """The expert of an algorithm, and its state from rollout to rollout."""
+    """The expert of an algorithm."""
 
     expert: Any
-    _labeller: Controller | None = None  # asks the expert, and holds its state
+    _labeller: Controller | None = None  # asks the expert, and holds what a recurrent one carries on
 
     def set_expert(self, expert: Any) -> None:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
@@ -52,19 +51,6 @@ class ExpertMixin:
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         return [*super()._excluded_save_params(), "expert", "_labeller"]  # type: ignore[misc]
-
-    def expert_state(self) -> Arrays:
-        """What an expert with a state, such as a recurrent policy, carries on, which no zip holds."""
-        return {} if self._labeller is None else self._labeller.state()
-
-    def restore_expert_state(self, state: Arrays) -> None:
-        """Go back to an :meth:`expert_state`; the model needs its expert and environment.
-
-        :raises ExpertError: an expert whose state could not be saved.
-        """
-        if state:
-            self._labeller = Controller.for_env(self.expert, self.get_env(), self._labeller)  # type: ignore[attr-defined]
-            self._labeller.restore(state)
 
 
 def parameters_of_both(policy: Any) -> tuple[list[Any], list[Any]]:

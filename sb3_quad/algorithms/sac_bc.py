@@ -18,13 +18,12 @@ from torch.nn import functional as F
 from sb3_quad.algorithms.buffers import ExpertNStepReplayBuffer, ExpertReplayBuffer, ExpertReplaySamples
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero
 from sb3_quad.algorithms.networks.losses import CloningLoss, agree, cloning_errors
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
+from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
 from sb3_quad.controllers.controller import Controller
 
 BC_LOSSES: tuple[CloningLoss, ...] = ("mse", "huber", "huber_mse")
 BC_FILTERS = ("none", "q", "agreement")
-STARTS = "starts"  # in the state of the expert: the rows that have just begun an episode
 
 
 class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
@@ -305,14 +304,6 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_labels", "_starts"]
-
-    def expert_state(self) -> Arrays:
-        """As of any algorithm with an expert, and which rows have just begun an episode."""
-        return super().expert_state() | ({} if self._starts is None else {STARTS: self._starts})
-
-    def restore_expert_state(self, state: Arrays) -> None:
-        self._starts = state.get(STARTS)
-        super().restore_expert_state({name: array for name, array in state.items() if name != STARTS})
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:

@@ -8,11 +8,9 @@ import numpy.typing as npt
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.arrays import Arrays, BoolArray, Float32Array
+from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
 from sb3_quad.simulation.state import QuadcopterState
-
-UNSAVED = "unsaved"  # the only name in what a controller keeps that cannot be saved; its value is whose it is
 
 
 class Controller:
@@ -141,24 +139,6 @@ class Controller:
             before = {"state": self._state} | ({} if episode_start is None else {"episode_start": episode_start})
         actions, self._state, *_ = self.source.predict(observation, deterministic=self._deterministic, **before)
         return actions
-
-    def state(self) -> Arrays:
-        """The state that ``predict`` is given next, as :meth:`restore` takes it."""
-        if self._state is None:
-            return {}
-        if not isinstance(self._state, tuple) or not all(isinstance(part, np.ndarray) for part in self._state):
-            return {UNSAVED: np.array(self.name)}
-        return {str(number): part.copy() for number, part in enumerate(self._state)}
-
-    def restore(self, state: Arrays) -> None:
-        """Go back to a :meth:`state`.
-
-        :raises ExpertError: it could not be saved.
-        """
-        if UNSAVED in state:
-            name = state[UNSAVED]
-            raise ExpertError(f"{self.kind} {name}: its state was no tuple of arrays, so no snapshot holds it; begin anew")
-        self._state = tuple(state[str(number)] for number in range(len(state))) if state else None
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:

@@ -23,7 +23,7 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
-ENVIRONMENT, DATASET, EXPERT_STATE = "environment.", "dataset.", "expert_state."  # before the names of their arrays
+ENVIRONMENT, DATASET = "environment.", "dataset."  # before the names of their arrays
 SHARE = 0.03  # of the run's time that snapshots may take
 
 
@@ -76,7 +76,6 @@ class SnapshotFile(LastGoodModel):
         batch: Any = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
         state = random_state()
         state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
-        state |= _with_prefix(EXPERT_STATE, model.expert_state() if hasattr(model, "expert_state") else {})
         if self._run.episodes.is_file():
             state["episodes"] = np.array(self._run.episodes.stat().st_size)
         if self._run.best_model.is_file():
@@ -128,8 +127,6 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         _fill(buffer, _part(state, f"{name}."))
     if batch is not None:
         batch.restore(environment)
-        if hasattr(model, "restore_expert_state"):
-            model.restore_expert_state(_part(state, EXPERT_STATE))
     _take_back(run, state, model.num_timesteps)
     set_random_state(state)
     return cast(BaseAlgorithm, model)
