@@ -156,12 +156,6 @@ def test_a_trial_that_fails_is_told_and_the_others_go_on(command, capsys):
     assert f"ConfigError: trial {failed[0]['number']}: batch_size is 0, must be at least 1" in output
     assert f"{len(failed)} failed" in output
 
-    Path("space.yml").write_text(yaml.safe_dump({"batch_size": [0, -1]}))
-    capsys.readouterr()
-    assert main([*command, "--study-name", "hopeless"]) == 2
-    assert "the first 5 trials failed" in one_line_of_error(capsys)
-    assert len(trials(2)) == 5
-
 
 class InterruptSecond(BaseCallback):
     """Sends this process Ctrl-C in the second training that it is part of."""

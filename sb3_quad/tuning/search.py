@@ -6,7 +6,7 @@ import math
 import os
 import platform
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,7 +41,6 @@ BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials shar
 OWNER = "owner"  # user attribute of a trial: the machine and the process that train it
 SETTINGS, SUCCESS, REWARD, RUN, ERROR = "settings", "success_rate", "mean_reward", "run", "error"  # others
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
-HOPELESS = 5  # so many trials failing at first, and none not: the settings are at fault, not what is varied
 
 
 class Search:
@@ -242,13 +241,6 @@ def retry_dead_trials(study: optuna.Study) -> None:
                 study.enqueue_trial(trial.params)
             except PermissionError:  # another user's
                 pass
-
-
-def check_hopeless(ended: Sequence[FrozenTrial]) -> None:
-    """:raises TrainingError: the first trials have all failed, not counting interrupted ones."""
-    failures = [trial for trial in ended if trial.state.name == "FAIL" and trial.user_attrs.get(ERROR) != INTERRUPTED]
-    if len(failures) == len(ended) == HOPELESS:
-        raise TrainingError(f"the first {HOPELESS} trials failed, the last with: {failures[-1].user_attrs[ERROR]}")
 
 
 def score(success: float, reward: float, n_episodes: int) -> float:

@@ -48,7 +48,6 @@ def run(options: argparse.Namespace) -> int:
     """Search, report, write. Returns the exit code."""
     from sb3_quad.cli.output import progress_bar
     from sb3_quad.tuning.results import count_trials, trial_line, write_results
-    from sb3_quad.tuning.search import check_hopeless
 
     prepare(options)
     with StopSignals() as signals:
@@ -66,7 +65,6 @@ def run(options: argparse.Namespace) -> int:
                     write_results(search)
                     print(trial_line(search, trial))
                     show(len(ended), options.n_trials, "trials")
-                    check_hopeless(ended)
             finally:
                 write_results(search)
     _print_results(search)
