@@ -3,6 +3,7 @@
 import os
 import random
 import shutil
+import signal
 from pathlib import Path
 
 os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read when torch is imported; the tests are the same on every machine
@@ -24,6 +25,13 @@ HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
     "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
     "sac_bc": ["learning_starts:100", "buffer_size:2000", "batch_size:64", "gradient_steps:2"],
 }
+
+
+def pytest_configure():
+    """Under nohup, or in a shell's background, signals are ignored, also by the programs that are started from here."""
+    for number in (signal.SIGINT, signal.SIGHUP):
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)

@@ -10,13 +10,11 @@ import numpy as np
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.colours import COLOURS
 from sb3_quad.base.errors import ConfigError, ControllerError
-from sb3_quad.base.validate import validate
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.scenarios.parts import Wrench
-from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan, sample_wrenches
+from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
@@ -85,26 +83,18 @@ class Setting(NamedTuple):
     own: Mapping[str, Mapping[str, Any]] = {}  # changes to the settings that go with a controller, by its label
 
 
-def fixed_setting(
-    settings: FlightSettings, target: Sequence[float] | None = None, push: Mapping[str, Any] | None = None
-) -> Setting:
-    """Episodes of some settings, all with the same target and the same push.
+def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:
+    """Episodes of some settings.
 
-    :param target: r_T, (3,), m; None: the episode's own.
-    :param push: fields of a :class:`~sb3_quad.evaluation.scenarios.parts.Wrench`; none: there is no push.
-    :raises ConfigError: an unknown vehicle, a target below ground, a push that is none.
+    :param target: of all of them, r_T, (3,), m; None: each episode's own.
+    :raises ConfigError: an unknown vehicle, a target below ground.
     """
-    vehicle = load_vehicle(settings.vehicle)
-    start = {}
+    start, least = {}, load_vehicle(settings.vehicle).collision_radius
     if target is not None:
         start["target"] = per_row("--target", target, 1, 3).T
-        if target[2] <= vehicle.collision_radius:
-            raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {vehicle.collision_radius:g} m")
-    wrenches = [validate(Wrench, push, "the push")] if push else []
-    generators = [np.random.default_rng(0)]
-    acting = sample_wrenches(wrenches, vehicle, settings.longest_episode, generators)
-    plan = Plan(start, acting)
-    return Setting(settings.vehicle, settings, lambda seed: plan)
+        if target[2] <= least:
+            raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {least:g} m")
+    return Setting(settings.vehicle, settings, lambda seed: Plan(start))
 
 
 def scenario_setting(text: str, own: Any = None) -> Setting:

@@ -18,7 +18,6 @@ SETTLED = 0.25  # m: for a sequence, a flight is over once it stays that near it
 VEHICLE_SHARE = 0.15  # of the picture's height that a vehicle is drawn across at least
 LARGEST = 6.0  # how much larger than life it is drawn at most
 APART = 0.8  # between poses in the picture, in the vehicle's drawn breadth
-SIDES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1], [-0.8, -0.8], [0.8, -0.8], [-0.8, 0.8], [0.8, 0.8]])  # of a pose
 
 
 class _View(NamedTuple):
@@ -95,17 +94,11 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) ->
 
 
 def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
-    """The time of each pose and where it is written: beside it, on the side with most room, inside the picture."""
-    places, breadth = view.project(recording.state.position[list(steps)])
-    taken = [*places]  # what a text keeps away from: poses and the texts before it
+    """The time of each pose and where it is written: above it, inside the picture."""
     tags = []
-    for step, place, reach in zip(steps, places, 0.5 * breadth, strict=True):
+    for step, (column, row), breadth in zip(steps, *view.project(recording.state.position[list(steps)]), strict=True):
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array(tag_size(text, size))
-        around = place + SIDES * (0.8 * reach + half)
-        around = around.clip(half, view.camera.lens[:2] - half)
-        room = np.linalg.norm(around[:, None] - np.stack(taken), axis=2).min(axis=1)
-        chosen = around[int(room.round().argmax())]
-        taken.append(chosen)
-        tags.append((text, (float(chosen[0]), float(chosen[1]))))
+        middle = np.clip([column, row - 0.4 * breadth - half[1]], half, view.camera.lens[:2] - half)
+        tags.append((text, (float(middle[0]), float(middle[1]))))
     return tags

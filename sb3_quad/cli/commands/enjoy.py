@@ -5,7 +5,7 @@ examples:
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
   sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 -o recovery.mp4
   sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
-  sb3-quad enjoy agent.zip --target 5 0 20 --force -20 -20 0 --torque -5 -5 -5 --at 2.5 --for 0.02 -o hit.mp4 --speed 0.5
+  sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
   sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml -n 3000 --no-render
 
 A controller is pid, geometric, the path of an SB3 zip or a run folder, or package.module:factory; name=… labels it.
@@ -22,7 +22,7 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, given, natural, positive, whole
+from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, positive, whole
 from sb3_quad.envs.registration import ENVIRONMENTS
 
 DEFAULT_ENV = "QuadTargetTracking-v0"
@@ -33,7 +33,6 @@ SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, an
 def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
     add = parser.add_argument
-    vector: dict[str, Any] = {"nargs": 3, "type": float, "metavar": ("X", "Y", "Z")}
     add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
     add("--algo", help="algorithm of a trained agent, looked up in the log folder")
     task = parser.add_mutually_exclusive_group()
@@ -54,11 +53,7 @@ def add_arguments(parser: Parser) -> None:
     actions.add_argument("--deterministic", action="store_true", help="fly the mean of a policy's actions (default)")
     actions.add_argument("--stochastic", action="store_true", help="sample from a policy's actions")
     add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
-    add("--target", help="where to fly to, m", **vector)
-    add("--force", help="an external force, world frame, N", **vector)
-    add("--torque", help="an external torque, body frame, N m", **vector)
-    add("--at", dest="start", type=float, metavar="S", help="when force and torque begin, s (0)")
-    add("--for", dest="duration", type=float, metavar="S", help="how long they act, s (to the end)")
+    add("--target", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where to fly to, m")
     add("--no-render", action="store_true", help="only fly and print how it went")
     output = "write films (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
     add("-o", "--output", nargs="+", default=[], metavar="FILE", help=output)
@@ -140,8 +135,6 @@ def _check(options: argparse.Namespace, window: bool) -> None:
 
     if not (options.controllers or options.algo):
         raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
-    if (options.start is not None or options.duration is not None) and options.force is None and options.torque is None:
-        raise ConfigError("--at and --for say when --force and --torque act; give one of these")
     if options.size:
         check_size(*options.size)
     for file in options.output:
@@ -166,16 +159,15 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         specs.insert(0, ControllerSpec(*_agent_of_run(options, env_id)))
         print(f"agent: {specs[0].spec}")
     agents = [spec.own for spec in specs if spec.own is not None]  # the first says how all are flown
-    push = given(options, "force", "torque", "start", "duration")
     if options.scenario is not None:
-        if options.env_kwargs or options.target or push:
-            raise ConfigError("--scenario says all about a flight; leave --env-kwargs, --target, --force and --torque away")
+        if options.env_kwargs or options.target:
+            raise ConfigError("--scenario says all about a flight; leave --env-kwargs and --target away")
         setting = scenario_setting(options.scenario, agents[0].vehicle if agents else None)
     else:
         kept = agents[0] if agents else FlightSettings(task=ENVIRONMENTS[env_id])
         task = options.task or (ENVIRONMENTS[env_id] if options.env and not options.algo else kept.task)
         changes = {"task": task} | ({} if task == kept.task else {"task_kwargs": None}) | options.env_kwargs
-        setting = fixed_setting(kept.with_changes(**changes), options.target, push)
+        setting = fixed_setting(kept.with_changes(**changes), options.target)
     controllers, own = {}, {}
     for spec in specs:
         warn(spec.notice(setting.vehicle))
