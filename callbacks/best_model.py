@@ -12,7 +12,6 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
-from sb3_quad.controllers.controller import Controller
 
 LIVES = 20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
 Score = tuple[float, float]  # success rate, mean reward
@@ -29,11 +28,10 @@ class BestModel(EveryTimesteps):
     evaluation happens.
 
     >>> from stable_baselines3 import PPO
-    >>> from sb3_quad import PIDExpert
     >>> from sb3_quad.envs import QuadcopterVecEnv
     >>> tasks = ("state_recovery", "target_tracking")
     >>> recovery, tracking = (QuadcopterVecEnv(4, task, max_episode_steps=50) for task in tasks)
-    >>> best = BestModel(recovery, every=800, n_episodes=4, seed=9, expert=PIDExpert(), others={"tracking": tracking})
+    >>> best = BestModel(recovery, every=800, n_episodes=4, seed=9, others={"tracking": tracking})
     >>> model = PPO("MlpPolicy", QuadcopterVecEnv(8, "state_recovery"), n_steps=100, batch_size=400, device="cpu")
     >>> _ = model.learn(1600, callback=best)
     >>> import numpy as np
@@ -52,12 +50,9 @@ class BestModel(EveryTimesteps):
     :param report: called with one line for each evaluation.
     :param others: further environments by name, such as those of another task, which are evaluated at the same times. They do
         not decide which model is best; their results go to ``evaluations_<name>.npz`` beside ``evaluations``.
-    :param expert: as DAgger takes it; it flies the same episodes once, at the first evaluation. ``eval/reward_against_expert``
-        is then the model's mean reward minus the expert's.
     :param should_continue: called after each evaluation with its success rate and mean reward; False ends the training.
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read or
         flew another number of episodes.
-    :raises ExpertError: at the first evaluation, an expert that does not fit the environment.
     :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's Monitor.
     """
 
@@ -71,21 +66,19 @@ class BestModel(EveryTimesteps):
         evaluations: str | Path = "evaluations.npz",
         report: Callable[[str], None] = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
-        expert: Any = None,
         should_continue: Callable[[float, float], bool] = lambda success, reward: True,
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
         if n_episodes < 1:
             raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
-        self._n_episodes, self._seed, self._expert = n_episodes, seed, expert
+        self._n_episodes, self._seed = n_episodes, seed
         self._best_model, self._report, self._should_continue = best_model, report, should_continue
         path, others = Path(evaluations), others or {}
-        # By the group of the log: the environments, the file, its rows and the expert's mean reward; the first group decides.
+        # By the group of the log: the environments, the file, and its rows; the first group decides.
         self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
         self._paths = {"eval": path} | {f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others}
         self._rows: dict[str, dict[str, Any]] = {group: {} for group in self._envs}
-        self._expert_rewards: dict[str, float] = {}
         self._start = 0.0
         self.stopped = False  # by ``should_continue``
         self.best: Score = (-np.inf, -np.inf)
@@ -145,7 +138,9 @@ class BestModel(EveryTimesteps):
             successes.append(float(info.get("is_success", 0.0)))  # without reports all fail, and reward decides
             survivals.append(float(info.get("survival", np.nan)))
 
-        rewards, lengths = self._evaluate(self.model, env, note)
+        env.seed(self._seed)
+        flown = evaluate_policy(self.model, env, self._n_episodes, callback=note, return_episode_rewards=True, warn=False)
+        rewards, lengths = flown
         values = {"timesteps": self.num_timesteps, "results": rewards, "ep_lengths": lengths, "successes": successes}
         values["seconds"] = seconds
         if not np.isnan(survivals).any():
@@ -158,19 +153,9 @@ class BestModel(EveryTimesteps):
         logged = {"success_rate": success, "mean_reward": reward, "mean_ep_length": float(np.mean(lengths))}
         if "survivals" in values:
             logged["survival_rate"] = float(np.mean(survivals))
-        if self._expert is not None:
-            if group not in self._expert_rewards:
-                expert = Controller.for_env(self._expert, env)
-                self._expert_rewards[group] = float(np.mean(self._evaluate(expert, env)[0]))
-            logged["reward_against_expert"] = reward - self._expert_rewards[group]
         for name, value in logged.items():
             self.logger.record(f"{group}/{name}", value)
         return score
-
-    def _evaluate(self, model: Any, env: VecEnv, callback: Any = None) -> tuple[Any, Any]:
-        """Rewards and lengths of the same episodes each time, (n_episodes,) both."""
-        env.seed(self._seed)
-        return evaluate_policy(model, env, self._n_episodes, callback=callback, return_episode_rewards=True, warn=False)
 
 
 def _append(rows: dict[str, Any], values: dict[str, Any]) -> None:

@@ -13,19 +13,7 @@ from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import disconnect, has_display, open_window, point_window, start_drawing
 from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import (
-    BODY_RATES,
-    FORCE_WORLD,
-    POSITION,
-    QUATERNION,
-    ROTOR_SPEEDS,
-    STATE_SIZE,
-    TARGET,
-    TORQUE_WORLD,
-    VELOCITY,
-    P,
-    QuadcopterState,
-)
+from sb3_quad.simulation.state import FORCE_WORLD, POSITION, ROTOR_SPEEDS, TARGET, TORQUE_WORLD, P, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
@@ -104,8 +92,8 @@ class BulletBody:
         position, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
         velocity, angular_velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
         x, y, z, w = quaternion
-        state[POSITION, 0], state[QUATERNION, 0], state[VELOCITY, 0] = position, (w, x, y, z), velocity
-        state[BODY_RATES, 0] = np.array(angular_velocity) @ np.array(rotation_rows(w, x, y, z))  # from the world's axes
+        body_rates = np.array(angular_velocity) @ np.array(rotation_rows(w, x, y, z))  # from the world's axes
+        state[: ROTOR_SPEEDS.start, 0] = (*position, w, x, y, z, *velocity, *body_rates)
 
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""
@@ -125,7 +113,7 @@ class Renderer:
         self.shown_at, self.frames_due = time.perf_counter(), 1.0
         # PyBullet would draw the collision sphere.
         p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client)
-        self.reset(np.zeros(STATE_SIZE))
+        self.reset(np.zeros(TARGET.stop))
         if self.human:
             start_drawing(self.scene.client)
 

@@ -37,8 +37,8 @@ class CoefficientSchedule(BaseCallback):
     :param start: its value until the followed quantity is known and has passed ``between[0]``.
     :param final: its value from ``between[1]`` on; in between, linear.
     :param follow: ``progress``, the share of the timesteps done; or the name of anything that is logged, such as
-        ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate`` (of :class:`~sb3_quad.callbacks.BestModel`
-        or SB3's EvalCallback) or ``eval/reward_against_expert`` (of ``BestModel`` with an ``expert``).
+        ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate`` (of
+        :class:`~sb3_quad.callbacks.BestModel` or SB3's EvalCallback).
     :param between: where it begins to move and where it ends; the second may be the smaller one, as for a loss.
     :param one_way: it never goes back when the followed quantity does.
     :raises ConfigError: numbers that are not finite, equal ends of ``between``; when training begins, a coefficient that the

@@ -29,7 +29,7 @@ class CalmActions(VecEnvWrapper):
         return self.venv.reset()
 
     def step_async(self, actions):
-        """Remember how much the action changes."""
+        """Note how much the action changes."""
         self.change = np.square(actions - self.last).mean(axis=1)
         self.last = actions.copy()
         self.venv.step_async(actions)

@@ -43,7 +43,7 @@ if arguments.agent:
 
 every = max(arguments.timesteps // 5, 60_000)  # a rollout, at least
 recovery, tracking = (QuadcopterVecEnv(48, task) for task in ("state_recovery", "target_tracking"))
-best = BestModel(recovery, every, n_episodes=48, seed=1_000_000, report=print, others={"tracking": tracking}, expert=expert)
+best = BestModel(recovery, every, n_episodes=48, seed=1_000_000, report=print, others={"tracking": tracking})
 less_cloning = CoefficientSchedule("bc_coef", start=5.0, final=1.0, follow="eval/success_rate", between=(0.5, 0.95))
 model.learn(arguments.timesteps, callback=[best, less_cloning, StopOnSignal(arguments.output)])
 model.save(arguments.output)

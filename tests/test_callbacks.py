@@ -136,26 +136,6 @@ def test_checkpoints_are_whole_models_at_their_number_of_steps(tmp_path):
         Checkpoint(40, "model.zip")
 
 
-def test_the_expert_flies_the_same_episodes_once(tmp_path):
-    """Here the reward is the action, so an expert that always says 0.5 collects 5 in the ten steps."""
-    asked = []
-
-    def expert(observation):
-        asked.append(len(observation))
-        return np.full((len(observation), 1), 0.5)
-
-    best = make_best(tmp_path, every=40, expert=expert, others={"far": make_vec_env(Walk, 2)})
-    model = make_model()
-    model.set_logger(configure(str(tmp_path), ["tensorboard"]))
-    model.learn(80, callback=best)
-    for group in ("eval", "eval_far"):
-        (_, reward), (_, difference) = (
-            logged(tmp_path, f"{group}/{name}")[0] for name in ("mean_reward", "reward_against_expert")
-        )
-        assert difference == pytest.approx(reward - 5.0, abs=1e-5)
-    assert asked == [2] * 40  # four episodes of ten steps in two environments, for two groups, and never again
-
-
 def test_the_episode_log_is_a_monitor_file(tmp_path):
     for _ in range(2):
         make_model().learn(80, callback=EpisodeLog(tmp_path / "0.monitor.csv", "Walk-v0"))

@@ -109,15 +109,14 @@ def test_a_training_that_goes_on_starts_where_it_stopped(tmp_path):
     assert course.seen == [0.5, 0.5] and again.current_beta == 0.25
 
 
-def test_a_run_of_a_configuration_file_follows_the_reward_against_the_expert(tmp_path):
-    schedule = {"coefficient": "beta", "start": 1.0, "final": 0.25, "follow": "eval/reward_against_expert"}
+def test_a_run_of_a_configuration_file_follows_what_best_model_logs(tmp_path):
+    schedule = {"coefficient": "beta", "start": 1.0, "final": 0.25, "follow": "eval/mean_reward"}
     settings = {
         "n_timesteps": 400,
         "n_envs": 8,
         "n_steps": 25,
         "batch_size": 100,
         "n_epochs": 1,
-        "eval_expert": True,
         "env_kwargs": {"max_episode_steps": 20},
         "callback": [{"coefficient_schedule.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
     }

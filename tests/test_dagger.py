@@ -222,12 +222,12 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
     settings = {"beta_decay": 0.05, "dataset_capacity": 150, "bc_loss": "nll", "clip_range_vf": 0.2, "seed": None}
     whole = build(**settings).learn(ROLLOUT * 3)
     whole.save(tmp_path / "model")
-    whole.save_dataset(tmp_path / "dataset.npz")
+    whole.dataset.save(tmp_path / "dataset.npz")
     whole.set_env(pendulum(seed=7))  # episodes begin anew after an interruption, so they do here too
     whole.learn(ROLLOUT * 3, reset_num_timesteps=False)
 
     resumed = DAgger.load(tmp_path / "model", env=pendulum(seed=7), device="cpu", expert=turn_back)
-    resumed.load_dataset(tmp_path / "dataset.npz")
+    resumed.dataset.load(tmp_path / "dataset.npz")
     assert resumed.current_beta == pytest.approx(0.35)
     resumed.learn(ROLLOUT * 3, reset_num_timesteps=False)
     assert resumed.num_timesteps == whole.num_timesteps == ROLLOUT * 6

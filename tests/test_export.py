@@ -78,7 +78,7 @@ SEES = {
 
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory):
-    """Zips of policies that hover, by the weights of one that came with the package, and react to all that they remember."""
+    """Zips of policies that hover, by the weights of one that came with the package, and react to all that they see."""
     folder, old = tmp_path_factory.mktemp("extended"), PPO.load(pretrained("itm-recovery"), device="cpu").policy
     torch.manual_seed(0)
     for name, sees in SEES.items():

@@ -101,7 +101,7 @@ def test_any_text_on_the_command_line_is_a_value(text):
         ({"vec_env": "bath"}, "'batch', 'dummy' or 'subproc'"),
         ({"env_kwargs": {"nosie": 0}}, "did you mean 'noise'"),
         ({"policy_kwargs": {"activation_fn": "nn.Tahn"}}, "did you mean 'nn.Tanh'"),
-        ({"normalize": True}, "normalize is not supported"),
+        ({"normalize": True}, "normalize: Input should be False"),
         ({"callback": 3}, "package.module.Class"),
     ],
 )

@@ -29,7 +29,7 @@ assert not any(name.startswith("sb3_quad.") for name in sys.modules)
 assert all(model.flight_settings["vehicle"]["mass"] > 0 for model in models)
 models[0].save("again.zip")
 seen = np.load(observations)
-own = [np.resize(seen, (len(seen), *model.observation_space.shape)) for model in models]  # some remember, and see more
+own = [np.resize(seen, (len(seen), *model.observation_space.shape)) for model in models]  # some see more
 actions = [model.predict(each, deterministic=True)[0].tolist() for model, each in zip(models, own)]
 json.dump([actions, [model.num_timesteps for model in models]], sys.stdout)
 """

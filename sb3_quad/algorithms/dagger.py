@@ -1,7 +1,6 @@
 """DAgger, data aggregation, as a Stable-Baselines3 algorithm (thesis 3.1.2, 4.2.1, Algorithm 3)."""
 
 import secrets
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -345,14 +344,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         self.set_expert(self.expert)
         if anew:  # β begins anew; the dataset stays until ``dataset.clear()``
             self._n_rollouts = 0
-
-    def save_dataset(self, path: str | Path) -> None:
-        """Save the dataset as an .npz file, as :meth:`AggregatedDataset.save` does."""
-        self.dataset.save(path)
-
-    def load_dataset(self, path: str | Path) -> None:
-        """Replace the dataset by a saved one, as :meth:`AggregatedDataset.load` does."""
-        self.dataset.load(path)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "dataset"]

@@ -1,9 +1,10 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
+import csv
 import fcntl
 import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -60,7 +61,7 @@ def locked(folder: Path, what: str) -> Iterator[None]:
             raise ConfigError(f"{what} {folder}: another process is writing to it; wait until that ends") from None
         except OSError:  # no locks here
             pass
-        for half in folder.glob(".*.tmp"):
+        for half in folder.rglob(".*.tmp"):
             half.unlink(missing_ok=True)
         yield
     finally:
@@ -70,6 +71,15 @@ def locked(folder: Path, what: str) -> Iterator[None]:
 def write_text(path: str | Path, text: str) -> None:
     """As :func:`write_bytes`, of text in UTF-8."""
     write_bytes(path, text.encode("utf-8"))
+
+
+def write_csv(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """As :func:`write_bytes`, of a table: empty where a row has no such key, without what no column is called."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> None:

@@ -140,11 +140,7 @@ def evaluate(
 
 
 def fly_scenario(
-    controller: Any,
-    scenario: Scenario,
-    backend: str = "batch",
-    recorded: int | None = 0,
-    own: Mapping[str, Any] | None = None,
+    controller: Any, scenario: Scenario, backend: str = "batch", recorded: int | None = 0, own: Mapping[str, Any] | None = None
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
 

@@ -7,8 +7,6 @@
 A number that does not exist is None, never NaN.
 """
 
-import csv
-import io
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -18,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, write_text
+from sb3_quad.base.files import read_arrays, write_csv
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.parts import Vector
@@ -121,11 +119,7 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """
     rows = [row for entry in entries for row in _rows(entry, read_arrays(folder / entry.flights, "episode_"))]
-    text = io.StringIO()
-    writer = csv.DictWriter(text, dict.fromkeys(name for row in rows for name in row), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    write_text(folder / EPISODES, text.getvalue())
+    write_csv(folder / EPISODES, dict.fromkeys(name for row in rows for name in row), rows)
 
 
 def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:

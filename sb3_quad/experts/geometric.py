@@ -10,22 +10,12 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import (
-    BODY_RATES,
-    POSITION,
-    QUATERNION,
-    TARGET,
-    VELOCITY,
-    WRENCH_SIZE,
-    P,
-    QuadcopterState,
-    W,
-    first_rows,
-)
+from sb3_quad.simulation.state import STATE, WRENCH_SIZE, P, QuadcopterState, W, first_rows, row_slices
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
+_ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
@@ -144,7 +134,7 @@ class GeometricExpert(Expert):
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
-        moving = [state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)]
+        moving = [state.array[rows] for rows in _ROWS]
         wrench = _NO_WRENCH if self._told is None or state.wrench is None else state.wrench
         constants: tuple[FloatArray, ...] = self._constants
         if self._told is not None and state.vehicles is not None:

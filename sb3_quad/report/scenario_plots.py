@@ -16,8 +16,6 @@ from sb3_quad.report.plots import HEIGHT, INK, POINTS, WIDTH, Plot, band, interv
 FORCE, TARGET = "#db1a24", "#1a9a45"
 LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
 LINE_POINTS = 200  # that a flight is drawn with, at most
-
-
 SHOWN_FLIGHTS = 4  # of a controller, of random episodes
 
 

@@ -1,7 +1,7 @@
 """Counter-based random numbers: a stream per row, so that neither threads nor neighbours change what a row gets.
 
 Every number is Philox4x32 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) of a key and a
-counter: the key names the row, the counter is ``(block, step, episode, purpose)``. Nothing is remembered in between.
+counter: the key names the row, the counter is ``(block, step, episode, purpose)``. Nothing is kept in between.
 
 ``streams``, uint32 of shape ``(4, n)``: key_lo, key_hi, episode, step. Resetting a row adds one to ``episode`` and sets
 ``step`` to 0; each control step adds one to ``step``.

@@ -191,8 +191,8 @@ def add_gusts(b, gust, first, count):
 def advance_gusts(b, gust, first, count):
     """Advance the gusts of a block by a control step, in place, by two random words of each lane.
 
-    What is added to a component is the sum of three numbers of seven bits each, scaled. A gust remembers many control steps,
-    so the sum of what was added is normal.
+    What is added to a component is the sum of three numbers of seven bits each, scaled. A gust's time constant is many
+    control steps, so the sum of what was added is normal.
     """
     word = b.word
     for lane in range(count):

@@ -6,8 +6,6 @@ Annals of Applied Statistics 1, 2007). Few seeds give intervals that are too nar
 Learning at the Edge of the Statistical Precipice, NeurIPS 2021): with one they tell of episodes alone.
 """
 
-import csv
-import io
 import itertools
 import json
 import warnings
@@ -20,7 +18,7 @@ import numpy as np
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_text
+from sb3_quad.base.files import write_csv, write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.statistics import Estimate
@@ -118,12 +116,9 @@ def write_results(place: SweepFolder, found: SweepResults) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
-    text, records = io.StringIO(), [found.records[run.name] for run in found.plan.runs if run.name in found.records]
+    records = [found.records[run.name] for run in found.plan.runs if run.name in found.records]
     columns = ["run", "configuration", "seed", "state", "scenario", "episodes", *MEASURES, "timesteps", "agent", "weights"]
-    writer = csv.DictWriter(text, [*columns, "message"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row for record in records for row in _rows(record))
-    write_text(place.path / "results.csv", text.getvalue())
+    write_csv(place.path / "results.csv", [*columns, "message"], (row for record in records for row in _rows(record)))
     content = {
         "sweep": found.plan.spec.name,
         "package_version": __version__,

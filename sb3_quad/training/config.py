@@ -9,16 +9,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias, get_args
 
 import gymnasium
-from pydantic import (
-    BeforeValidator,
-    Field,
-    NonNegativeFloat,
-    PositiveInt,
-    StrictBool,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, ValidationInfo, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
@@ -57,9 +48,7 @@ def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
 
 
 Whole: TypeAlias = Annotated[
-    int,
-    Field(lt=2**63),
-    BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
+    int, Field(lt=2**63), BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name))
 ]
 Keywords: TypeAlias = Annotated[dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))]
 Classes: TypeAlias = Annotated[
@@ -82,14 +71,13 @@ class TrainingConfig(Frozen):
     env_kwargs: Keywords = Field(default={}, description="keywords of the environment's constructor")
     eval_env_kwargs: Keywords = Field(default={}, description="put over env_kwargs in the evaluation's environments")
     eval_tasks: Tasks = Field(default=(), description="further tasks to evaluate on; the own one decides which model is best")
-    eval_expert: StrictBool = Field(default=False, description="true or false: whether the expert is evaluated, too")
     policy: str = "MlpPolicy"
     policy_kwargs: Keywords = Field(default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'")
     expert: Any = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory, to learn from")
     callback: Classes = Field(default=[], description="callbacks of the training")
     env_wrapper: Classes = Field(default=[], description="wrappers around each environment, of dummy and subproc")
     vec_env_wrapper: Classes = Field(default=[], description="wrappers around the vectorised environment")
-    normalize: Any = None
+    normalize: Literal[False] | None = Field(default=None, description="its statistics would not be part of a model's zip")
     noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(default=None, description="of an off-policy algorithm")
     noise_std: NonNegativeFloat = Field(default=0.1, description="deviation of that noise, of actions within -1 and 1")
     hyperparams: dict[str, Any] = Field(description="keywords of the algorithm's constructor, converted")
@@ -168,13 +156,6 @@ class TrainingConfig(Frozen):
             raise ConfigError(f"{info.data['env_id']} has no tasks; leave it out")
         return tuple(_one_of(TASKS, name, info) for name in value)
 
-    @field_validator("normalize")
-    @classmethod
-    def _not_normalised(cls, value: Any) -> Any:
-        if value:
-            raise ConfigError("normalize is not supported: its statistics are not part of a model's zip; use false")
-        return value
-
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
         if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
@@ -185,8 +166,8 @@ class TrainingConfig(Frozen):
             raise ConfigError(f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; give steps")
         if self.noise_type is not None and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
-        if (self.expert or self.eval_expert) and not takes_expert(get_algorithm(self.algo)):
-            raise ConfigError(f"expert: {self.algo} learns from no expert; leave expert and eval_expert out")
+        if self.expert and not takes_expert(get_algorithm(self.algo)):
+            raise ConfigError(f"expert: {self.algo} learns from no expert; leave it out")
         return self
 
 

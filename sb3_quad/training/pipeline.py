@@ -188,7 +188,7 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
             raise ConfigError(f"{where}: {error}") from None
         if stage.trim and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
             raise ConfigError(
-                f"{where}: trim {stage.trim} is for agents that read the 18 features, not for ones that remember"
+                f"{where}: trim {stage.trim} is for agents that see the 18 features alone"
             )
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)

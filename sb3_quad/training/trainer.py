@@ -207,7 +207,6 @@ def _learn(
             evaluations=run.evaluations,
             report=report,
             others={task: env for task, env in eval_envs.items() if task is not None},
-            expert=getattr(model, "expert", None) if config.eval_expert else None,
             should_continue=should_continue,
         )
         callbacks.append(best)

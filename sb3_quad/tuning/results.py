@@ -1,7 +1,5 @@
 """What a search leaves: the best settings as YAML, all trials as CSV."""
 
-import csv
-import io
 import json
 from pathlib import Path
 from typing import Any
@@ -9,7 +7,7 @@ from typing import Any
 import yaml
 from optuna.trial import FrozenTrial
 
-from sb3_quad.base.files import write_text
+from sb3_quad.base.files import write_csv, write_text
 from sb3_quad.tuning.search import ERROR, INTERRUPTED, REWARD, RUN, SETTINGS, SUCCESS, Search
 from sb3_quad.tuning.space import current
 
@@ -23,10 +21,8 @@ def write_results(search: Search) -> None:
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     folder, best = Path(search.job.log_folder), search.best
-    text = io.StringIO()
+    rows = list[dict[str, Any]]()
     head = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds", *search.space.dimensions, RUN, ERROR]
-    writer = csv.DictWriter(text, head, extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
     for trial in search.trials():
         own = {
             "number": trial.number,
@@ -36,8 +32,8 @@ def write_results(search: Search) -> None:
             "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 2),
         }
         error = {ERROR: INTERRUPTED} if trial.state.name == "FAIL" else {}  # of a process that was killed
-        writer.writerow({**error, **trial.user_attrs, **varied(search, trial), **own})
-    write_text(folder / TRIALS, text.getvalue())
+        rows.append({**error, **trial.user_attrs, **varied(search, trial), **own})
+    write_csv(folder / TRIALS, head, rows)
     if best is not None:
         head = [
             f"Found by sb3-quad tune: trial {best.number} of {len(search.trials())} that ended, study {search.name}.",

@@ -116,9 +116,14 @@ def at_its_end(kind: str, folder: Path) -> bool:
 
 
 def outcome(folder: Path) -> dict[str, object]:
-    """What the trainings have left, by file: weights of agents, rows of evaluations and episodes, only names else."""
+    """What the trainings have left, by file: weights of agents, rows of evaluations and episodes, only names else.
+
+    A run that was killed before its settings were written never began; what is half-written there is nobody's.
+    """
     found: dict[str, object] = {}
     for path in sorted(folder.glob("logs/*/*/**/*")):
+        if path.name.endswith(".tmp") and not (path.parent / "args.yml").exists():
+            continue
         name = "/".join(part.rsplit("_", 1)[0] if part[-1].isdigit() else part for part in path.relative_to(folder).parts)
         if path.suffix == ".zip":
             found[name] = {key: each.tolist() for key, each in load_from_zip_file(path, device="cpu")[1]["policy"].items()}

@@ -95,8 +95,11 @@ def test_an_error_leaves_a_run_that_goes_on_to_the_same_agent_also_the_second_ti
     Trouble.what = fail
     with pytest.raises(RuntimeError):
         resume(str(broken), quiet)
-    (broken / ".resume.npz.1.tmp").write_bytes(b"half")
+    halves = [broken / ".resume.npz.1.tmp", broken / ENV / ".args.yml.1.tmp"]
+    for half in halves:
+        half.write_bytes(b"half")
     assert the_same(resume(str(broken), quiet).run, whole)
+    assert not any(half.exists() for half in halves)
 
 
 def test_the_seconds_of_the_episodes_go_on(broken):

@@ -1,1 +1,1 @@
-"""Settings for one vehicle in still air, from the geometric expert: agents that see 18 features and remember nothing."""
+"""Settings for one vehicle in still air, from the geometric expert: agents that see the 18 features alone."""
