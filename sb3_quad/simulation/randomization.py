@@ -133,8 +133,8 @@ class Gusts(Frozen):
     Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930); the update of D. T. Gillespie,
     "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E 54, 1996), but that what comes to a gust in a
     control step is no normal number, only as wide as one: their sums are normal, over a time constant of many steps. The first
-    gust of an episode is normal, too; deviation and time constant are exact. It is what MIL-F-8785C's Dryden model has along the
-    flight path, with the time constant L / V.
+    gust of an episode is normal, too; deviation and time constant are exact. It is what MIL-F-8785C's Dryden model has along
+    the flight path, with the time constant L / V.
     """
 
     std: NonNegativeRange = Field(description="standard deviation of each component, N or as unit says; sampled per episode")
