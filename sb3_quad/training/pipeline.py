@@ -187,9 +187,7 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         if stage.trim and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
-            raise ConfigError(
-                f"{where}: trim {stage.trim} is for agents that see the 18 features alone"
-            )
+            raise ConfigError(f"{where}: trim {stage.trim} is for agents that see the 18 features alone")
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
