@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from sb3_quad.controllers.pretrained import load_pretrained, pretrained
     from sb3_quad.experts.geometric import GeometricExpert
     from sb3_quad.experts.pid import PIDExpert
-    from sb3_quad.simulation.vehicle_distribution import sample_vehicles
+    from sb3_quad.simulation.sampled_vehicles import sample_vehicles
 
 __all__ = [
     "PPOBC",
@@ -45,7 +45,7 @@ _LAZY = {  # imported on first use, so that `import sb3_quad` and `--help` do no
     "env_kwargs": "sb3_quad.controllers.agent_settings",
     "load_pretrained": "sb3_quad.controllers.pretrained",
     "pretrained": "sb3_quad.controllers.pretrained",
-    "sample_vehicles": "sb3_quad.simulation.vehicle_distribution",
+    "sample_vehicles": "sb3_quad.simulation.sampled_vehicles",
 }
 
 register_environments()

@@ -14,13 +14,13 @@ from pydantic import Field, PositiveFloat, ValidationError, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.validate import Frozen, explain, validate
+from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.random import DESIGN, uniforms
 from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, PositiveRange, Range, between
 from sb3_quad.simulation.state import P, first_rows
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle
 
 DISTRIBUTIONS = YamlFolder("vehicle distribution", "sb3_quad.vehicles.distributions")
 _RANGES = ("mass", "thrust_to_weight", "torque_to_inertia", "motor_time_constant", "moment_thrust_ratio", "least_thrust")
@@ -128,36 +128,3 @@ def arm_length(column, vehicles):
         x, y = vehicles[P.pitch_arm_0 + rotor, column], vehicles[P.roll_arm_0 + rotor, column]
         longest = max(longest, math.sqrt(x * x + y * y))
     return longest
-
-
-def sample_vehicles(vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle = "itm") -> list[Vehicle]:
-    """n vehicles of a distribution, such as ``sample_vehicles("raptor", 1000)``.
-
-    :param vehicles: a name, a path, a :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution` or its fields.
-    :param seed: vehicle i is that of the first episode of row i in environments of this seed.
-    :param vehicle: the base vehicle, which says what the distribution does not.
-    :raises ConfigError: an unknown name or field, or a value that does not fit; or some of them could not fly.
-    """
-    from sb3_quad.simulation.batch import QuadcopterBatch  # not at the top: a batch takes distributions
-    from sb3_quad.simulation.settings import FlightSettings
-
-    base, distribution = load_vehicle(vehicle), validate(VehicleDistribution, vehicles, "vehicles")
-    batch = QuadcopterBatch(n, FlightSettings(vehicles=distribution, vehicle=base), seed)
-    batch.reset()
-    found = []
-    for number, column in enumerate(batch.vehicles.T):
-        hover, middle, half = column[P.hover_thrust], column[P.thrust_middle], column[P.thrust_half_range]
-        roll, pitch = column[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4)
-        changes = {
-            "name": f"sampled_{seed}_{number}",
-            "mass": column[P.mass],
-            "inertia": tuple(column[P.ixx : P.izz + 1]),
-            "rotor_positions": tuple(zip(-pitch, roll, strict=True)),
-            "moment_thrust_ratio": abs(column[P.yaw_arm_0]),
-            "thrust_coefficient": column[P.thrust_coefficient],
-            "motor_gain": column[P.motor_gain],
-            "thrust_limits": ((middle - half) / hover, (middle + half) / hover),
-            "collision_radius": column[P.collision_radius],
-        }
-        found.append(base.model_copy(update=changes))
-    return found
