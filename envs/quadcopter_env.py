@@ -128,7 +128,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `history` | `None` | ages of the frames that are seen, control steps, such as `(0, 1, 2, 4)`; `None`: the present one |
     | `position_integral` | `None` | fields of :class:`~sb3_quad.simulation.frames.PositionIntegral`, `{}` for its own |
     | `vehicles` | `None` | a distribution of vehicles, one for each episode, such as `{"distribution": "raptor"}` |
-    | `randomize` | `None` | fields of :class:`~sb3_quad.simulation.randomization.Randomization`: the world of each episode |
+    | `randomize` | `None` | fields of :class:`~sb3_quad.simulation.randomization.Randomization`: what differs by episode |
     | `render_mode` | `None` | `"human"` (a real-time window, one per process), `"rgb_array"` (pictures, without a display) |
     | `render_width`, `render_height` | 640, 480 | size of pictures and window, pixels |
 

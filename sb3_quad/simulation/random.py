@@ -22,7 +22,7 @@ from numba import float32, int32, uint32, uint64
 from sb3_quad.simulation.compiled import LANES, compiled
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DESIGN = range(6)  # purposes: the last word of the counter
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DISTRIBUTION = range(6)  # purposes: the last word of the counter
 ROUNDS = 10
 _MASK, _SHIFT = uint64(0xFFFFFFFF), uint64(32)
 _SQRT_HALF_BITS = 0x3F3504F3  # of sqrt(1/2)

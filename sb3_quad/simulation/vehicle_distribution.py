@@ -17,7 +17,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.random import DESIGN, uniforms
+from sb3_quad.simulation.random import DISTRIBUTION, uniforms
 from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, PositiveRange, Range, between
 from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
@@ -94,7 +94,7 @@ def sample_from_distribution(i, streams, table, vehicles):
     """
     if table[D.mass + 2] == FIXED:
         return
-    u = uniforms(streams, i, 4, DESIGN)
+    u = uniforms(streams, i, 4, DISTRIBUTION)
     mass, most = between(table, D.mass, u[0], 1.0), between(table, D.thrust_to_weight, u[1], 1.0)
     least = between(table, D.least_thrust, u[5], 0.0)
     x = table[D.size_deviation] * (math.sqrt(-2.0 * math.log(u[6])) * math.cos(2.0 * math.pi * u[7]) - 1.0)
