@@ -12,7 +12,7 @@ from sb3_quad.envs.rendering.camera import ChaseCamera
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene
 from sb3_quad.envs.rendering.window import disconnect, has_display, open_window, point_window, start_drawing
-from sb3_quad.simulation.physics import rotation_rows
+from sb3_quad.simulation.kernel import write_body
 from sb3_quad.simulation.state import FORCE_WORLD, POSITION, ROTOR_SPEEDS, TARGET, TORQUE_WORLD, P, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -90,10 +90,7 @@ class BulletBody:
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
         position, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
-        velocity, angular_velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
-        x, y, z, w = quaternion
-        body_rates = np.array(angular_velocity) @ np.array(rotation_rows(w, x, y, z))  # from the world's axes
-        state[: ROTOR_SPEEDS.start, 0] = (*position, w, x, y, z, *velocity, *body_rates)
+        write_body(state, position, quaternion, *p.getBaseVelocity(self.body, physicsClientId=self.client))
 
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""

@@ -1,5 +1,6 @@
 """``QuadcopterEnv``: one quadcopter on PyBullet as a Gymnasium environment."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -221,7 +222,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        if not np.isfinite(array).all():
+        if not math.isfinite(sum(array.tolist())):
             raise ValueError(f"action {array.tolist()}: every number must be finite")
         batch = self.batch
         self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0])
@@ -233,7 +234,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
     def _info(self) -> dict[str, Any]:
-        return {key: self.batch.outcome[field][0].item() for key, field in INFOS.items()}
+        ended = dict(zip(self.batch.outcome.dtype.names or (), self.batch.outcome[0].item(), strict=True))
+        return {key: ended[field] for key, field in INFOS.items()}
 
     def render(self) -> Image | None:
         """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""

@@ -93,7 +93,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         for row in self._ended:
             self._infos[row] = {}
         observations, rewards, dones = self.batch.step(self._actions)
-        rows = np.flatnonzero(dones)
+        rows = dones.nonzero()[0]
         self._ended = ended = rows.tolist()
         if ended:
             elapsed = round(time.time() - self._start, 6)

@@ -96,7 +96,6 @@ class YamlFolder:
         return parse_mapping_text(text, where), where
 
     def _files(self) -> dict[str, Any]:
-        """The files in the package, by name."""
         package = resources.files(self.package)
         folders = {folder: package.joinpath(folder).iterdir() for folder in ("", *self.folders)}
         paths = sorted(str(PurePosixPath(folder, file.name)) for folder, files in folders.items() for file in files)

@@ -123,7 +123,6 @@ def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | 
 
 
 def _label_and_spec(text: str) -> tuple[str, str]:
-    """The label and the name or path."""
     label, equals, spec = text.partition("=")
     if not equals or "/" in label or "\\" in label:  # an equals sign further on belongs to the path
         path = agent_path(text)

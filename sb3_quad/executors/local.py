@@ -32,7 +32,6 @@ class LocalExecutor:
         self._stopped = False
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        """See :meth:`~sb3_quad.executors.Executor.submit`."""
         return self._threads.submit(self._call, function, *arguments)
 
     def stop(self) -> None:

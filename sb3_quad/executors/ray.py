@@ -56,7 +56,6 @@ class RayExecutor:
         self.workers = max(1, int(total.get("CPU", 0) // num_cpus) if num_cpus else workers)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        """See :meth:`~sb3_quad.executors.Executor.submit`."""
         call = self._ray.remote(_call).options(name=getattr(function, "__name__", "call"), **self._needs)
         reference, future = call.remote(sys.argv, os.getcwd(), function, *arguments), Future[Any]()
         self._references.append(reference)

@@ -62,7 +62,6 @@ def plot_curves(
 
 
 def _losses(groups: Mapping[str, Sequence[Curve]]) -> list[str]:
-    """The names of all losses, in the order in which they come."""
     return [*dict.fromkeys(name for curves in groups.values() for curve in curves for name in curve.losses)]
 
 

@@ -96,15 +96,13 @@ class QuadcopterBatch:
         self.queue = np.zeros((max(longest, *(each.delay for each in vehicles)), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
-        # One column serves all rows until rows are set apart.
-        self.noise_level, self.additive_level = np.zeros(1), np.zeros(1)
-        self.mean = DEFAULT_MEAN[:, None].copy()
-        self.std = DEFAULT_STD[:, None].copy()
+        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[:, None]  # until rows are set apart
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
         self.physics_step, self.substeps = vehicles[0].physics_step, vehicles[0].substeps
         self.own_delays = self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any())
         self.own_arms = len(columns) > 1 or self.distribution is not None or self.randomize.sets_arms
+        self.constants = np.array([self.physics_step, self.substeps, self.own_delays, self.own_arms, autoreset], np.float64)
         self._bind()
         self.set_noise(settings.noise)
         self._set_scaling(settings)
@@ -150,20 +148,20 @@ class QuadcopterBatch:
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
             raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
-        out = np.empty((self.n, self.observation.size), np.float32), np.empty(self.n, np.float32), np.empty(self.n, np.bool_)
+        out = np.empty(self.last_observations.shape, np.float32), np.empty(self.n, np.float32), np.empty(self.n, np.bool_)
         if not self._step(mode, array, *out):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
             raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
         return out
 
     def _look(self, resetting: Any) -> Float32Array:
-        observations, dones = np.empty((self.n, self.observation.size), np.float32), np.zeros(self.n, np.bool_)
+        observations, dones = np.empty(self.last_observations.shape, np.float32), np.zeros(self.n, np.bool_)
         dones[resetting] = True
         self._step(LOOK, _NO_ACTIONS, observations, _NO_REWARDS, dones)
         return observations
 
     def _step(self, mode: int, *arrays: npt.NDArray[Any]) -> bool:
-        chunks = min(self.threads, self.n // CHUNK)
+        chunks = min(self.threads, self.n // (2 * CHUNK))
         return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
 
     def turn_rotors(self, actions: npt.NDArray[Any]) -> FloatArray:
@@ -175,7 +173,7 @@ class QuadcopterBatch:
         """
         wrenches = np.empty((self.substeps, 2, 3))
         a = self._arrays
-        rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, a.physics_step, a.own_delays)
+        rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, self.physics_step, self.own_delays)
         return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
@@ -276,11 +274,11 @@ class QuadcopterBatch:
         if self.mean.shape[1] < self.n:
             if rows is None and one_for_all:
                 return np.zeros(1, dtype=np.int64)
-            parts = ("mean", "std", "noise_level", "additive_level")
-            vars(self).update({name: np.repeat(getattr(self, name), self.n, axis=-1) for name in parts})
+            self.scaling = np.repeat(self.scaling, self.n, axis=1)
             self._bind()
         return self.rows(rows)
 
     def _bind(self) -> None:
-        """Note all arrays for the compiled step."""
+        self.mean, self.std = self.scaling[:OBSERVATION_SIZE], self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
+        self.noise_level, self.additive_level = self.scaling[-2:]
         self._arrays = BatchArrays(*(getattr(self, name) for name in BatchArrays._fields))

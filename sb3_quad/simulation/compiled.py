@@ -46,7 +46,6 @@ def _source_stamp() -> str:
 
 @functools.cache
 def _tell(line: str) -> None:
-    """Say a line on stderr, once."""
     sys.stderr.write(f"sb3_quad: {line}\n")
 
 

@@ -14,16 +14,15 @@ from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
 from sb3_quad.simulation.observation import NORMALS, OBSERVATION_SIZE, WORDS, observe
-from sb3_quad.simulation.physics import command_rotors, fly, moment, turn_rotors
+from sb3_quad.simulation.physics import command_rotors, fly, moment, rotation_rows, turn_rotors
 from sb3_quad.simulation.random import STEP
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.sampling import add_gusts, advance_gusts, count_episode, sample_episode, start_episode
 from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE, P, W, X
 from sb3_quad.simulation.tasks import SCORED, S, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish
-from sb3_quad.vehicles.vehicle import PARAMETER_NAMES
 
-CHUNK = 4 * LANES  # rows that a thread takes at once
+CHUNK = 2 * LANES  # rows that a thread takes at once
 LOOK, SCORE, FLY = range(3)
 """What :func:`step` does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a
 control step that another simulator has flown; it flies and scores one."""
@@ -62,7 +61,7 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "radius": ("f8", ()),  # of the collision sphere
     "arm": ("f8", (3, 4)),  # moment per thrust, by axis and rotor
     "delay": ("f8", ()),  # control steps
-    "vehicle": ("f8", len(PARAMETER_NAMES)),
+    "vehicle": ("f8", P.roll_arm_0),  # its parameters but for the arms, the last of them
     "scored": ("f8", len(SCORED)),  # max_distance and the costs of the row's task
     "reward": ("f8", ()),
     "distance": ("f8", ()),
@@ -102,10 +101,7 @@ class BatchArrays(NamedTuple):
     integral: FloatArray  # (0 or 3, n), of the position
     integral_numbers: FloatArray  # (4,), see PositionIntegral
     streams: Any  # uint32 (4, n), see random.py
-    mean: FloatArray  # (OBSERVATION_SIZE, 1 or n), μ of Eq. 3.16
-    std: FloatArray  # (OBSERVATION_SIZE, 1 or n), σ
-    noise_level: FloatArray  # (1 or n,), relative
-    additive_level: FloatArray  # (1 or n,), in σ
+    scaling: FloatArray  # (2 OBSERVATION_SIZE + 2, 1 or n), μ and σ of Eq. 3.16, levels of the relative and additive noise
     task_index: IntArray  # (n,), of the episodes under way
     task_parameters: FloatArray  # (tasks, columns), see TASK
     task_weights: FloatArray  # (tasks,), cumulative
@@ -114,20 +110,16 @@ class BatchArrays(NamedTuple):
     max_steps: IntArray  # (n,), of those that follow
     outcome: Any  # OUTCOME (n,)
     last_observations: Float32Array  # (n, size), of the episodes that outcome tells of
-    physics_step: float  # s
-    substeps: int  # physics steps in a control step
-    own_delays: bool  # whether delays differ by row
-    own_arms: bool  # whether rotor positions do
-    autoreset: bool  # whether a row that ends begins its next episode within the same step
+    constants: FloatArray  # (5,): physics step, s; physics steps in a control step; whether delays differ by row; whether
+    # rotor positions do; whether a row that ends begins its next episode within the same step
 
 
 @compiled
 def step(
     control, leads, mode, actions, observations, rewards, dones,
     state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers, gust,
-    frames, ages, integral, integral_numbers, streams, mean, std, noise_level, additive_level,
-    task_index, task_parameters, task_weights, returns, limits, max_steps, outcome, last_observations,
-    physics_step, substeps, own_delays, own_arms, autoreset,
+    frames, ages, integral, integral_numbers, streams, scaling,
+    task_index, task_parameters, task_weights, returns, limits, max_steps, outcome, last_observations, constants,
 ):  # fmt: skip
     """A control step of all rows, of which this thread takes as many as others leave it; see :func:`.threads.share_out`.
 
@@ -138,7 +130,8 @@ def step(
         written; the others are :class:`BatchArrays`.
     :return: False if an action is not finite, and then nothing has happened.
     """
-    n = state.shape[1]
+    n, physics_step, substeps = state.shape[1], constants[0], np.int64(constants[1])
+    own_delays, own_arms, autoreset = constants[2] > 0.0, constants[3] > 0.0, constants[4] > 0.0
     chunks = (n + CHUNK - 1) // CHUNK
     if leads:
         if mode != LOOK and not _finite(actions):
@@ -163,8 +156,8 @@ def step(
             # What is the same for all rows is in the block already unless it is fresh.
             for lane in range(LANES):
                 b.row[lane] = first + min(lane, count - 1)
-            if fresh or mean.shape[1] > 1:
-                _load_scaling(b, mean, std, noise_level, additive_level)
+            if fresh or scaling.shape[1] > 1:
+                _load_scaling(b, scaling)
             if fresh or vehicles.shape[1] > 1:
                 _load_vehicles(b, vehicles, first, count, physics_step, fresh or own_arms)
             if fresh or task_weights.shape[0] > 1:
@@ -238,8 +231,8 @@ def step(
             start_episode(i, state, queue, streams, task_index, vehicles, task_parameters, task_weights)
             if frames.shape[1] > 0:
                 clear_frames(i, frames, integral)
-        if fresh or mean.shape[1] > 1:
-            _load_scaling(b, mean, std, noise_level, additive_level)
+        if fresh or scaling.shape[1] > 1:
+            _load_scaling(b, scaling)
         fresh = False
         if b.row[count - 1] - b.row[0] == count - 1:  # side by side, since rows ascend
             _load_rows(state, b.row[0], count, b.state)
@@ -288,6 +281,17 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, gust, physics_s
 
 
 @compiled
+def write_body(state, position, quaternion, velocity, rates):
+    """Write another simulator's pose, quaternion (x, y, z, w), and world-frame velocities into column 0 of ``state``."""
+    x, y, z, w = quaternion
+    r, state[X.quaternion, 0] = rotation_rows(w, x, y, z), w
+    for axis in range(3):
+        state[X.position + axis, 0], state[X.velocity + axis, 0] = position[axis], velocity[axis]
+        state[X.quaternion + 1 + axis, 0] = quaternion[axis]
+        state[X.body_rates + axis, 0] = r[0][axis] * rates[0] + r[1][axis] * rates[1] + r[2][axis] * rates[2]
+
+
+@compiled
 def _new_block():
     """Room for a block, (1,), which begins with a cache line: vectors that straddle two take a third longer."""
     room = np.empty(_SIZE + 64, np.uint8)
@@ -299,7 +303,7 @@ def _new_block():
 def _finite(actions):
     # By their bits: code compiled with fastmath may take it that no NaN exists.
     wrong = 0
-    for bits in actions.view(np.int32).flat:
+    for bits in actions.view(np.int32).reshape(-1):
         wrong += (bits & 0x7F800000) == 0x7F800000
     return wrong == 0
 
@@ -336,22 +340,27 @@ def _load_rows(source, first, count, target):
 @compiled
 def _load_vehicles(b, vehicles, first, count, dt, arms):
     """What the control step needs of the vehicles of a block, with the divisions done; without ``arms`` those stay."""
-    _load_rows(vehicles, first, count, b.vehicle)
-    v = b.vehicle
+    if vehicles.shape[1] > 1 and count == LANES:
+        _divide(b, vehicles, first, dt)
+    else:
+        _load_rows(vehicles, first, count, b.vehicle)
+        _divide(b, b.vehicle, 0, dt)
+    if arms:
+        _load_rows(vehicles[P.roll_arm_0 :], first, count, b.arm.reshape(12, LANES))
+
+
+@compiled
+def _divide(b, v, first, dt):
     for lane in range(LANES):
-        ixx, iyy, izz, lift = v[P.ixx, lane], v[P.iyy, lane], v[P.izz, lane], v[P.thrust_coefficient, lane]
-        b.motor[lane], b.push[lane] = v[P.motor_gain, lane] * dt, dt / v[P.mass, lane]
-        b.fall[lane], b.lift[lane] = v[P.gravity, lane] * dt, lift
+        i = first + lane
+        ixx, iyy, izz, lift = v[P.ixx, i], v[P.iyy, i], v[P.izz, i], v[P.thrust_coefficient, i]
+        b.motor[lane], b.push[lane] = v[P.motor_gain, i] * dt, dt / v[P.mass, i]
+        b.fall[lane], b.lift[lane] = v[P.gravity, i] * dt, lift
         b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
         b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
-        b.thrust_middle[lane] = v[P.thrust_middle, lane] / lift
-        b.thrust_half_range[lane] = v[P.thrust_half_range, lane] / lift
-        b.radius[lane], b.delay[lane] = v[P.collision_radius, lane], v[P.delay, lane]
-    if arms:
-        for axis in range(3):
-            for rotor in range(4):
-                for lane in range(LANES):
-                    b.arm[axis, rotor, lane] = v[P.roll_arm_0 + 4 * axis + rotor, lane]
+        b.thrust_middle[lane] = v[P.thrust_middle, i] / lift
+        b.thrust_half_range[lane] = v[P.thrust_half_range, i] / lift
+        b.radius[lane], b.delay[lane] = v[P.collision_radius, i], v[P.delay, i]
 
 
 @compiled
@@ -396,11 +405,11 @@ def _load_scored(b, index, parameters):
 
 
 @compiled
-def _load_scaling(b, mean, std, relative, additive):
+def _load_scaling(b, scaling):
     """μ, 1/σ and the noise levels of a block, in float32."""
     for lane in range(LANES):
-        i = 0 if mean.shape[1] == 1 else b.row[lane]
-        b.noise_level[lane], b.additive[lane] = relative[i], additive[i]
+        i = 0 if scaling.shape[1] == 1 else b.row[lane]
+        b.noise_level[lane], b.additive[lane] = scaling[2 * OBSERVATION_SIZE, i], scaling[2 * OBSERVATION_SIZE + 1, i]
         for k in range(OBSERVATION_SIZE):
-            b.mean[k, lane] = mean[k, i]
-            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(std[k, i])
+            b.mean[k, lane] = scaling[k, i]
+            b.inverse_std[k, lane] = np.float32(1.0) / np.float32(scaling[OBSERVATION_SIZE + k, i])

@@ -56,8 +56,9 @@ def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> An
         ``control[DONE]``. It is one call, since an interrupt, which Python sees to between two calls, must leave nothing half
         done.
     """
-    pool = _pool
-    control = np.zeros(CONTROL, dtype=np.int64)
+    pool, control = _pool, np.zeros(CONTROL, np.int64)
+    if helpers < 1:
+        return function(control, True, *arguments)
     if pool.resting > 0:
         pool.resting -= 1
         helpers = 0

@@ -158,5 +158,4 @@ def _name(varied: Mapping[str, Any]) -> str:
 
 
 def _file_name(text: str) -> str:
-    """A name as a folder's."""
     return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", text).strip("-.,")[:LONGEST] or "run"

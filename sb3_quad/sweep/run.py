@@ -136,7 +136,6 @@ def pipeline_folder(place: Path) -> Path | None:
 
 
 def _train(run: Run, place: Path) -> PipelineResult:
-    """Train a run, or what is left of it."""
 
     def report(line: str) -> None:
         with (place / LOG).open("a", encoding="utf-8") as file:

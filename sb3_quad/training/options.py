@@ -31,9 +31,7 @@ class SettingsOptions(Frozen):
 
     n_timesteps: int | None = option(None, "timesteps, in whole rollouts; fewer than one shorten it", "-n")
     n_envs: int | None = option(None, "environments side by side")
-    vec_env: str | None = option(
-        None, "batch (compiled), dummy (PyBullet, one process) or subproc (one process each)", metavar="KIND"
-    )
+    vec_env: str | None = option(None, "batch (compiled), dummy (PyBullet) or subproc (one process each)", metavar="KIND")
     expert: str | None = option(None, "pid, geometric, path/to/model.zip or package.module:factory", metavar="SPEC")
     env_kwargs: dict[str, Any] | None = option(None, "environment keywords, such as noise:0", metavar="K:V")
 
@@ -42,12 +40,7 @@ class RunOptions(Frozen):
     """What a training is told beyond its settings, which the configurations of a sweep may differ in."""
 
     eval_env_kwargs: dict[str, Any] | None = option(None, "environment keywords for evaluations only", metavar="K:V")
-    trained_agent: str | None = option(
-        None,
-        "agent to start from (policy and critic): an SB3 on-policy zip, a run folder, or a name such as itm-recovery",
-        "-i",
-        metavar="ZIP",
-    )
+    trained_agent: str | None = option(None, "agent to start from: an SB3 zip, a run folder or a name", "-i", metavar="ZIP")
     n_eval_envs: PositiveInt | None = option(None, "environments of an evaluation (batch: one per episode; else 1)")
     device: Annotated[str, AfterValidator(_check_device)] = option("cpu", "cpu, cuda or auto", metavar=None)
     eval_freq: int = option(250_000, "timesteps between evaluations; below 1: one at the end")

@@ -142,7 +142,6 @@ def _expert(config: TrainingConfig) -> dict[str, Any]:
 
 
 def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
-    """Those that the settings name."""
     return [instance(path, "callback", **kwargs) for path, kwargs in config.callback]
 
 

@@ -166,7 +166,6 @@ def _dimension(algo: str, settings: Mapping[str, Any], name: str, given: Any, wh
 
 
 def _rollout(algo: str, settings: Mapping[str, Any]) -> float:
-    """Timesteps of a rollout."""
     return math.prod(_number_of(current(algo, settings, key)) or 1 for key in ("n_steps", "n_envs"))
 
 

@@ -22,8 +22,8 @@ PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
 PARAMETER_NAMES = (
     *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain", "gravity"),
-    *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
+    *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
 )
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 LAYOUT_ANGLE = math.radians(20.0)  # by which rotors in the same place may differ, seen from the centre of mass
@@ -244,7 +244,7 @@ class Vehicle(Frozen):
         low, high = self.thrust_range
         head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
         tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius, self.delay)
-        return np.array([*head, *self.mixer[1:].ravel(), *tail], dtype=np.float64)
+        return np.array([*head, *tail, *self.mixer[1:].ravel()], dtype=np.float64)
 
 
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
