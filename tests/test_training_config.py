@@ -180,7 +180,7 @@ def test_the_types_are_resolved_whichever_algorithm_is_asked_first():
     """A name that SB3 leaves as a string is resolved once for the process; here nobody has done so yet."""
 
     class Own(PPO):
-        def __init__(self, policy: str, env: Optional["VecEnv"], learning_rate: float = 0.1) -> None:  # noqa: F821, UP045
+        def __init__(self, policy: str, env: Optional["VecEnv"], learning_rate: float = 0.1) -> None:  # noqa: F821
             raise NotImplementedError
 
     assert constructor_parameters(Own)["learning_rate"].annotation is float
