@@ -16,7 +16,7 @@ EXPERTS = {
     "told_geometric": "sb3_quad.experts.geometric:told_geometric",
     "told_cautious": "sb3_quad.experts.geometric:told_cautious",
 }
-DEFAULT_EXPERT = "geometric"
+DEFAULT_EXPERT = "pid"
 """Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
 
 
