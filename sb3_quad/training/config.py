@@ -27,7 +27,7 @@ SETTINGS = YamlFolder(
     "settings file",
     "sb3_quad.zoo_configs",
     ".yml",
-    folders=("any_quadcopter", "nominal", "pid", "robust", "thesis", "value_based"),
+    folders=("any_quadcopter", "nominal", "robust", "thesis", "value_based"),
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
