@@ -9,6 +9,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+import sb3_quad.training.trim
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 
@@ -60,6 +61,7 @@ def shorten_trainings(monkeypatch):
         return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args, **{**kwargs, "progress_bar": False})
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
+    monkeypatch.setattr(sb3_quad.training.trim, "trim", lambda model: None)  # which needs an agent that flies
 
 
 def check_output(page, output):
@@ -68,7 +70,7 @@ def check_output(page, output):
     number = re.compile(r"\d+\.\d+")
     assert number.sub("#", shown) in number.sub("#", output)
     ours, theirs = ([[float(each) for each in number.findall(line)] for line in text.splitlines()] for text in (output, shown))
-    for (survival, error), (shown_survival, shown_error) in zip([line for line in ours if line], theirs, strict=True):
+    for (survival, error), (shown_survival, shown_error) in zip([line for line in ours if len(line) == 2], theirs, strict=True):
         assert survival == pytest.approx(shown_survival, abs=5.0) and error == pytest.approx(shown_error, abs=0.02)
     assert theirs[-2][0] + 20 < theirs[-1][0]
 
