@@ -1,6 +1,5 @@
 """Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files that hold them."""
 
-import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -134,8 +133,7 @@ class Vehicle(Frozen):
 
         :raises ConfigError: there is none.
         """
-        rotors = ((each.rotor_positions, each.rotor_directions) for each in (self, other))
-        turn = find_turn(*itertools.chain.from_iterable(rotors))
+        turn = find_turn(self.rotor_positions, self.rotor_directions, other.rotor_positions, other.rotor_directions)
         if turn is None:
             raise ConfigError(
                 f"rotor_layout: no turn brings the rotors of {self.name} to where those of {other.name} are, directions "
