@@ -60,14 +60,12 @@ def did_you_mean(name: object, valid: Iterable[str]) -> str:
     "did you mean 'far_tracking' or 'target_tracking'? "
     """
     text, names = str(name).lower(), sorted(valid)
-    distances = {option: _edit_distance(text, option.lower()) for option in names}
-    nearest = min(names, key=distances.__getitem__, default="")
     letters = sum(map(str.isalnum, text))
-    if nearest and distances[nearest] <= max(1, letters // 4) and distances[nearest] < letters:
-        found = [nearest]
-    else:
-        parts = _parts(text)
-        found = [option for option in names if parts and parts <= _parts(option.lower())]
+    most = min(max(1, letters // 4), letters - 1)  # slips
+    near = {each: _edit_distance(text, each.lower()) for each in names if abs(len(each) - len(text)) <= most}
+    found = [each for each in sorted(near, key=near.__getitem__)[:1] if near[each] <= most]
+    if not found and (parts := _parts(text)):
+        found = [each for each in names if parts <= _parts(each.lower())]
     return f"did you mean {' or '.join(map(repr, found))}? " if 0 < len(found) <= 3 else ""
 
 
@@ -77,11 +75,12 @@ def _parts(text: str) -> set[str]:
 
 def _edit_distance(given: str, meant: str) -> int:
     """How many letters left out, added, replaced, or swapped with the next make one text the other."""
-    before, row = [0], [*range(len(meant) + 1)]
+    rows: list[list[int]] = [[*range(len(meant) + 1)]]
     for i, letter in enumerate(given):
-        older, before, row = before, row, [i + 1]
+        rows.append([i + 1])
         for j, other in enumerate(meant):
-            row.append(min(before[j + 1] + 1, row[j] + 1, before[j] + (letter != other)))
+            least = min(rows[i][j + 1] + 1, rows[i + 1][j] + 1, rows[i][j] + (letter != other))
             if i > 0 and j > 0 and letter == meant[j - 1] and other == given[i - 1]:
-                row[-1] = min(row[-1], older[j - 1] + 1)
-    return row[-1]
+                least = min(least, rows[i - 1][j - 1] + 1)
+            rows[i + 1].append(least)
+    return rows[-1][-1]
