@@ -1,11 +1,11 @@
 """Experts by name, as YAML and the command line give them."""
 
-import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
+from sb3_quad.base.imports import import_name
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
@@ -62,7 +62,7 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         valid = [*EXPERTS, *pretrained_names()]
         raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
     try:
-        return pkgutil.resolve_name(location)
+        return import_name(location)
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported
