@@ -62,7 +62,10 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     settings = job.flight_settings
-    controllers = {"agent": model, "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle)}
+    controllers = {
+        "agent": model,
+        "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle, layout=settings.rotor_layout),
+    }
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))
 
@@ -87,7 +90,9 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     if result.exit_code != 0:
         return result.exit_code
     flown = result.job.flight_settings
-    controllers = {"expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle)}
+    controllers = {
+        "expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout)
+    }
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
     beside = ("expert", "IL-agent", "RL-agent")
     print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)

@@ -91,9 +91,10 @@ def evaluate(
     for spec in controllers:
         try:
             vehicles = [_vehicle(spec, each) for each in suite.scenarios]
-            records[spec] = describe(spec, vehicles[0])
-            for line in dict.fromkeys(filter(None, map(spec.notice, vehicles))):
+            record, notices = describe(spec, vehicles[0]), dict.fromkeys(map(spec.notice, vehicles))
+            for line in filter(None, notices):
                 report(line)
+            records[spec] = record
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
     _report_vehicles(suite, list(records), report)

@@ -81,6 +81,11 @@ class FlightSettings(ObservationSettings):
         scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
         return {**scaling, **self.model_dump(mode="json", include={*ObservationSettings.model_fields, "rotor_layout"})}
 
+    @property
+    def layout(self) -> Vehicle:
+        """The vehicle whose axes and order of the rotors an agent with these settings knows."""
+        return first_vehicle(self.vehicle if self.rotor_layout is None else self.rotor_layout)
+
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
 
@@ -100,6 +105,17 @@ class FlightSettings(ObservationSettings):
         layout = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
         changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles, "rotor_layout": layout}
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
+
+
+def known_layout(model: Any) -> Vehicle | None:
+    """The layout that a model knows, by what :meth:`FlightSettings.write_into` wrote; None: it holds nothing of that kind.
+
+    :raises ConfigError: what it holds does not fit.
+    """
+    own = getattr(model, KEY, None)
+    if not isinstance(own, dict):
+        return None
+    return validate(Vehicle, own.get("rotor_layout") or own.get("vehicle"), f"{type(model).__name__}.{KEY}: vehicle")
 
 
 def levels(noise: Any) -> tuple[FloatArray, FloatArray]:

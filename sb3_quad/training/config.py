@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args
 import gymnasium
 from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, ValidationInfo, field_validator, model_validator
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
@@ -252,5 +252,7 @@ def check_environment(env_id: str) -> None:
     """:raises ConfigError: an environment that Gymnasium does not know; the message names the nearest."""
     if env_id in gymnasium.registry:
         return
-    nearest, _, _ = unknown("environment", env_id, gymnasium.registry).partition(" (valid:")
-    raise ConfigError(f"{nearest} (of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)")
+    hint = did_you_mean(env_id, gymnasium.registry)
+    raise ConfigError(
+        f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
+    )

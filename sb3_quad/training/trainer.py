@@ -138,7 +138,8 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
 def _expert(config: TrainingConfig) -> dict[str, Any]:
     if not takes_expert(get_algorithm(config.algo)):
         return {}
-    return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
+    vehicle, layout = config.env_kwargs.get("vehicle", "itm"), config.env_kwargs.get("rotor_layout")
+    return {"expert": resolve_expert(config.expert, vehicle, layout=layout)}
 
 
 def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
