@@ -54,6 +54,8 @@ class VehicleDistribution(Frozen):
         """``distribution``: a name, or the path of a YAML file, whose ranges the others replace; or that alone."""
         data = {"distribution": data} if isinstance(data, (str, Path)) else data
         if isinstance(data, Mapping) and "distribution" in data:
+            if not isinstance(data["distribution"], (str, Path)):
+                raise ValueError("distribution: must be a name, or the path of a YAML file")
             own = {key: value for key, value in data.items() if key != "distribution"}
             return {**DISTRIBUTIONS.read(data["distribution"])[0], **own}
         return data
