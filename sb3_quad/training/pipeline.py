@@ -247,7 +247,7 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        scores = list(zip(curve.success.tolist(), curve.reward.tolist(), strict=True))
+        scores = list(zip(np.nan_to_num(curve.values("success")), curve.reward, strict=True))
         success, reward = max(scores) if stage.pass_on == "best" else scores[-1]
         wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
         if success < stage.require.success_rate or reward < wanted:

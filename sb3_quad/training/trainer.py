@@ -226,8 +226,8 @@ def _learn(
                 tb_log_name=f"{config.algo}_{run.path.name}",
                 reset_num_timesteps=model.num_timesteps == 0,
             )
-            if best is not None and signals.received is None and not best.stopped:
-                best.evaluate()
+            if best is not None and signals.received is None and not best.stopped and best.latest < model.num_timesteps:
+                best.evaluate()  # a callback has ended the training before its time
         finally:
             signals.hold()
     except (Exception, KeyboardInterrupt) as error:

@@ -142,7 +142,7 @@ class Search:
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
         rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
-        every = total // count + 1 if count > 1 else -1  # never due with the last timestep: that one follows the last update
+        every = math.ceil(total / count)
         evaluations: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
