@@ -108,7 +108,7 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
     with StopSignals() as signals, locked(run.path, "run folder"), _environments(job) as (env, eval_envs):
         if run.timesteps >= config.n_timesteps:
-            report(f"complete: {run.timesteps:,} timesteps")
+            report(f"complete, {run.timesteps:,} timesteps; to train its agent further: -i {run.path}")
             return TrainingResult(job, run, load_model(run.model, job.device), trained_seconds(run))
         if run.not_begun:
             model = build_model(job, env)

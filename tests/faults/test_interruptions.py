@@ -176,7 +176,10 @@ def test_a_complete_run_says_so_and_shows_its_table(whole, capsys):
     before = {path: path.stat().st_mtime_ns for path in whole.path.rglob("*")}
     assert main(["train", "--resume", str(whole.path)]) == 0
     shown = capsys.readouterr().out
-    assert "complete: 1,600 timesteps" in shown and "target_tracking: 4 fresh episodes" in shown
+    assert (
+        f"complete, 1,600 timesteps; to train its agent further: -i {whole.path}" in shown
+        and "target_tracking: 4 fresh episodes" in shown
+    )
     assert {path: path.stat().st_mtime_ns for path in whole.path.rglob("*")} == before
 
 
