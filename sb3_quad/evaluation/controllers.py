@@ -83,6 +83,8 @@ def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[Contr
     found = plain + [ControllerSpec(*each, "adaptive") for each in adapted]
     files = [file_name(entry.label) for entry in found]
     for file, entry in zip(files, found, strict=True):
+        if not entry.label.isprintable():
+            raise ConfigError(f"controller {entry.label!r}: holds control characters; label it: name={entry.spec}")
         if files.count(file) > 1:
             raise ConfigError(f"controller {entry.label!r}: two are called so; label them: name={entry.spec}")
     return found

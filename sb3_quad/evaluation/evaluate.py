@@ -118,8 +118,8 @@ def evaluate(
         return results(None)
     try:
         place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    except (OSError, ValueError) as error:  # ValueError: no path
+        raise ConfigError(f"{folder}: cannot be written ({getattr(error, 'strerror', None) or error})") from None
     with locked(place, "folder"):
         done |= _begin(place, digest, jobs, overwrite)
         missing = [job for job in jobs if job.name not in done]

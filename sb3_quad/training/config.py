@@ -137,9 +137,12 @@ class TrainingConfig(Frozen):
     @field_validator("env_kwargs", "eval_env_kwargs")
     @classmethod
     def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-        for key in value:
-            if info.data["env_id"] in ENVIRONMENTS and key not in FlightSettings.model_fields:
-                raise ConfigError(unknown(f"keyword of {info.data['env_id']}", key, FlightSettings.model_fields))
+        env_id = info.data["env_id"]
+        if env_id in ENVIRONMENTS:
+            for key in value:
+                if key not in FlightSettings.model_fields:
+                    raise ConfigError(unknown(f"keyword of {env_id}", key, FlightSettings.model_fields))
+            FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **info.data.get("env_kwargs", {}), **value})
         return value
 
     @field_validator(*BASES)

@@ -36,7 +36,7 @@ from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import resume, train
+from sb3_quad.training.trainer import resume, train, trained_seconds
 from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
@@ -215,7 +215,7 @@ def _train_stages(
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
                 run = open_run(runs[number]) if number < len(runs) else None
                 if run is not None and run.timesteps >= job.config.n_timesteps:
-                    timesteps, seconds = run.timesteps, read_curve(run.path).seconds[-1] if run.evaluations.is_file() else 0.0
+                    timesteps, seconds = run.timesteps, trained_seconds(run)
                 else:
                     start = job.model_copy(update={"trained_agent": agent}) if agent else job
                     report(f"{stage.name}: {describe(start)}")
@@ -231,7 +231,7 @@ def _train_stages(
                 if signals.received is not None:
                     break
                 agent = str(_trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, run))
-                results[stage.name] = StageResult(str(run.path), agent, timesteps, float(seconds))
+                results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
         except KeyboardInterrupt:
             if signals.received is None:
                 raise
@@ -247,7 +247,7 @@ def _passed_on(stage: Stage, run: RunFolder) -> Path:
     """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        scores = list(zip(curve.success.tolist(), curve.reward.tolist(), strict=True))
+        scores = list(zip(np.nan_to_num(curve.values("success")), curve.reward, strict=True))
         success, reward = max(scores) if stage.pass_on == "best" else scores[-1]
         wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
         if success < stage.require.success_rate or reward < wanted:

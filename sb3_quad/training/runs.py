@@ -142,8 +142,9 @@ def make_folder(path: str | Path, what: str, flag: str) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=path).close()
-    except OSError as error:
-        raise ConfigError(f"{what} {path}: cannot be written ({error.strerror}); give another with {flag}") from None
+    except (OSError, ValueError) as error:  # ValueError: no path
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
 
 
 def _runs(parent: Path, name: str) -> dict[int, Path]:

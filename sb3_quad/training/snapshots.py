@@ -6,24 +6,28 @@ import os
 import random
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch as th
+from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, write_arrays, write_bytes
+from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.callbacks.interruption import LastGoodModel
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 ENVIRONMENT, DATASET = "environment.", "dataset."  # before the names of their arrays
+LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])  # by name: value, how many it is the mean of, not shown by
 SHARE = 0.03  # of the run's time that snapshots may take
 
 
@@ -48,6 +52,10 @@ class SnapshotFile(LastGoodModel):
         """Whether the rollout under way is in its first step after the snapshot, so that no buffer holds more than it."""
         after = self.num_timesteps - self.training_env.num_envs
         return not isinstance(self.model, OffPolicyAlgorithm) or self.snapshot is None or self.snapshot.timesteps == after
+
+    def _on_training_start(self) -> None:
+        if self._run.resume_state.is_file():  # the log of a resumed run says what it would have said
+            set_log(self.logger, read_arrays(self._run.resume_state, "log").get("log"), self._run.resume_state)
 
     def _is_due(self) -> bool:
         return super()._is_due() or self._hurry()
@@ -74,7 +82,7 @@ class SnapshotFile(LastGoodModel):
         """
         model: Any = self.model
         batch: Any = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
-        state = random_state()
+        state = random_state() | {"log": log_state(self.logger)}
         state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
         if self._run.episodes.is_file():
             state["episodes"] = np.array(self._run.episodes.stat().st_size)
@@ -179,6 +187,27 @@ def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:
         run.best_model.unlink(missing_ok=True)
     if run.episodes.is_file():
         os.truncate(run.episodes, min(run.episodes.stat().st_size, int(state.get("episodes", 0))))
+
+
+def log_state(logger: Logger) -> Any:
+    """What was recorded since the logger's last dump, such as the losses of the latest update, as JSON."""
+    numbers = {name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))}
+    kept = {name: (float(each), logger.name_to_count[name], logger.name_to_excluded[name]) for name, each in numbers.items()}
+    return np.array(json.dumps(kept))
+
+
+def set_log(logger: Logger, state: Any, path: Path) -> None:
+    """Record what :func:`log_state` gave.
+
+    :raises ConfigError: something else, which the file at ``path`` holds.
+    """
+    try:
+        kept = LOG.validate_python(json.loads(str(state)))
+    except ValueError as error:
+        raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
+    for name, (value, count, excluded) in kept.items():
+        logger.name_to_value[name], logger.name_to_excluded[name] = value, excluded
+        logger.name_to_count[name] = count
 
 
 def random_state() -> Arrays:

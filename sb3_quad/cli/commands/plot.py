@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     if options.thesis:  # its success is our survival
         for name, reference in load_suite("thesis").scenario(THESIS[options.thesis]).reference.items():
             lines[f"thesis: {name}"] = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
-    show = options.show or (["survival" if options.thesis else "success", "reward"])
+    show = options.show or (["survival", "reward"] if options.thesis else [])
     curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     write_bytes(options.output, picture(curves, kind, dpi=130))
     print(f"saved {options.output}")
