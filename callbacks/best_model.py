@@ -1,4 +1,4 @@
-"""Evaluation along the way, and the best model kept: by success first, then by mean reward."""
+"""Evaluation along the way, and the best model kept: by success or survival first, then by mean reward."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -13,12 +13,12 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 from stable_baselines3.common.type_aliases import TrainFrequencyUnit
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import read_arrays, save_model, write_arrays
 from sb3_quad.callbacks.every import EveryTimesteps
 
 LIVES = 20  # ends that SB3's Monitor does not count, as Atari's wrappers report, in one episode at most
-Score = tuple[float, float]  # success rate, mean reward
+Score = tuple[float, float]  # share of successes or survivals, mean reward
 LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
     "success_rate": ("successes", np.mean),
     "survival_rate": ("survivals", np.mean),
@@ -28,6 +28,7 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 """By the name in the log: an array of an evaluation, and its statistic."""
 RATES = {"success": "success_rate", "survival": "survival_rate"}
+SHARES = {"success": "successes", "survival": "survivals"}  # their arrays
 
 
 class BestModel(EveryTimesteps):
@@ -64,7 +65,8 @@ class BestModel(EveryTimesteps):
     :param report: called with one line for each evaluation.
     :param others: further environments by name, such as those of another task, which are evaluated at the same times. They do
         not decide which model is best; their results go to ``evaluations_<name>.npz`` beside ``evaluations``.
-    :param should_continue: called after each evaluation with its success rate and mean reward; False ends the training.
+    :param should_continue: called after each evaluation with that share and mean reward; False ends the training.
+    :param by: ``success`` or ``survival``: the share of episodes that makes a model the best; reward decides between equals.
     :raises ConfigError: ``every`` or ``n_episodes`` below 1; when training begins, ``evaluations`` that cannot be read or
         flew another number of episodes.
     :raises TrainingError: at an evaluation, a wrapper that drops ``info["episode"]`` of SB3's Monitor.
@@ -81,9 +83,12 @@ class BestModel(EveryTimesteps):
         report: Callable[[str], None] = lambda line: None,
         others: Mapping[str, VecEnv] | None = None,
         should_continue: Callable[[float, float], bool] = lambda success, reward: True,
+        by: str = "success",
         verbose: int = 0,
     ) -> None:
         super().__init__(every, verbose)
+        if by not in SHARES:
+            raise ConfigError(unknown("share", by, SHARES))
         if n_episodes < 1:
             raise ConfigError(f"BestModel: n_episodes is {n_episodes}, must be at least 1")
         self._n_episodes, self._seed = n_episodes, seed
@@ -92,6 +97,7 @@ class BestModel(EveryTimesteps):
         # By the group of the log: the environments, the file, and its rows; the first group decides.
         self._envs = {"eval": env} | {f"eval_{name}": other for name, other in others.items()}
         self._paths = {"eval": path} | {f"eval_{name}": path.with_name(f"{path.stem}_{name}.npz") for name in others}
+        self._by = SHARES[by]
         self._rows: dict[str, dict[str, Any]] = {group: {} for group in self._envs}
         self._start, self._last = 0.0, 0
         self.stopped = False  # by ``should_continue``
@@ -108,7 +114,7 @@ class BestModel(EveryTimesteps):
         rows = self._rows["eval"]
         self._start = time.perf_counter() - rows.get("seconds", [0.0])[-1]
         none = [[]] * len(rows.get("results", []))
-        self.best = max(map(_score, rows.get("successes", none), rows.get("results", [])), default=self.best)
+        self.best = max(map(_score, rows.get(self._by, none), rows.get("results", [])), default=self.best)
         self._last = last_timestep(self.model)
 
     def _on_event(self) -> bool:
@@ -176,7 +182,7 @@ class BestModel(EveryTimesteps):
         write_arrays(self._paths[group], **self._rows[group])
         for name, value in self._latest(group).items():
             self.logger.record(f"{group}/{name}", value)
-        return _score(values.get("successes", []), rewards)
+        return _score(values.get(self._by, []), rewards)
 
     def _latest(self, group: str) -> dict[str, float]:
         """What the latest evaluation says, by its names in the log."""

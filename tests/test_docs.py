@@ -70,7 +70,9 @@ def check_output(page, output):
     number = re.compile(r"\d+\.\d+")
     assert number.sub("#", shown) in number.sub("#", output)
     ours, theirs = ([[float(each) for each in number.findall(line)] for line in text.splitlines()] for text in (output, shown))
-    for (survival, error), (shown_survival, shown_error) in zip([line for line in ours if len(line) == 2], theirs, strict=True):
+    for (survival, error), (shown_survival, shown_error) in zip(
+        [line for line in ours if len(line) == 2], theirs, strict=True
+    ):
         assert survival == pytest.approx(shown_survival, abs=5.0) and error == pytest.approx(shown_error, abs=0.02)
     assert theirs[-2][0] + 20 < theirs[-1][0]
 

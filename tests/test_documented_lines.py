@@ -17,12 +17,17 @@ from sb3_quad.training import pipeline
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 PENDULUM = "Pendulum-v1: {policy: MlpPolicy, n_timesteps: 100, n_steps: 100, batch_size: 50, gradient_steps: 2}"
-ELSEWHERE = {"--executor ray": "tests/test_ray.py", "my_package.control:make": "a module of the user's", "--resume": "test_runs.py"}
+ELSEWHERE = {
+    "--executor ray": "tests/test_ray.py",
+    "my_package.control:make": "a module of the user's",
+    "--resume": "tests/test_runs.py",
+    "my_experts:lqr": "tests/test_docs.py",
+    "…": "in short",
+}
 SHORTER = {  # flags that a command is given beside those that stand there
     "evaluate": ["--episodes", "2", "--overwrite"],
     "enjoy": ["-n", "20", "--overwrite"],
     "export": ["--overwrite"],
-    "plot": ["--overwrite"],
     "sweep": ["--dry-run"],
     "train": ["--eval-episodes", "2", "--no-progress"],
     "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", "--no-progress"],
@@ -68,7 +73,7 @@ def folder(tmp_path_factory, trained_runs):
     for algo in ("ppo", "logs/ppo"):
         shutil.copytree(place / "logs/ppo_bc", place / algo / "ppo_bc" if algo == "ppo" else place / algo)
     shutil.copytree(ROOT / "examples", place / "examples")
-    for name in ("my.yaml", "my_vehicle.yaml"):
+    for name in ("my.yaml", "my_vehicle.yaml", "mine_tuned.yaml"):
         shutil.copy(ROOT / "examples/my_quadcopter.yaml", place / name)
     shutil.copy(ROOT / "zoo_configs/search_spaces/dagger.yml", place / "my_space.yml")
     best = place / "logs/tune/dagger/QuadTargetTracking-v0_1/best.yml"
@@ -87,7 +92,7 @@ def shorter(content):
     if not isinstance(content, dict):
         return [shorter(each) for each in content] if isinstance(content, list) else content
     kept = {key: shorter(value) for key, value in content.items() if key not in ("require", "trim", "position_scale")}
-    return kept | ({"n_timesteps": 960} if "n_timesteps" in kept else {})
+    return kept | ({"n_timesteps": 960} if isinstance(kept.get("n_timesteps"), int) else {})
 
 
 @pytest.mark.slow

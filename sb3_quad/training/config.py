@@ -71,6 +71,7 @@ class TrainingConfig(Frozen):
     env_kwargs: Keywords = Field(default={}, description="keywords of the environment's constructor")
     eval_env_kwargs: Keywords = Field(default={}, description="put over env_kwargs in the evaluation's environments")
     eval_tasks: Tasks = Field(default=(), description="further tasks to evaluate on; the own one decides which model is best")
+    best_by: Literal["success", "survival"] = Field(default="success", description="which share makes a model the best")
     policy: str = "MlpPolicy"
     policy_kwargs: Keywords = Field(default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'")
     expert: Any = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory, to learn from")

@@ -213,6 +213,7 @@ def _learn(
             report=report,
             others={task: env for task, env in eval_envs.items() if task is not None},
             should_continue=should_continue,
+            by=job.config.best_by,
         )
         callbacks.append(best)
     if job.save_freq > 0:

@@ -87,7 +87,7 @@ def _steps(sizes: list[int], n_envs: int, seconds: float) -> Iterator[tuple[int,
         settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": keywords}
         return closing(make_environments(build_config("ppo", ENV_ID, settings), n, 0))
 
-    randomize = load_config("dagger", TRAINED).env_kwargs["randomize"]
+    randomize = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
     with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
         env.reset(seed=0)
         yield 1, _rates({"PyBullet, one environment": env}, (4,), seconds)
