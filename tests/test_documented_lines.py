@@ -17,12 +17,12 @@ from sb3_quad.training import pipeline
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
 PENDULUM = "Pendulum-v1: {policy: MlpPolicy, n_timesteps: 100, n_steps: 100, batch_size: 50, gradient_steps: 2}"
-ELSEWHERE = {
+ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "--executor ray": "tests/test_ray.py",
-    "my_package.control:make": "a module of the user's",
     "--resume": "tests/test_runs.py",
     "my_experts:lqr": "tests/test_docs.py",
-    "…": "in short",
+    "my_package.control:make": "a module of the user's",
+    "…": "a line in short",
 }
 SHORTER = {  # flags that a command is given beside those that stand there
     "evaluate": ["--episodes", "2", "--overwrite"],

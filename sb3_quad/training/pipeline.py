@@ -61,7 +61,7 @@ class Stage(Frozen):
         default=0, description="added to the seed, so that a stage sees other episodes than one before it on the same task"
     )
     pass_on: Literal["best", "last"] = Field(
-        default="best", description="the best evaluation, by its settings' best_by, then by reward"
+        default="best", description="the best evaluation, as best_by of its settings says"
     )
     trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
