@@ -142,9 +142,12 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         _check(state, {f"{name}.pos": one, f"{name}.full": np.array(False)}, path)
         buffer.pos, buffer.full = int(state[f"{name}.pos"]), bool(state[f"{name}.full"])
         _require(0 <= buffer.pos < buffer.buffer_size, f"{name}.pos is beyond its rows", path)
-        _check(state, _with_prefix(f"{name}.", _filled(buffer)), path)
-        for each, rows in _filled(buffer).items():
-            rows[...] = state[f"{name}.{each}"]
+        own = _with_prefix(f"{name}.", _filled(buffer))
+        # What was written later than the rest may hold more rows.
+        state |= {each: state[each][: len(rows)] for each, rows in own.items() if each in state and state[each].ndim}
+        _check(state, own, path)
+        for each, rows in own.items():
+            rows[...] = state[each]
     if batch is not None:
         try:
             batch.restore(environment)

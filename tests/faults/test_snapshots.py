@@ -135,6 +135,23 @@ def test_values_that_mean_nothing_are_refused(name, value, broken, resuming):
         assert message.startswith(f"{broken[0].resume_state}: ") and name.split(".")[-1] in message
 
 
+def test_rows_that_a_buffer_had_more_when_it_was_written_are_left_out(broken):
+    run, config = broken
+    whole = run.resume_state.read_bytes()
+    state = dict(np.load(run.resume_state))
+    more = {
+        name: np.concatenate([array, array[:1]])
+        for name, array in state.items()
+        if name.startswith("replay_buffer.") and array.ndim
+    }
+    np.savez(run.resume_state, **{**state, **more})
+    model = load_snapshot(run, config.algo, make_environments(config, config.n_envs, 0), "cpu", expert=None)
+    for name in more:
+        rows = getattr(model.replay_buffer, name.partition(".")[2])[: len(state[name])]
+        np.testing.assert_array_equal(rows, state[name])
+    run.resume_state.write_bytes(whole)
+
+
 def test_a_batch_is_not_restored_in_part():
     batch = QuadcopterBatch(3, FlightSettings(task=TASK), seed=0)
     state = batch.snapshot()
