@@ -130,7 +130,7 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
     zip_file, where = io.BytesIO(state["model"].tobytes()), f"{path}: model"
     model: Any = load_zip(algorithm, zip_file, where=where, env=env, device=device, force_reset=batch is None, **attributes)
     one = np.array(0)
-    _check(state, {"timesteps": one, "episodes": one, "best_model": NO_BYTES, **random_state()}, path)
+    _check(state, {"timesteps": one, "episodes": one, "best_model": NO_BYTES, "log": np.array(""), **random_state()}, path)
     _check(state, _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {}), path)
     _require(batch is not None or not environment, f"{ENVIRONMENT}… is of environments of another kind", path)
     _require(int(state["episodes"]) >= 0, "episodes is negative", path)
