@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import PPO
 from torch import nn
+from torch.nn.utils import parameters_to_vector
 
 from sb3_quad import PPOBC, DAgger, GeometricExpert
 from sb3_quad.algorithms import dagger, ppo_bc
@@ -76,6 +77,22 @@ def test_the_number_of_threads_changes_no_bit(threads):
             for _ in range(20):
                 assert all(th.equal(*pair) for pair in zip(alone, cloning(net, x, labels, index), strict=True))
         assert th.get_num_threads() == count
+
+
+@pytest.mark.parametrize("algorithm", [DAgger, PPOBC])
+def test_from_the_seed_to_the_trained_weights_the_number_of_threads_changes_no_bit(algorithm, threads):
+    found = []
+    for count in (1, 2, 3):
+        threads(count)
+        env = QuadcopterVecEnv(48, "state_recovery", max_episode_steps=20, seed=0)
+        rollout = {"n_steps": 25, "batch_size": 600, "n_epochs": 2}
+        model = algorithm("MlpPolicy", env, expert=GeometricExpert(), **rollout, seed=0, device="cpu")
+        begun = parameters_to_vector(model.policy.parameters())
+        model.learn(2400)
+        found.append((begun, parameters_to_vector(model.policy.parameters())))
+        assert th.get_num_threads() == count and not th.equal(*found[-1])
+    for stage, alone in enumerate(found[0]):
+        assert all(th.equal(alone, other[stage]) for other in found[1:]), ("begun", "trained")[stage]
 
 
 def test_a_forked_child_computes_alone(threads):

@@ -26,6 +26,10 @@ class ExpertMixin:
         """Learn from ``expert`` from now on, as a model must that was loaded without one."""
         self.expert = expert
 
+    def _setup_model(self) -> None:
+        with one_torch_thread(compiled=True):  # the orthogonal weights of a network depend on how many threads make them
+            super()._setup_model()  # type: ignore[misc]
+
     def _prepare_to_learn(self, anew: bool) -> None:
         """Check the expert, and forget what the environments before have left where they begin ``anew``."""
         raise NotImplementedError

@@ -27,7 +27,6 @@ from stable_baselines3.td3 import policies as td3
 from torch import nn, optim
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
 from sb3_quad.base.trust import VARIABLE
 
@@ -46,8 +45,11 @@ def unpickle(text: str, where: str) -> Any:
         return _interpret(base64.b64decode(text))
     except _UnknownName as error:
         raise ConfigError(f"{where} names {error}, which may run anything; {WAY_OUT}") from None
-    except Exception as error:  # what a pickle of wrong types raises depends on the types
-        raise ConfigError(f"{where} is not what Stable-Baselines3 pickles ({one_line(error)}); {WAY_OUT}") from None
+    except (
+        Exception
+    ) as error:  # what wrong types raise depends on the types; the message of one may show, and so ask, an object
+        reason = str(error) if isinstance(error, _Refusal) else type(error).__name__
+        raise ConfigError(f"{where} is not what Stable-Baselines3 pickles ({reason}); {WAY_OUT}") from None
 
 
 class _UnknownName(Exception):

@@ -56,7 +56,18 @@ scenarios:
   - {name: near, target: {distance: 1}, duration: 2, episodes: 400}
   - {name: thrown, start: {attitude: {distribution: uniform}, velocity: {std: 2}}, duration: 2, episodes: 400}
 """
-SWEEP = {"name": "sweep", "algo": "dagger", "env": "QuadTargetTracking-v0", "seed": [0, 1], "evaluation": {"episodes": 4}}
+SWEEP = {
+    **{key: DAGGER[key] for key in ("n_timesteps", "n_envs", "env_kwargs")},
+    "hyperparams": {key: DAGGER[key] for key in DAGGER if key not in ("n_timesteps", "n_envs", "env_kwargs")},
+    "name": "sweep",
+    "conf_file": "nominal/dagger.yml",
+    "algo": "dagger",
+    "env": "QuadTargetTracking-v0",
+    "seed": [0, 1],
+    "eval_freq": 2000,
+    "eval_episodes": 4,
+    "evaluation": {"episodes": 4},
+}
 STAGES = [
     {
         "name": "one",
@@ -88,11 +99,8 @@ def command(kind: str, folder: Path) -> list[str]:
     small = {"QuadTargetTracking-v0": SETTINGS.get(kind, TINY)}
     settings.write_text(yaml.safe_dump({"stages": STAGES} if kind == "pipeline" else small))
     if kind == "sweep":
-        spec = folder / "sweep.yml"
-        settings = folder / "settings.yml"
-        settings.write_text(yaml.safe_dump({"QuadTargetTracking-v0": DAGGER}))
-        spec.write_text(yaml.safe_dump({**SWEEP, "conf_file": str(settings), "eval_freq": 2000, "eval_episodes": 4}))
-        return ["sweep", str(spec), "-f", str(logs), "--workers", "2", "--no-progress"]
+        settings.write_text(yaml.safe_dump(SWEEP))
+        return ["sweep", str(settings), "-f", str(logs), "--workers", "2", "--no-progress"]
     more = ["--conf-file", str(settings), "-f", str(logs), "--no-progress"]
     if kind == "tune":
         space = folder / "space.yml"

@@ -12,20 +12,26 @@ import random
 import sys
 import types
 import zipfile
+from collections import deque
 from collections.abc import Iterable
 
 import numpy as np
 import pytest
+import sb3_contrib  # noqa: F401 - before what is imported is watched
 from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNoise
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.her import GoalSelectionStrategy
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers import unpickle as own
 from sb3_quad.controllers.pretrained import pretrained
 
 COUNT = int(os.environ.get("SB3_QUAD_PICKLES", "300"))
-KNOWN = [*(own._CLASSES | own._FUNCTIONS | own._ARGUMENTS)]
+KNOWN = [
+    *(own._CLASSES | own._FUNCTIONS | own._ARGUMENTS),
+    ("sb3_contrib.common.recurrent.policies", "RecurrentActorCriticPolicy"),
+]
 FOREIGN = [
     *(("os", "system"), ("builtins", "getattr"), ("builtins", "setattr"), ("builtins", "bool"), ("builtins", "exec")),
     *(("canary", "touched"), ("canary", "Touched"), ("numpy", "load"), ("stable_baselines3.common.buffers", "BaseBuffer")),
@@ -45,11 +51,37 @@ def real_pickles() -> list[bytes]:
         entries = json.loads(archive.read("data")).values()
     found = [base64.b64decode(each[":serialized:"]) for each in entries if isinstance(each, dict) and ":serialized:" in each]
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(2), np.ones(2)), 2)
-    others = noise, TrainFreq(1, TrainFrequencyUnit.STEP), FloatSchedule(0.1), np.ones((2, 2)).T, np.ones((4, 3))[:, 1]
+    arrays = (
+        np.ones((2, 2)).T,
+        np.arange(12.0).reshape(4, 3)[:, 1],
+        np.array(True),
+        np.float64(0.5),
+        np.zeros((0, 3), np.uint8),
+    )
+    others = (
+        noise,
+        TrainFreq(1, TrainFrequencyUnit.STEP),
+        FloatSchedule(0.1),
+        GoalSelectionStrategy.FUTURE,
+        deque([1], 3),
+        arrays,
+    )
     return found + [pickle.dumps(each, protocol) for each in others for protocol in (4, 5)]
 
 
 REAL = real_pickles()
+
+
+def shown(value: object) -> str:
+    generator = getattr(value, "_np_random", None)
+    return repr((value, generator and generator.bit_generator.state, getattr(value, "maxlen", None)))
+
+
+@pytest.mark.parametrize("content", REAL)
+def test_what_sb3_pickles_is_read_as_pickle_reads_it(content):
+    ours, theirs = own.unpickle(base64.b64encode(content).decode(), "here"), pickle.loads(content)
+    assert shown(ours) == shown(theirs)
+    assert type(ours) is type(theirs)
 
 
 class Writer:

@@ -3,7 +3,7 @@
 examples:
   sb3-quad plot logs/ppo_bc/QuadStateRecovery-v0_1
   sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
-  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:31.9:-16.1 --title "state recovery" -o curves.svg
+  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:32.25:-16.1 --title "state recovery" -o curves.svg
   sb3-quad plot "PPO+BC=logs/ppo_bc/QuadStateRecovery-v0_*" --thesis state_recovery --show survival reward losses
 """
 
@@ -38,7 +38,7 @@ def _line(text: str) -> tuple[str, dict[str, float]]:
         name, success, reward = text.split(":")
         return name, {"success": float(success) / 100, "survival": float(success) / 100, "reward": float(reward)}
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:31.9:-16.1") from None
+        raise argparse.ArgumentTypeError(f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1") from None
 
 
 def run(options: argparse.Namespace) -> int:
