@@ -60,7 +60,10 @@ def shares(output):
 )
 def test_agents_succeed(run, name, agents, success):
     """As the examples are shipped; 480 episodes of 15 s each, as they print."""
-    found = shares(run(name))
+    output = run(name)
+    found = shares(output)
+    rewards = [float(reward) for reward in re.findall(r"mean reward (-[\d.]+)", output)]
+    assert rewards == sorted(set(rewards)), "training by a reward of one's own raises it"
     for agent in agents:
         assert found[agent][0] >= success and found[agent][1] >= 97.0, found
     if name == "train_dagger.py":
