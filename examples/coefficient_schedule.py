@@ -14,11 +14,12 @@ from typing import Any
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import KVWriter
-from stable_baselines3.common.utils import FloatSchedule
+from stable_baselines3.common.utils import FloatSchedule, LinearSchedule
 
 from sb3_quad import DAgger, PIDExpert
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 
 PROGRESS = "progress"
 
@@ -147,9 +148,22 @@ if __name__ == "__main__":
     parser.add_argument("--timesteps", type=int, default=240_000, help="over all environments (%(default)s)")
     arguments = parser.parse_args()
 
-    env = QuadcopterVecEnv(48, max_episode_steps=500, seed=0)
-    model = DAgger("MlpPolicy", env, PIDExpert(), n_steps=250, batch_size=2000, n_epochs=2, seed=0, device="cpu")
+    env = QuadcopterVecEnv(48, max_episode_steps=1000, seed=0)
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        PIDExpert(),
+        n_steps=250,
+        batch_size=2048,
+        gradient_steps=100,
+        n_epochs=1,
+        learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+        seed=0,
+        device="cpu",
+    )
     # β falls from 1 to 0 while the share of training episodes that succeed goes from 50 % to 95 %.
     schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95))
     model.learn(arguments.timesteps, callback=schedule)
     print(f"beta {model.current_beta:.2f}")
+    flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)
+    print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

@@ -10,12 +10,14 @@ import argparse
 from collections import deque
 
 import numpy as np
-from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_quad import DAgger, GeometricExpert
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.controller import true_state_of
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 
 
 class FlightMetrics(BaseCallback):
@@ -99,12 +101,29 @@ class FlightMetrics(BaseCallback):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=480_000, help="over all environments (%(default)s)")
+    parser.add_argument("--timesteps", type=int, default=600_000, help="over all environments (%(default)s)")
     arguments = parser.parse_args()
 
-    env = QuadcopterVecEnv(48, task="state_recovery", max_episode_steps=300, seed=0)
-    model = PPO("MlpPolicy", env, n_steps=250, batch_size=4000, n_epochs=4, seed=0, device="cpu")
-    metrics = FlightMetrics(tolerance=0.5)
+    env = QuadcopterVecEnv(240, task="target_tracking", max_episode_steps=500, seed=0)
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        GeometricExpert(),
+        n_steps=125,
+        batch_size=2048,
+        gradient_steps=100,
+        n_epochs=1,
+        gamma=0.99,
+        learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+        beta=1.0,  # the expert flies the first rollout, and less of each following one
+        beta_decay=0.2,
+        beta_final=0.0,
+        seed=0,
+        device="cpu",
+    )
+    metrics = FlightMetrics()
     model.learn(arguments.timesteps, callback=metrics)
     for name, value in metrics.metrics().items():
         print(f"{name}: {value:.3f}")
+    flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)
+    print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

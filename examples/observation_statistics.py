@@ -2,6 +2,8 @@
 
     python examples/observation_statistics.py
 
+No agent comes of it: PPO has hardly begun to learn, and its first flights are what is measured.
+
 In a settings file, with ``PYTHONPATH=examples`` on the command line::
 
     callback:

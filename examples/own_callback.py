@@ -9,9 +9,11 @@ import argparse
 
 from coefficient_schedule import CoefficientSchedule
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert
 from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 
 
 class CrashRate(BaseCallback):
@@ -39,7 +41,20 @@ parser.add_argument("--timesteps", type=int, default=600_000, help="transitions,
 arguments = parser.parse_args()
 
 env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=300, seed=0)
-model = DAgger("MlpPolicy", env, GeometricExpert(), n_steps=125, batch_size=4096, gradient_steps=30, n_epochs=2,
-               learning_rate=2e-3, seed=0, device="cpu")  # fmt: skip
+model = DAgger(
+    "MlpPolicy",
+    env,
+    GeometricExpert(),
+    n_steps=125,
+    batch_size=2048,
+    gradient_steps=100,
+    n_epochs=1,
+    gamma=0.99,
+    learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+    seed=0,
+    device="cpu",
+)
 less_expert = CoefficientSchedule("beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05))
 model.learn(arguments.timesteps, callback=[CrashRate(), less_expert])
+flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
+print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

@@ -9,6 +9,7 @@ same class teaches as `PYTHONPATH=examples sb3-quad train --algo dagger --expert
 import argparse
 
 import numpy as np
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import DAgger, GeometricExpert, PIDExpert
 from sb3_quad.envs import QuadcopterVecEnv
@@ -37,9 +38,23 @@ if __name__ == "__main__":
 
     expert = SwitchingExpert()
     env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=500, seed=0)
-    model = DAgger("MlpPolicy", env, expert, n_steps=125, batch_size=4096, gradient_steps=30, n_epochs=2,
-                   learning_rate=2e-3, seed=0, device="cpu")  # fmt: skip
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        expert,
+        n_steps=125,
+        batch_size=2048,
+        gradient_steps=100,
+        n_epochs=1,
+        gamma=0.99,
+        learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+        beta=1.0,  # the expert flies the first rollout, and less of each following one
+        beta_decay=0.2,
+        beta_final=0.0,
+        seed=0,
+        device="cpu",
+    )
     model.learn(arguments.timesteps)
     for name, controller in (("PID", PIDExpert()), ("own expert", expert), ("agent", model)):
-        flights = fly(controller, "state_recovery", n_episodes=48, seed=1_000_000, max_steps=500)
-        print(f"{name}: recovers {flights.success.mean():.1%}")
+        flights = fly(controller, "state_recovery", n_episodes=480, seed=1_000_000)
+        print(f"{name}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

@@ -14,15 +14,16 @@ from typing import Any
 
 import numpy as np
 from matplotlib.figure import Figure as Picture
-from stable_baselines3 import PPO
 from stable_baselines3.common.logger import Figure
+from stable_baselines3.common.utils import LinearSchedule
 
+from sb3_quad import DAgger, GeometricExpert
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.callbacks.every import EveryTimesteps
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
-from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.flights import fly, fly_settings
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings
 
@@ -87,8 +88,26 @@ if __name__ == "__main__":
     parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
     arguments = parser.parse_args()
 
-    env = QuadcopterVecEnv(240, task="state_recovery", seed=0)
-    model = PPO("MlpPolicy", env, n_steps=50, batch_size=4000, tensorboard_log="tb", seed=0, device="cpu")
-    plots = TrajectoryPlots(every=12_000, n_flights=2, max_steps=200, task="state_recovery")
+    env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=500, seed=0)
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        GeometricExpert(),
+        n_steps=125,
+        batch_size=2048,
+        gradient_steps=100,
+        n_epochs=1,
+        gamma=0.99,
+        learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+        beta=1.0,  # the expert flies the first rollout, and less of each following one
+        beta_decay=0.2,
+        beta_final=0.0,
+        seed=0,
+        device="cpu",
+        tensorboard_log="tb",
+    )
+    plots = TrajectoryPlots(every=60_000, n_flights=2, max_steps=200, task="state_recovery")
     model.learn(arguments.timesteps, callback=plots)
+    flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
+    print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")
     print("plots are in tb/")

@@ -1,8 +1,10 @@
 """Saved and shipped zips fly in stock Stable-Baselines3, where sb3_quad is not installed."""
 
 import json
+import runpy
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.utils import LinearSchedule
 
 import sb3_quad
-from sb3_quad import PPOBC, SACBC, DAgger, PIDExpert
+from sb3_quad import PPOBC, SACBC, DAgger, GeometricExpert, PIDExpert
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import pretrained_names
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -33,6 +35,8 @@ own = [np.resize(seen, (len(seen), *model.observation_space.shape)) for model in
 actions = [model.predict(each, deterministic=True)[0].tolist() for model, each in zip(models, own)]
 json.dump([actions, [model.num_timesteps for model in models]], sys.stdout)
 """
+EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "load_in_plain_sb3.py"
+RUN = "import runpy, sys; sys.modules['sb3_quad'] = None; runpy.run_path(sys.argv.pop(1), run_name='__main__')"
 SMALL = {"n_steps": 32, "batch_size": 128, "learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "seed": 0, "device": "cpu"}
 
 
@@ -72,3 +76,54 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
         seen = np.resize(observations, (len(observations), *model.observation_space.shape))
         # Both processes may use different numbers of threads, whose sums round differently.
         np.testing.assert_allclose(np.float32(flown), model.predict(seen, deterministic=True)[0], atol=1e-5)
+
+
+def save_extended(folder):
+    """A zip as `train` leaves it, of an agent that sees frames, its last action and the integral, by a scaling of its own."""
+    scaling = {"observation_mean": np.linspace(-0.3, 0.4, 18), "observation_std": np.linspace(2.0, 3.0, 18)}
+    integral = {"gain": 2.0, "distance": 2.0, "speed": 9.0, "limit": 0.1}
+    frames = {"last_action": True, "history": [0, 2, 5], "position_integral": integral}
+    settings = FlightSettings(vehicle="hummingbird", **frames, **scaling)
+    model = DAgger("MlpPolicy", QuadcopterVecEnv(4, **settings.in_any_task()), GeometricExpert("hummingbird"), **SMALL)
+    settings.write_into(model)
+    model.save(folder / "extended.zip")
+    return folder / "extended.zip"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*pretrained_names(), "extended"])
+def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_path):
+    """In closed loop: what flies is the action for the example's observation."""
+    path = save_extended(tmp_path) if name == "extended" else sb3_quad.pretrained(name)
+    model = PPO.load(path, device="cpu")
+    settings = {**sb3_quad.env_kwargs(path), "noise": 0.0, "vehicles": None}
+    env = QuadcopterVecEnv(1, "state_recovery", {"velocity_std": 1.0}, max_episode_steps=1000, seed=3, **settings)
+    observation, action = runpy.run_path(str(EXAMPLE))["Observation"](model.flight_settings), np.zeros((1, 4))
+    expected = env.reset()
+    for _ in range(150 if name == "extended" else 500):
+        state = env.true_state()
+        position = (state.position - state.target)[0]
+        seen = observation(position, state.rotation[0], state.velocity[0], state.body_rates[0], action[0])
+        np.testing.assert_allclose(seen, expected[0], rtol=1e-6, atol=1e-6)
+        action = model.predict(seen[None], deterministic=True)[0]
+        expected, _, done, _ = env.step(action)
+        if done[0]:
+            break
+    assert len(observation.frames) == observation.ages[-1] + 1
+    assert (observation.integral != 0.0).any() == (observation.rule is not None)
+
+
+@pytest.mark.slow
+def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path):
+    zips = [str(sb3_quad.pretrained(name)) for name in pretrained_names()]
+    command = [sys.executable, "-W", "error", "-c", RUN, str(EXAMPLE)]
+    result = subprocess.run([*command, *zips, str(save_extended(tmp_path))], capture_output=True, text=True, check=False)
+    assert result.returncode == 0, result.stderr
+    distances = [float(line.rpartition(": ")[2].split(" m from")[0]) for line in result.stdout.splitlines()]
+    assert len(distances) == len(zips) + 1
+    for name, distance in zip(pretrained_names(), distances, strict=False):
+        assert distance < (1.5 if name == "thesis-ppo" else 0.1), name  # that one hovers beside its target
+    model = DAgger("MlpPolicy", QuadcopterVecEnv(4), PIDExpert(), **SMALL)
+    model.save(tmp_path / "silent.zip")
+    result = subprocess.run([*command, str(tmp_path / "silent.zip")], capture_output=True, text=True, check=False)
+    assert result.returncode == 1 and "flight_settings" in result.stderr and "Traceback" not in result.stderr
