@@ -92,6 +92,11 @@ def test_own_experts_and_vehicles_recover(run, name):
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
 
 
+@pytest.mark.slow
+def test_thesis_readings(run):
+    assert run("thesis_readings.py").count("of 240 recoveries survive") == 6
+
+
 def test_own_reward(run):
     output = run("own_reward.py", *SHORT)
     before, after = map(float, re.findall(r"mean reward (-[\d.]+)", output))
