@@ -98,7 +98,7 @@ def _origin(model: Path) -> tuple[str, dict[str, str]]:
         "algorithm": f"`{_plain(arguments.get('algo', algorithm))}`, {timesteps}"
         + (f" from `{_plain(Path(start).name)}`" if start else ""),
         "environment": f"`{_plain(arguments.get('env', run.name))}`",
-        **({"expert": f"`{_plain(settings['expert'])}`"} if settings.get("expert") else {}),
+        **({"expert": f"`{_plain(settings['expert'])}`"} if settings.get("expert") and settings.get("bc_coef") != 0 else {}),
         **{name: _plain(arguments.get(name, UNKNOWN)) for name in ("seed", *MADE_WITH)},
     }
     return _plain(read_text(run.command)) if run.command.is_file() else f"# {UNKNOWN}", facts
