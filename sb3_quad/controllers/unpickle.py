@@ -26,7 +26,7 @@ from stable_baselines3.sac import policies as sac
 from stable_baselines3.td3 import policies as td3
 from torch import nn, optim
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.base.imports import require
 from sb3_quad.base.trust import VARIABLE
 
@@ -45,9 +45,10 @@ def unpickle(text: str, where: str) -> Any:
         return _interpret(base64.b64decode(text))
     except _UnknownName as error:
         raise ConfigError(f"{where} names {error}, which may run anything; {WAY_OUT}") from None
-    except (
-        Exception
-    ) as error:  # what wrong types raise depends on the types; the message of one may show, and so ask, an object
+    except MissingExtra:
+        raise
+    except Exception as error:  # what wrong types raise depends on the types
+        # Not the message of any error: to show an object is to ask it.
         reason = str(error) if isinstance(error, _Refusal) else type(error).__name__
         raise ConfigError(f"{where} is not what Stable-Baselines3 pickles ({reason}); {WAY_OUT}") from None
 
@@ -195,8 +196,8 @@ def _change(instance: Any, state: Any) -> Any:
         _CHANGES[kind](instance, state)
         return instance
     _check(kind in _WITH_ATTRIBUTES.values() and type(state) is dict, "a state")
-    _check(all(type(name) is str for name in state), "attributes")
-    getattr(kind, "__setstate__", lambda made, attributes: vars(made).update(attributes))(instance, state)
+    _check(all(type(name) is str and not name.startswith("__") for name in state), "attributes")
+    getattr(kind, "__setstate__", lambda made, attributes: made.__dict__.update(attributes))(instance, state)
     return instance
 
 
@@ -221,6 +222,7 @@ def _interpret(content: bytes) -> Any:
     memo: dict[int, Any] = {}
     stack: list[Any] = []
     below: list[list[Any]] = []  # the stacks below each mark
+    argument: Any
     for opcode, argument, _ in pickletools.genops(content):
         name, items = opcode.name, []
         if name in _SIZES:

@@ -216,15 +216,16 @@ class QuadcopterBatch:
         :raises ConfigError: the snapshot is of other environments.
         """
         for name in dict.fromkeys((*_KEPT, *snapshot)):
-            array, own = snapshot.get(name), getattr(self, name) if name in _KEPT else None
+            array: Any = snapshot.get(name)
+            own = getattr(self, name) if name in _KEPT else None
             fits = array is not None and own is not None and (array.dtype, array.shape) == (own.dtype, own.shape)
             if not fits or (name == "task_index" and not ((array >= 0) & (array < self.task_weights.size)).all()):
                 found = "missing" if array is None else f"{array.dtype} of shape {array.shape}"
                 raise ConfigError(
                     f"the saved state of the environments does not fit these ({name}: {found}); use the run's own settings"
                 )
-        for name, array in snapshot.items():
-            getattr(self, name)[...] = array
+        for name in _KEPT:
+            getattr(self, name)[...] = snapshot[name]
 
     def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
         """Move targets r_T, (3,) or (rows, 3), world frame, m; until the row's next reset."""
