@@ -272,10 +272,12 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     )
     assert all(part in card for part in (*facts, run.command.read_text().strip()))
     assert agent_settings("mine.zip")[0] == agent_settings("mailed_best_model.zip")[0]
-    assert main(["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]) == 2
-    assert (
-        f"{run.best_model}: environment spaces and policy_kwargs must be the same" in capsys.readouterr().err
-    )  # of other sizes
+    again = ["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]
+    assert main([*again, "--conf-file", "ppo.yml"]) == 2  # of other sizes
+    assert f"{run.best_model}: environment spaces and policy_kwargs must be the same" in capsys.readouterr().err
+    assert main([*again, "--eval-episodes", "0", "--no-progress"]) == 0  # its successor has its observation and networks
+    (successor,) = Path("logs", "ppo").glob(f"{ENV}_*/{ENV}.zip")
+    assert agent_settings(successor)[0].observation_std == std
 
 
 @pytest.mark.parametrize("algo", ["dagger", "ppo"])

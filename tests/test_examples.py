@@ -92,6 +92,13 @@ def test_own_experts_and_vehicles_recover(run, name):
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
 
 
+def test_cloning_plot(run, tmp_path):
+    rows = [f'"our reward, {kind}",tracking,{error}' for kind, error in (("cloning", 0.1), ("none", 0.5), ("none", 0.6))]
+    (tmp_path / "results.csv").write_text("\n".join(["configuration,scenario,final_error", *rows]))
+    run("cloning_plot.py", "results.csv", "cloning.png")
+    assert Image.open(tmp_path / "cloning.png").size[0] > 500
+
+
 @pytest.mark.slow
 def test_thesis_readings(run):
     assert run("thesis_readings.py").count("of 240 recoveries survive") == 6

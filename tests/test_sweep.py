@@ -4,6 +4,7 @@ import itertools
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -132,7 +133,9 @@ def test_dry_run_lists_the_runs(tmp_path, capsys, monkeypatch):
 
 
 @pytest.mark.parametrize("name", SWEEPS.names())
-def test_sweeps_of_the_package_expand(name):
+def test_sweeps_of_the_package_expand(name, trained_runs, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(trained_runs("dagger"), "logs/dagger/QuadTargetTracking-v0_1")  # from which `cloning` starts
     assert {run.seed for run in expand(load_sweep(name))} == {0, 1, 2}
 
 
