@@ -141,7 +141,7 @@ def test_pruned_trials_end_early_and_are_never_the_best(command, monkeypatch, ca
     assert "trial 0 pruned, success" in capsys.readouterr().out
     rows = trials()
     assert [(row["state"], row["evaluations"], row["value"]) for row in rows] == [("PRUNED", "1", "")] * 2
-    assert PPO.load(Path(rows[0]["run"]) / f"{ENV}.zip").num_timesteps == 408
+    assert PPO.load(Path(rows[0]["run"]) / f"{ENV}.zip").num_timesteps == 400
     assert not (folder() / "best.yml").exists()
 
 

@@ -7,7 +7,6 @@ forks of this process, which has imported everything and has no threads: a kill 
 """
 
 import csv
-import multiprocessing
 import os
 import random
 import re
@@ -24,9 +23,13 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 import sb3_quad.callbacks.interruption
 import sb3_quad.cli.closing
-import sb3_quad.executors.local
+import sb3_quad.evaluation.evaluate
+import sb3_quad.report.results_page
+import sb3_quad.sweep.run
 import sb3_quad.training.trim
+import sb3_quad.tuning.results
 from sb3_quad.cli import main
+from sb3_quad.envs import QuadcopterVecEnv
 
 RUNS = ("dagger", "ppo_bc", "pipeline", "sac_bc", "evaluate", "sweep", "tune", "ppo", "sac")
 TINY = {
@@ -198,12 +201,12 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
         (sb3_quad.cli.closing, "FRESH_EPISODES", 4),
         (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
         (sb3_quad.callbacks.interruption, "PAUSE", 0.1),
-        (sb3_quad.executors.local, "_context", lambda: multiprocessing.get_context("fork")),  # workers need not import again
         (sb3_quad.training.trim, "N_FLIGHTS", 4),
         (sb3_quad.training.trim, "N_HEADINGS", 4),
     ):
         assert hasattr(module, name)
         setattr(module, name, value)
+    QuadcopterVecEnv(1)  # loads what is compiled
     rng, done, failed, trial = random.Random(seed), 0, 0, 0
     kills_of = Counter[str]()
     whole: dict[str, dict[str, object]] = {}
