@@ -91,12 +91,6 @@ def test_own_experts_and_vehicles_recover(run, name):
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
 
 
-def test_own_reward(run):
-    output = run("own_reward.py", *SHORT)
-    before, after = map(float, re.findall(r"mean reward (-[\d.]+)", output))
-    assert before != after
-
-
 def test_own_callback(run):
     output = run("own_callback.py", "--timesteps", "100000")  # the first episodes end in the third rollout
     assert "episodes crashed, beta 0.80" in output
@@ -107,7 +101,7 @@ def test_coefficient_schedule(run):
 
 
 def test_flight_metrics(run):
-    assert "rollout/collision_rate: " in run("flight_metrics.py", "--timesteps", "24000")
+    assert "rollout/collision_rate: " in run("flight_metrics.py", "--timesteps", "150000")
 
 
 def test_trajectory_plots(run, tmp_path):
