@@ -14,14 +14,16 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all fuzz test-zoo lint format type links commit-checks clean
+.PHONY: help install train test test-all fuzz test-zoo test-extras lint format type links commit-checks clean
 
 help:
+	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
 	@echo "make train          train with the default settings"
 	@echo "make test           run the tests that a change is likely to break, in minutes"
 	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3 or Ray, in an environment of its own"
+	@echo "make test-extras    install each extra into an empty environment, as README says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
 	@echo "make type           check types"
@@ -50,6 +52,9 @@ fuzz: $(INSTALLED)
 
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py $(ARGS)
+
+test-extras:
+	PYTHON=$(PYTHON) .ci/extras $(ARGS)
 
 lint: $(INSTALLED) links
 	$(PY) -m ruff check .
@@ -92,12 +97,11 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 		$(INSTALL) setuptools hatchling && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
 	fi
 
-# Ray, and rl_zoo3, which needs older versions of some packages than ours: they come first in an environment
-# that borrows all others.
-$(ZOO_INSTALLED): constraints-zoo.txt $(INSTALLED)
+# Ray and rl_zoo3, in an environment that borrows all others.
+$(ZOO_INSTALLED): constraints.txt $(INSTALLED)
 	$(PY) -m venv --without-pip $(ZOO_VENV)
 	@$(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \
 		"$$($(ZOO_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
 	@$(PY) -m pip --python $(ZOO_VENV)/bin/python install --quiet --no-compile --disable-pip-version-check \
-		--no-deps --ignore-installed --requirement constraints-zoo.txt
+		--constraint constraints.txt 'rl_zoo3[plots]' requests ray
 	@touch $@

@@ -1,6 +1,7 @@
 """What all environments have in common: their spaces, and what they can be asked and told in flight."""
 
 import functools
+import inspect
 from collections.abc import Callable
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -8,6 +9,7 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import validate
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
@@ -49,6 +51,10 @@ class BatchEnv:
 
     def _make_batch(self, n: int, seed: int | None, n_threads: int | None, autoreset: bool, **keywords: Any) -> None:
         """Make the batch of n rows that fly as the keywords say; errors name the environment's class."""
+        own = inspect.signature(type(self)).parameters.values()
+        valid = {each.name for each in own if each.kind is each.POSITIONAL_OR_KEYWORD} | FlightSettings.model_fields.keys()
+        for key in keywords.keys() - valid:
+            raise ConfigError(f"{type(self).__name__}: {unknown('keyword', key, valid)}")
         settings = validate(FlightSettings, keywords, type(self).__name__)
         self.batch = QuadcopterBatch(n, settings, seed, n_threads, autoreset)
 

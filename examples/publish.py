@@ -31,6 +31,7 @@ from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
 from sb3_quad.evaluation.metrics import Metrics, summarise
+from sb3_quad.evaluation.results import file_name
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.export.network import check_policy
 from sb3_quad.simulation.frames import ObservationSettings
@@ -60,8 +61,8 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Slim, fly, write. Returns the exit code."""
-    if Path(options.name).name != options.name:
-        raise ConfigError(f"--name {options.name}: a name without folders; they are for -o")
+    if file_name(options.name) != options.name:
+        raise ConfigError(f"--name {options.name!r}: letters, digits and, between them, '_', '.' and '-'; folders are for -o")
     zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)

@@ -20,6 +20,8 @@ from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.snapshots import random_state, set_random_state
 
 
@@ -56,16 +58,15 @@ def test_evaluations_are_regular_and_recorded(tmp_path):
     lines = []
     best = make_best(tmp_path, every=60, report=lines.append)
     make_model().learn(160, callback=best)
-    best.evaluate()
     best = make_best(tmp_path, every=60, report=lines.append)  # an existing file is continued
     make_model().learn(60, callback=best)
     with np.load(tmp_path / "evaluations.npz") as file:
-        assert file["timesteps"].tolist() == [60, 120, 160, 60]
-        assert file["results"].shape == file["successes"].shape == file["ep_lengths"].shape == (4, 4)
+        assert file["timesteps"].tolist() == [60, 120, 160, 60, 80]  # whole rollouts
+        assert file["results"].shape == file["successes"].shape == file["ep_lengths"].shape == (5, 4)
         assert (np.diff(file["seconds"]) >= 0).all()
         means = file["results"].mean(axis=1), file["successes"].mean(axis=1)
     assert best.best == max(zip(means[1].tolist(), means[0].tolist(), strict=True))
-    assert len(lines) == 4
+    assert len(lines) == 5
     assert (tmp_path / "best_model.zip").is_file()
 
 
@@ -78,11 +79,27 @@ def logged(folder, tag):
 def test_tensorboard_shows_every_evaluation_where_it_happened(tmp_path):
     best, model = make_best(tmp_path, every=20), make_model(tensorboard_log=str(tmp_path))
     model.learn(120, callback=best)  # two in each rollout
-    best.evaluate()
     with np.load(tmp_path / "evaluations.npz") as file:
         means = file["results"].mean(axis=1)
     steps, shown = zip(*logged(tmp_path / "PPO_1", "eval/mean_reward"), strict=True)
-    assert steps == (20, 40, 60, 80, 100, 120, 120) and shown == pytest.approx(means, abs=1e-5)
+    assert steps == (20, 40, 60, 80, 100, 120) and shown == pytest.approx(means, abs=1e-5)
+
+
+def test_the_final_error_is_the_median_of_the_flights_that_are_not_lost(tmp_path):
+    how = {"task_kwargs": {"start_position": (0, 0, 0.5), "target_distance": 1.0, "velocity_std": 2.0}}
+    env = QuadcopterVecEnv(8, max_episode_steps=50, **how)
+    model = PPO("MlpPolicy", env, n_steps=10, batch_size=80, device="cpu", tensorboard_log=str(tmp_path))
+    lines = []
+    best = BestModel(env, 1000, 8, 5, tmp_path / "best.zip", tmp_path / "evaluations.npz", lines.append)
+    model.learn(80, callback=best)
+    flown = fly(model, n_episodes=8, seed=5, max_steps=50, **how)
+    assert 0 < flown.survival.sum() < 8
+    with np.load(tmp_path / "evaluations.npz") as file:
+        errors = np.where(flown.survival, flown.final_error, np.nan)  # in the order of the rows
+        np.testing.assert_allclose(np.sort(file["final_errors"][0]), np.sort(errors))
+    ((steps, median),) = logged(tmp_path / "PPO_1", "eval/final_error")
+    assert steps == 80 and median == pytest.approx(np.median(flown.final_error[flown.survival]))
+    assert f"survival {100 * flown.survival.mean():.1f} %, mean reward" in lines[0]
 
 
 def test_success_comes_before_reward(tmp_path, monkeypatch):
@@ -123,7 +140,7 @@ def test_a_training_that_goes_on_keeps_to_the_multiples(tmp_path):
     checkpoints = Checkpoint(60, str(tmp_path / "model_{steps}.zip"))
     model.learn(80, callback=[best, checkpoints], reset_num_timesteps=False)
     with np.load(tmp_path / "evaluations.npz") as file:
-        assert file["timesteps"].tolist() == [120]
+        assert file["timesteps"].tolist() == [120, 160]
     assert [entry.name for entry in tmp_path.glob("model_*")] == ["model_120.zip"]
 
 

@@ -23,6 +23,7 @@ from sb3_quad.cli import closing, main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
+from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
@@ -122,7 +123,9 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
     assert arguments_file["seed"] == 3
     assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {"max_episode_steps": 60, "noise": 0.1}
     with np.load(run / "evaluations.npz") as file:
-        assert file["timesteps"].tolist() == [400, 800, 1200, 1200]
+        assert file["timesteps"].tolist() == [400, 800, 1200]
+    lines = [line for line in output.splitlines() if " timesteps, " in line and " s: " in line]
+    assert len(lines) == 3 and all(line.count("survival") == 2 for line in lines)  # of both tasks
 
 
 @pytest.mark.parametrize("vec_env", ["batch", pytest.param("dummy", marks=pytest.mark.slow)])
@@ -168,10 +171,13 @@ def test_pybullet_gives_the_same_run_as_the_batch(tmp_path, vec_env):
 
 def test_other_environments_train_too(tmp_path):
     settings = {"n_timesteps": 128, "n_envs": 2, "n_steps": 32, "batch_size": 32}
-    config = build_config("ppo", "Pendulum-v1", settings)
-    result = train(TrainingJob(config=config, log_folder=str(tmp_path), eval_episodes=1), report=lambda line: None)
+    config, lines = build_config("ppo", "Pendulum-v1", settings), []
+    result = train(TrainingJob(config=config, log_folder=str(tmp_path), eval_episodes=1), report=lines.append)
     assert PPO.load(result.run.model).num_timesteps == 128
-    assert result.run.best_model.is_file()
+    assert result.run.best_model.is_file() and "successes" not in np.load(result.run.evaluations)
+    (line,) = lines
+    assert "mean reward" in line and "success" not in line
+    assert main(["plot", f"ppo={result.run.path}", "-o", str(tmp_path / "curves.svg")]) == 0
 
 
 @pytest.mark.slow
@@ -272,12 +278,6 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     )  # of other sizes
 
 
-def test_only_interrupted_runs_resume(trained_runs, capsys):
-    run = trained_runs("dagger")
-    assert main(["train", "--resume", str(run)]) == 2
-    assert f"-i {run}" in one_line_of_error(capsys)
-
-
 @pytest.mark.parametrize("algo", ["dagger", "ppo"])
 def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo):
     path = tmp_path / "diverging.yml"
@@ -342,3 +342,12 @@ def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_w
     seen.clear()
     closing.print_tables({"agent": agent}, job.flight_settings.in_any_task(), 4, 0)
     assert np.allclose(seen[0][:, 12:], -2.5)
+
+
+@pytest.mark.parametrize("task", [*TASKS, {"target_tracking": 3, "far_tracking": 1}])
+def test_any_task_has_a_closing_table(task):
+    config = build_config("ppo", ENV, {"n_timesteps": 1, "env_kwargs": {"task": task, "max_episode_steps": 2}})
+    table = closing.agent_and_expert(TrainingJob(config=config), lambda observation: np.zeros((len(observation), 4)))
+    assert table.title.startswith(task if isinstance(task, str) else "75% target_tracking, 25% far_tracking")
+    of_thesis = isinstance(task, str) and task in closing.SCENARIOS
+    assert [bool(column.source) for column in table.columns] == [False, False] + of_thesis * [True, True]

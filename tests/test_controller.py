@@ -8,13 +8,15 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 
-from sb3_quad.base.errors import ExpertError
+from sb3_quad import PPOBC, SACBC, DAgger
+from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.evaluation.scaling import AdaptiveScaling
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 class Stateful(gym.Env):
@@ -48,6 +50,20 @@ def test_the_true_state_is_collected_from_single_environments():
     labeller = Controller.for_env(FromState(), env)
     assert labeller.needs_state
     np.testing.assert_array_equal(labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "settings"),
+    [(DAgger, {"n_steps": 8}), (PPOBC, {"n_steps": 8, "batch_size": 16, "bc_coef": 1.0}), (SACBC, {"bc_coef": 1.0})],
+)
+def test_an_expert_can_be_a_name_and_is_made_for_the_vehicle_of_the_environments(algorithm, settings):
+    env = VecMonitor(QuadcopterVecEnv(2, vehicle="crazyflie", seed=0))
+    model = algorithm("MlpPolicy", env, expert="pid", device="cpu", **settings).learn(16)
+    labeller = Controller.for_env(model.expert, env, model._labeller)
+    assert labeller is model._labeller  # made once
+    assert isinstance(labeller.source, PIDExpert) and labeller.source.vehicle == load_vehicle("crazyflie")
+    with pytest.raises(ConfigError, match="unknown expert 'pidd': did you mean 'pid'"):
+        algorithm("MlpPolicy", env, expert="pidd", device="cpu", **settings).learn(16)
 
 
 @pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecNormalize(VecMonitor(env))])
@@ -121,7 +137,7 @@ class OnlyState:
     [
         (None, "no expert"),
         (PIDExpert, r"PIDExpert\(\)"),
-        ("pid", "must be a function"),
+        (3, "must be a function"),
         (OnlyState(), "true_state"),
     ],
 )

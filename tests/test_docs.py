@@ -9,6 +9,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
+import sb3_quad.training.trim
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 
@@ -60,22 +61,25 @@ def shorten_trainings(monkeypatch):
         return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args, **{**kwargs, "progress_bar": False})
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
+    monkeypatch.setattr(sb3_quad.training.trim, "trim", lambda model: None)  # which needs an agent that flies
 
 
 def check_output(page, output):
-    """A page shows the rewards that its code prints, to within what another seed changes; stage two raises each."""
+    """A page shows what its code prints, to within what another seed changes; stage two recovers more often."""
     (shown,) = re.findall(r"^```text\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    number = re.compile(r"-\d+\.\d")
+    number = re.compile(r"\d+\.\d+")
     assert number.sub("#", shown) in number.sub("#", output)
-    rewards = [[float(text) for text in number.findall(line)] for line in output.splitlines() if number.search(line)]
-    for line, printed in zip(shown.splitlines(), rewards, strict=True):
-        assert printed == pytest.approx([float(text) for text in number.findall(line)], abs=1.5)
-        assert printed[0] < printed[1]
+    ours, theirs = ([[float(each) for each in number.findall(line)] for line in text.splitlines()] for text in (output, shown))
+    for (survival, error), (shown_survival, shown_error) in zip(
+        [line for line in ours if len(line) == 2], theirs, strict=True
+    ):
+        assert survival == pytest.approx(shown_survival, abs=5.0) and error == pytest.approx(shown_error, abs=0.02)
+    assert theirs[-2][0] + 20 < theirs[-1][0]
 
 
 def check_readme(scope):
     assert scope["info"].keys() >= {"is_success", "distance"}
-    assert PPO.load("agent.zip", device="cpu").num_timesteps == 600_000
+    assert PPO.load("agent.zip", device="cpu").num_timesteps == 3_000_000
 
 
 def check_dagger(scope):
@@ -84,8 +88,7 @@ def check_dagger(scope):
 
 
 def check_ppo_bc(scope):
-    first, last = (PPO.load(path, device="cpu").policy.state_dict()["action_net.weight"] for path in scope["zips"])
-    assert not np.array_equal(first, last)
+    assert scope["model"].num_timesteps == 3_060_000
 
 
 def check_dynamics(scope):

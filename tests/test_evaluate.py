@@ -138,7 +138,9 @@ def test_table_results_and_episodes_agree(here, capsys):
 
 def test_a_folder_of_results_is_kept_or_written_anew(here, capsys):
     assert evaluate("a=pid", "b=pid", "--scenario", "tracking", "starts") == 0
-    before = times_of_change(here)
+    before, shown = times_of_change(here), capsys.readouterr().out
+    assert evaluate("a=pid", "b=pid", "--scenario", "tracking", "starts") == 0  # killed after the last flight, say
+    assert times_of_change(here) == before and capsys.readouterr().out.splitlines()[:10] == shown.splitlines()[:10]
     assert evaluate("a=pid", "--scenario", "tracking") == 2
     error = capsys.readouterr().err
     assert "holds results already; give another folder with -o" in error and error.count("\n") == 1
@@ -164,7 +166,7 @@ def test_an_interrupted_evaluation_goes_on_by_the_same_command_alone(here, capsy
             assert code == 2 and len(kept) == 3
             continue
         assert code == 0 and kept == (["pid", "pid"] if again == command else [])
-        assert len(load_results("out").entries) == 4 and load_results("out").unfinished is None
+        assert len(load_results("out").entries) == 4 and load_results("out").finished
         shutil.rmtree("out")
 
 

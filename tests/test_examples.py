@@ -55,7 +55,7 @@ def shares(output):
         ("coefficient_schedule.py", ["agent"], 95.0),
         ("flight_metrics.py", ["agent"], 95.0),
         ("trajectory_plots.py", ["agent"], 95.0),
-        ("train_dagger.py", ["agent, state_recovery", "agent, target_tracking"], 95.0),
+        ("train_dagger.py", ["agent, target_tracking"], 95.0),
     ],
 )
 def test_agents_succeed(run, name, agents, success):
@@ -68,7 +68,8 @@ def test_agents_succeed(run, name, agents, success):
         assert found[agent][0] >= success and found[agent][1] >= 97.0, found
     if name == "train_dagger.py":
         better = shares(run("train_ppo_bc.py", "dagger.zip"))
-        assert all(min(better[agent]) >= 97.0 for agent in agents), better
+        assert better["agent, target_tracking"][0] >= 95.0, better
+        assert better["agent, state_recovery"][1] >= max(88.25, found["agent, state_recovery"][1] + 20), "the thesis's, better"
 
 
 def test_imitation_then_stage_two_then_stock_sb3(run, tmp_path):
@@ -89,6 +90,11 @@ def test_own_experts_and_vehicles_recover(run, name):
     found = shares(output)
     teacher = found["own expert" if name == "own_expert.py" else "geometric"]
     assert min(teacher) > 99.0 and teacher > found["PID"] and "agent" in found
+
+
+@pytest.mark.slow
+def test_thesis_readings(run):
+    assert run("thesis_readings.py").count("of 240 recoveries survive") == 6
 
 
 def test_own_callback(run):

@@ -10,12 +10,14 @@ from hypothesis import strategies as st
 
 import sb3_quad  # noqa: F401  (registers the environments)
 from sb3_quad.base.errors import ConfigError, ExpertError
+from sb3_quad.base.imports import import_packages
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY, QuadcopterState
+from sb3_quad.training.values import import_class
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 TO_R0 = np.array([0.0, 0.0, 15.0])
@@ -125,6 +127,28 @@ def test_actions_are_always_valid(expert, data):
     assert np.isfinite(actions).all() and np.abs(actions).max() <= 1.0
 
 
+def test_a_module_of_the_present_folder_is_found_where_only_installed_ones_are_searched(tmp_path, monkeypatch):
+    """As in an installed command; it comes last on the path, so that nothing there replaces an installed module."""
+    (tmp_path / "my_own.py").write_text(
+        "from stable_baselines3.common.callbacks import BaseCallback as Callback\nfrom sb3_quad import PIDExpert as Pilot\n"
+    )
+    (tmp_path / "torch.py").write_text("raise AssertionError('imported from the present folder')\n")
+    before = [path for path in sys.path if path not in ("", str(tmp_path))]
+    monkeypatch.chdir(tmp_path)
+    for use in (
+        lambda: resolve_expert("my_own:Pilot"),
+        lambda: import_class("my_own.Callback", "callback"),
+        lambda: import_packages(["my_own"], "--gym-packages"),
+    ):
+        monkeypatch.setattr(sys, "path", [*before])
+        monkeypatch.delitem(sys.modules, "my_own", raising=False)
+        use()
+        assert sys.path == [*before, str(tmp_path)]
+    monkeypatch.setattr(sys, "path", [*before])
+    import_packages(["torch"], "--gym-packages")
+    assert sys.path == before
+
+
 def test_experts_by_name(tmp_path, monkeypatch):
     assert isinstance(resolve_expert("pid"), PIDExpert) and isinstance(resolve_expert("geometric"), GeometricExpert)
     module = types.ModuleType("my_experts")
@@ -151,3 +175,17 @@ def test_wrong_observations_and_gains_are_named():
         PIDExpert().predict(np.zeros(17))
     with pytest.raises(ConfigError, match="kp"):
         PIDExpert(kp=-1)
+
+
+def test_the_readings_of_the_thesis_contain_ours_and_agree_near_level():
+    from thesis_readings import PIDReading, zyx_body
+
+    rng = np.random.default_rng(0)
+    flying = QuadcopterVecEnv(300, task="state_recovery", noise=0.0, seed=0)
+    flying.reset()
+    state = flying.true_state()
+    np.testing.assert_array_equal(zyx_body("itm").actions(state), PIDExpert().actions(state))
+    state.array[QUATERNION] = np.vstack([np.ones(300), 1e-4 * rng.normal(size=(3, 300))])
+    ours = PIDExpert().actions(state)
+    for order in ("zyx", "zxy", "xyz"):
+        np.testing.assert_allclose(PIDReading("itm", order, "world").actions(state), ours, atol=0.02)

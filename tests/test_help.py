@@ -1,4 +1,4 @@
-"""Every command's help shows examples, and these are command lines that the command takes."""
+"""Every command's help shows examples, and these are command lines that the command takes; what none takes is answered."""
 
 import re
 import shlex
@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from sb3_quad.base.errors import did_you_mean
+from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS, EPILOG, make_parser
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.training.algorithms import ALGORITHMS
@@ -44,3 +46,65 @@ def test_examples_are_taken(name):
 @pytest.mark.parametrize("name", list(COMMANDS))
 def test_the_readme_lists_every_command(name):
     assert f"`sb3-quad {name}" in README
+
+
+TASKS = ("far_tracking", "state_recovery", "target_tracking")
+
+
+@pytest.mark.parametrize(
+    ("given", "valid", "meant"),
+    [
+        ("state_recovry", TASKS, ["state_recovery"]),
+        ("tracking", TASKS, ["far_tracking", "target_tracking"]),
+        ("hover", TASKS, []),
+        ("imt", ("crazyflie", "itm"), ["itm"]),
+        ("Learning_Rtae", ("learning_rate",), ["learning_rate"]),
+        ("reference.yml", ("thesis/reference.yml", "dagger.yml"), ["thesis/reference.yml"]),
+        ("nothere.yml", ("thesis/reference.yml", "dagger.yml"), []),
+        ("a2c", ("dagger", "ppo", "sac"), []),
+        ("bc_coef", ("ent_coef", "vf_coef"), []),
+        ("--learning-rate", ("--eval-freq", "--seed"), []),
+        ("-x", ("-f", "-n"), []),
+        ("n", ("n_envs", "n_epochs", "n_steps", "n_timesteps"), []),  # too many to help
+        ("", TASKS, []),
+        ("anything", (), []),
+    ],
+)
+def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_random(given, valid, meant):
+    assert did_you_mean(given, valid) == (f"did you mean {' or '.join(map(repr, meant))}? " if meant else "")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("train --n-timestep 5", "option '--n-timestep': did you mean '--n-timesteps'?"),
+        (
+            "train --learning-rate 1e-3",
+            "option '--learning-rate': a hyperparameter is given as --hyperparams learning_rate:1e-3,",
+        ),
+        ("tune --gamma=0.9 -n 5", "--hyperparams gamma:0.9, a keyword of the environment as --env-kwargs gamma:0.9"),
+        ("train --gamma -n 5", "--hyperparams gamma:VALUE,"),
+        ("train -optimize", "option '-optimize': the command sb3-quad tune does that"),
+        ("train --optimize-hyperparameters", "the command sb3-quad tune does that"),
+        ("train --sampler tpe", "option '--sampler': it belongs to sb3-quad tune"),
+        ("train --track", "docs/zoo.md"),
+        ("report folder --nothing", "option '--nothing': see --help, and docs/zoo.md"),
+        ("train 5", "argument '5': see --help"),
+        ("train --algo a2c", "algorithm 'a2c': (valid: dagger,"),
+        ("train --conf-file nothere.yml", "settings file 'nothere.yml': (valid: any_quadcopter/dagger.yml,"),
+        ("train --hyperparams bc_coef:1 --algo dagger", "key of dagger 'bc_coef': (valid: batch_size,"),
+        (
+            "enjoy pid --task tracking --no-render",
+            "did you mean 'far_tracking' or 'recovery_and_tracking' or 'target_tracking'?",
+        ),
+        (
+            "enjoy --algo ppo -f nowhere --no-render",
+            "nowhere/ppo: there is no run of QuadTargetTracking-v0; give another place with --env",
+        ),
+    ],
+)
+def test_what_is_unknown_is_answered_by_what_helps(arguments, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(shlex.split(arguments)) == 2
+    said = capsys.readouterr().err
+    assert message in said and said.startswith("error: ") and said.count("\n") == 1

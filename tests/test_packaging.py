@@ -122,13 +122,9 @@ def test_package_dir_leads_to_the_package(options):
         assert (ROOT / mapping[prefix]).joinpath(*name.removeprefix(prefix).split(".")) == folder
 
 
-@pytest.mark.parametrize("file", ["constraints.txt", "constraints-zoo.txt"])
-def test_each_dependency_is_pinned(options, file):
-    """Those of some extras in a file of their own: rl_zoo3 contradicts the others, and the environment of both has it."""
-    extras = dict(options["options.extras_require"])
-    zoo = "".join(extras.pop(name) for name in APART)
-    wanted = zoo if "zoo" in file else "".join([options["options"]["install_requires"], *extras.values()])
-    pins = [line.split("==")[0] for line in (ROOT / file).read_text().splitlines() if "==" in line]
+def test_each_dependency_is_pinned(options):
+    wanted = "".join([options["options"]["install_requires"], *options["options.extras_require"].values()])
+    pins = [line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
     assert requirements(wanted) <= set(pins)
     assert len(pins) == len(set(pins))
 
@@ -137,7 +133,8 @@ def test_the_extra_for_developers_holds_all_but_those_apart(options):
     extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
     assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", *APART))) - {"torch"}
     assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
-    assert all(f"`pip install '.[{name}]'`" in (ROOT / "README.md").read_text(encoding="utf-8") for name in extras)
+    readme, tried = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", ".ci/extras"))
+    assert all(f"| `[{name}]` |" in readme and re.search(rf"^ +{name}\)", tried, re.MULTILINE) for name in extras)
 
 
 def test_extras_are_installed_from_a_clone(options):
@@ -145,7 +142,7 @@ def test_extras_are_installed_from_a_clone(options):
     code = [path for name in CODE for path in (ROOT / name).rglob("*.py")]
     for path in [ROOT / "README.md", *ROOT.glob("docs/*.md"), *code]:
         for written in re.findall(r"pip install [^`\n]*\[[^`\n]*", path.read_text(encoding="utf-8")):
-            named = re.match(r"pip install '\.\[(\w+|\{extra\})\]'", written)
+            named = re.match(r"pip install (?:-c constraints.txt )?'\.\[(\w+|\{extra\})\]'", written)
             assert named, f"{path}: {written}"
             assert named[1] in (*options["options.extras_require"], "{extra}"), f"{path}: {written}"
 

@@ -6,6 +6,7 @@ from conftest import legends_cover_nothing
 
 from sb3_quad.cli import main
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
+from sb3_quad.report import curves
 from sb3_quad.report.curves import plot_curves
 
 EXPERT = {"expert": {"success": 0.3, "reward": -5.0}}
@@ -56,6 +57,13 @@ def test_the_command_writes_a_picture(runs, capsys):
     assert picture.read_text(encoding="utf-8").count("<svg") == 1 and "curves.svg" in capsys.readouterr().out
 
 
+def test_a_run_folder_alone_is_called_by_its_path(runs, monkeypatch):
+    named = {}
+    monkeypatch.setattr(curves, "plot_curves", lambda groups, *rest: named.update(groups) or plot_curves(groups, *rest))
+    assert main(["plot", f"{runs}/Env_1", f"{runs}/Env_2/", "-o", str(runs / "curves.svg")]) == 0
+    assert {name: len(found) for name, found in named.items()} == {f"{runs.name}/Env_1": 1, f"{runs.name}/Env_2": 1}
+
+
 def test_losses_and_survival_are_drawn_where_a_run_has_them(runs):
     path = runs / "Env_1" / "evaluations.npz"
     more = {"survivals": np.ones((2, 2)), "train/bc_loss": np.array([np.nan, 0.25])}
@@ -80,8 +88,9 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["agent=nowhere/*"], "no folder fits"),
-        (["agent"], "give NAME=PATTERN"),
+        (["agent=nowhere/*"], "'agent=nowhere/*': no such folder"),
+        (["agent"], "or NAME=PATTERN"),
+        (["agent={runs}/Env_1", "agent={runs}/Env_2"], "'agent': two are called so"),
         (["agent={runs}/Env_1", "-o", "curves.gif"], "must end in"),
         (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
         (["agent={runs}"], "no such file"),

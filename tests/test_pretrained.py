@@ -213,7 +213,7 @@ def test_publish_refuses_what_it_cannot_describe(dagger_run, tmp_path, capsys):
     for arguments, message in (
         ([str(tmp_path / "none.zip"), "--name", "x"], "no such file"),
         ([str(tmp_path), "--name", "x"], "no run with an agent"),
-        ([str(source), "--name", "a/b"], "without folders"),
+        *(([str(source), "--name", name], "--name") for name in ("", "..", "a/b", "two\nlines")),
         ([str(source), "--name", "x", "--episodes", "0"], "must be at least 1"),
     ):
         assert publish.main([*arguments, "--command", "typed so", "-o", str(tmp_path / "out")]) == 2

@@ -15,6 +15,7 @@ from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
+from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -228,7 +229,15 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: env.set_noise(-1), "noise"),
         (lambda env: QuadcopterEnv(observation_std=np.zeros(18)), "observation_std"),
         (lambda env: QuadcopterEnv(task="target_trackin"), "did you mean 'target_tracking'"),
-        (lambda env: QuadcopterEnv(noize=0), "QuadcopterEnv: unknown key 'noize': did you mean 'noise'"),
+        (lambda env: QuadcopterEnv(noize=0), "QuadcopterEnv: unknown keyword 'noize': did you mean 'noise'"),
+        (
+            lambda env: QuadcopterEnv(rendermode="human"),
+            "QuadcopterEnv: .* 'rendermode': did you mean 'render_mode'",
+        ),
+        (
+            lambda env: QuadcopterVecEnv(1, nthreads=1),
+            "QuadcopterVecEnv: .* 'nthreads': did you mean 'n_threads'",
+        ),
         (lambda env: QuadcopterEnv(vehicle="itn"), "did you mean 'itm'"),
         (lambda env: QuadcopterEnv(render_mode="rgb_aray"), "did you mean 'rgb_array'"),
     ],

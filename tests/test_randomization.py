@@ -279,7 +279,7 @@ def test_a_reserve_is_for_a_told_expert_and_not_negative(told, reserve):
         ({"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}}, "greater than 0"),
         ("mass", "randomize"),
         ({"vehicles": {"distribution": "rapter"}}, "vehicle distribution 'rapter'"),
-        ({"vehicles": {**RAPTOR, "mass": [0, 2]}}, "greater than 0"),
+        ({"vehicles": {**RAPTOR, "mass": [0, 2]}}, "greater than"),
         ({"vehicles": {**RAPTOR, "thrust_to_weight": [0.9, 2]}}, "cannot hover"),
         ({"vehicles": {**RAPTOR, "motor_time_constant": 0.001}}, "motor_gain"),
         ({"vehicles": {**RAPTOR, "inertia_ratios": [1, 1, 5]}}, "rigid body"),

@@ -2,9 +2,12 @@
 
 import inspect
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
+from gymnasium import spaces
+from gymnasium.wrappers import TransformObservation
 from stable_baselines3 import PPO, SAC, TD3, HerReplayBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -51,6 +54,24 @@ def test_labels_go_with_n_step_returns():
     data = pendulum(bc_coef=0.5, n_steps=3).learn(400).replay_buffer.sample(300)
     np.testing.assert_allclose(2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5)
     assert (data.discounts.numpy() < 0.99).any()
+
+
+def test_dict_observations_are_cloned_as_sac_takes_them():
+    def make():
+        observed = spaces.Dict(pole=spaces.Box(-1.0, 1.0, (2,)), rate=spaces.Box(-8.0, 8.0, (1,)))
+        return TransformObservation(gym.make("Pendulum-v1"), lambda o: {"pole": o[:2], "rate": o[2:]}, observed)
+
+    def expert(observation):
+        return swing_up(np.hstack([observation["pole"], observation["rate"]]))
+
+    given = {**SMALL, "learning_starts": 0, "expert": expert, "bc_coef": 0.5}
+    model = SACBC("MultiInputPolicy", make_vec_env(make, 4, seed=0), **given).learn(400)
+    data = model.replay_buffer.sample(300)
+    parts = {name: values.numpy() for name, values in data.observations.items()}
+    np.testing.assert_allclose(2.0 * data.expert_actions.numpy(), expert(parts), atol=1e-5)
+    assert model.logger.name_to_value["train/bc_loss"] > 0.0
+    with pytest.raises(ConfigError, match=r"n_steps 3: .*Dict"):
+        SACBC("MultiInputPolicy", make_vec_env(make, 4), n_steps=3)
 
 
 def test_labels_lie_beside_the_actions_of_the_same_state():

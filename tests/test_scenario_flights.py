@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.evaluation.evaluate import fly_scenario
@@ -13,6 +14,7 @@ from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
+from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.statistics import mean, share
 from sb3_quad.experts.pid import PIDExpert
@@ -156,10 +158,20 @@ def test_the_expert_reaches_the_specified_metrics(name, times, path):
 
 
 def test_the_expert_is_lost_where_the_specification_says():
-    assert specified("recovery_s1", 1)[0].flown.value == pytest.approx(1.78, rel=0.01)
-    assert specified("recovery_s2", 1)[0].flown.value == pytest.approx(1.46, rel=0.01)
+    assert specified("recovery_s1_world", 1)[0].flown.value == pytest.approx(1.78, rel=0.01)
+    assert specified("recovery_s2_world", 1)[0].flown.value == pytest.approx(1.46, rel=0.01)
     assert specified("side_hit", 1)[0].survival.value == 0.0
     assert specified("constant_force", 1)[0].final_error.value == pytest.approx(5.6, rel=0.01)
+
+
+def test_velocity_in_the_body_frame_turns_with_the_vehicle():
+    """The thesis's outcomes of s1 and s2 (4.3.2) come out: docs/choices.md."""
+    assert specified("recovery_s1", 1)[0].flown.value == pytest.approx(1.71, rel=0.01)
+    assert specified("recovery_s2", 1)[0].survival.value == 1.0
+    start = sample_plan(load_suite("thesis").scenario("recovery_s1"), [0]).start
+    np.testing.assert_allclose(start["velocity"], [[2, -2, 0]], atol=1e-12)  # half a turn about x
+    with pytest.raises(ConfigError, match="velocity_frame"):
+        scenario("start: {attitude: uniform, velocity_frame: body}")
 
 
 def test_the_expert_recovers_as_often_as_specified():

@@ -298,7 +298,7 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
         (["pdi", "--no-render"], "did you mean 'pid'"),
         (["nowhere.zip", "--no-render"], "no such file"),
         (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
-        (["pid", "--task", "recovery", "--no-render"], "did you mean 'state_recovery'"),
+        (["pid", "--task", "state-recovery", "--no-render"], "did you mean 'state_recovery'"),
         (["pid", "--task", "state_recovery", "--scenario", "thesis:side_hit", "--no-render"], "not allowed with"),
         (["pid", "--scenario", "thesis:side_hitt", "--no-render"], "did you mean 'side_hit'"),
         (["pid", "--scenario", "side_hit", "--no-render"], "suite:name"),

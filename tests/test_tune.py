@@ -272,8 +272,8 @@ def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("algo", "file"),
     [
-        *(("dagger", name) for name in ("dagger.yml", "pid/dagger.yml", "nominal/dagger.yml", "thesis/dagger.yml")),
-        *(("ppo_bc", name) for name in ("ppo_bc.yml", "nominal/ppo_bc.yml", "pid/ppo_bc.yml", "thesis/ppo_bc.yml")),
+        *(("dagger", name) for name in ("dagger.yml", "robust/dagger.yml", "nominal/dagger.yml", "thesis/dagger.yml")),
+        *(("ppo_bc", name) for name in ("ppo_bc.yml", "nominal/ppo_bc.yml", "robust/ppo_bc.yml", "thesis/ppo_bc.yml")),
         ("ppo", "ppo.yml"),
     ],
 )

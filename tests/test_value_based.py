@@ -83,7 +83,7 @@ def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, short_clone):
         "name": "one",
         "algo": "dagger",
         "env": ENV,
-        "conf_file": "pid/dagger.yml",
+        "conf_file": "dagger.yml",
         "settings": {"n_steps": 16, "batch_size": 64},
     }
     tiny = {key: TINY[key] for key in ("batch_size", "train_freq", "buffer_size")}

@@ -15,11 +15,12 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.notices import tell
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.simulation.compiled import _tell, compile_notice
+from sb3_quad.simulation.compiled import compile_notice
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 TASKS = ("target_tracking", "state_recovery")
@@ -193,7 +194,7 @@ def test_compiling_is_told_where_something_is_compiled_and_nowhere_else(capsys):
     def doubled(x):
         return x + x
 
-    _tell.cache_clear()
+    tell.cache_clear()
     with compile_notice():
         pass
     assert capsys.readouterr().err == ""

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from sb3_quad.base.errors import CannotHover, ConfigError
+from sb3_quad.cli import main
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import PARAMETER_NAMES, VEHICLES, Vehicle, load_vehicle
@@ -193,6 +194,16 @@ def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
     with pytest.raises(ConfigError, match=r"bad\.yaml") as caught:
         load_vehicle(path)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("excess", [0.001, 0.049, 0.06])
+def test_a_little_too_large_a_moment_is_a_warning_and_more_is_refused(tmp_path: Path, capfd: Any, excess: float) -> None:
+    path = write(tmp_path / "own.yaml", inertia=[0.01, 0.01, 0.02 * (1.0 + excess)], geometric_gains=None)
+    arguments = ["check-vehicle", str(path), "-n", "0"]
+    assert main(arguments) == (2 if excess > 0.05 else 0)
+    said = capfd.readouterr()
+    assert said.err.count("\n") == 1 and f"here by {100 * excess:.2g} %" in said.err and str(path) in said.err
+    assert ("warning" in said.err) == (excess < 0.05) == ("unphysical" in said.out)
 
 
 def test_unknown_name_gives_the_nearest() -> None:

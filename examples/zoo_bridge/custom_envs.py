@@ -1,6 +1,6 @@
 """Lets rl_zoo3's own scripts train and show our algorithms: it imports a module of this name, if there is one.
 
-    pip install '.[zoo]'                                                     # from a clone
+    pip install -c constraints.txt '.[zoo]'                                  # from a clone
     PYTHONPATH=examples/zoo_bridge rl_zoo3 train --algo ppo_bc --env QuadStateRecovery-v0
 
 In a program, ``import custom_envs`` comes before anything imported from rl_zoo3. What becomes of our settings is said in

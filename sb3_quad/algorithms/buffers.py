@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer, RolloutBuffer
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
@@ -49,11 +49,11 @@ class ExpertRolloutBuffer(RolloutBuffer):
 
 
 class ExpertReplaySamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions."""
+    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions; Dict observations by key."""
 
-    observations: th.Tensor
+    observations: th.Tensor | dict[str, th.Tensor]
     actions: th.Tensor
-    next_observations: th.Tensor
+    next_observations: th.Tensor | dict[str, th.Tensor]
     dones: th.Tensor
     rewards: th.Tensor
     discounts: th.Tensor | None
@@ -84,6 +84,10 @@ class ExpertReplayBuffer(ReplayBuffer):
 
 class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
     """The same with SB3's n-step returns."""
+
+
+class ExpertDictReplayBuffer(ExpertReplayBuffer, DictReplayBuffer):  # type: ignore[misc]
+    """The same for Dict observations."""
 
 
 class AggregatedDataset:

@@ -54,7 +54,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
     :param env: The environment to learn from (if registered in Gym, can be str)
     :param expert: Whose actions are learnt: an object with ``actions(state)`` such as ``GeometricExpert``, another SB3
         model, or a function from observations to actions; :class:`~sb3_quad.controllers.controller.Controller` says what
-        each is shown. It is never saved: give it to ``load`` again, or call :meth:`set_expert`, before learning continues
+        each is shown. Or a name as YAML takes it, such as ``"pid"``. It is never saved: give it to ``load`` again, or call
+        :meth:`set_expert`, before learning continues
     :param batch_size: Minibatch size, in pairs of the dataset
     :param n_epochs: Passes of the critic over each rollout; and of the actor, over as many pairs as a rollout holds,
         unless ``gradient_steps`` says otherwise

@@ -35,7 +35,8 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
     model loads with ``PPO.load``, even where this package is not installed.
 
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
-        an SB3 model, or a callable from observations to actions. Needed when learning starts with a cloning weight.
+        an SB3 model, or a callable from observations to actions; or a name as YAML takes it, such as ``"pid"``. Needed when
+        learning starts with a cloning weight.
     :param bc_coef: c_BC, the weight of the cloning term: a float or a schedule of the remaining progress (SB3's
         ``LinearSchedule(0.1, 0.0, 0.5)`` falls from 0.1 to 0 over the first half).
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum over the action's
@@ -178,7 +179,7 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
     def _check_cloning(self) -> None:
         if self.expert is None:
             raise ExpertError(
-                "PPOBC needs an expert to clone: PPOBC(..., expert=GeometricExpert()), model.set_expert(...), or bc_coef=0"
+                "PPOBC needs an expert to clone: PPOBC(..., expert='geometric'), model.set_expert(...), or bc_coef=0"
             )
         if self.use_sde and self.bc_loss == "nll":
             raise ConfigError("use_sde: bc_loss 'nll' needs a diagonal Gaussian policy; use bc_loss='mse', for example")

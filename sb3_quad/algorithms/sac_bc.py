@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import torch as th
+from gymnasium import spaces
 from stable_baselines3 import SAC
-from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import ContinuousCritic
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
@@ -15,7 +16,12 @@ from stable_baselines3.sac.policies import SACPolicy
 from torch import nn
 from torch.nn import functional as F
 
-from sb3_quad.algorithms.buffers import ExpertNStepReplayBuffer, ExpertReplayBuffer, ExpertReplaySamples
+from sb3_quad.algorithms.buffers import (
+    ExpertDictReplayBuffer,
+    ExpertNStepReplayBuffer,
+    ExpertReplayBuffer,
+    ExpertReplaySamples,
+)
 from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero
 from sb3_quad.algorithms.networks.losses import CloningLoss, agree, cloning_errors
 from sb3_quad.base.arrays import BoolArray, Float32Array
@@ -31,7 +37,7 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
     All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the additions at their defaults it is
     SAC, bit for bit. A saved model loads with ``SAC.load``, even where this package is not installed. For any environment with
-    a Box action space; with cloning, observations that are no Dict.
+    a Box action space.
 
     What is added, with its source:
 
@@ -44,9 +50,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
     ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair et al.
     =====================  ============================================================================================
 
-    :param expert: who labels: an object with ``actions(state)`` on the true state of our
-        environments, an SB3 model, or a function from observations to actions. It is never saved. Needed when learning starts
-        with cloning.
+    :param expert: who labels: an object with ``actions(state)`` on the true state of our environments, an SB3 model, or a
+        function from observations to actions; or a name as YAML takes it, such as ``"pid"``. It is never saved. Needed when
+        learning starts with cloning.
     :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a schedule of the remaining
         progress.
     :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear beyond 0.05;
@@ -148,15 +154,18 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
     def _setup_model(self) -> None:
         self.bc_coef = FloatSchedule(self.bc_coef)
         self._clones = is_ever_nonzero(self.bc_coef)
+        if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
+            raise ConfigError(f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict observations; give 1")
         if self._clones:
-            self._refuse_dict_observations()
-            if self.replay_buffer_class not in (None, ReplayBuffer, NStepReplayBuffer):
+            if self.replay_buffer_class not in (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer):
                 raise ConfigError(f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's actions")
             kind = ExpertReplayBuffer if self.n_steps == 1 else ExpertNStepReplayBuffer
+            if isinstance(self.observation_space, spaces.Dict):
+                kind = ExpertDictReplayBuffer
             returns = {} if self.n_steps == 1 else {"n_steps": self.n_steps, "gamma": self.gamma}
-            spaces = self.observation_space, self.action_space
+            both = self.observation_space, self.action_space
             memory = self.device, self.n_envs, self.optimize_memory_usage
-            self.replay_buffer = kind(self.buffer_size, *spaces, *memory, **self.replay_buffer_kwargs, **returns)
+            self.replay_buffer = kind(self.buffer_size, *both, *memory, **self.replay_buffer_kwargs, **returns)
         super()._setup_model()
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
@@ -298,7 +307,7 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
     def _prepare_to_learn(self, anew: bool) -> None:
         if self.will_clone() and self.expert is None:
-            raise ExpertError("SACBC needs an expert: SACBC(..., expert=GeometricExpert()) or model.set_expert(...)")
+            raise ExpertError("SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)")
         if anew or self._last_obs is None:  # the environments begin anew
             self._starts = self._labeller = None
 

@@ -3,7 +3,7 @@
 Each message is one line that names the thing and the way out; the command line prints it and leaves with code 2.
 """
 
-import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -44,12 +44,43 @@ class ExportError(SB3QuadError, RuntimeError):
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
-    """The message for an unknown ``name``: the nearest valid one and the whole list.
+    """The message for an unknown ``name``: what it may be a slip of, and the whole list.
 
     >>> unknown("task", "state_recovry", ["target_tracking", "state_recovery"])
     "unknown task 'state_recovry': did you mean 'state_recovery'? (valid: state_recovery, target_tracking)"
     """
     names = sorted(str(option) for option in valid)
-    close = difflib.get_close_matches(str(name), names, n=1, cutoff=0.4)
-    hint = f"did you mean {close[0]!r}? " if close else ""
-    return f"unknown {kind} {str(name)!r}: {hint}(valid: {', '.join(names)})"
+    return f"unknown {kind} {str(name)!r}: {did_you_mean(name, names)}(valid: {', '.join(names)})"
+
+
+def did_you_mean(name: object, valid: Iterable[str]) -> str:
+    """The valid name that ``name`` misspells, or those few that it is a part of, as a question; empty if there is none.
+
+    >>> did_you_mean("tracking", ["far_tracking", "state_recovery", "target_tracking"])
+    "did you mean 'far_tracking' or 'target_tracking'? "
+    """
+    text, names = str(name).lower(), sorted(valid)
+    letters = sum(map(str.isalnum, text))
+    most = min(max(1, letters // 4), letters - 1)  # slips
+    near = {each: _edit_distance(text, each.lower()) for each in names if abs(len(each) - len(text)) <= most}
+    found = [each for each in sorted(near, key=near.__getitem__)[:1] if near[each] <= most]
+    if not found and (parts := _parts(text)):
+        found = [each for each in names if parts <= _parts(each.lower())]
+    return f"did you mean {' or '.join(map(repr, found))}? " if 0 < len(found) <= 3 else ""
+
+
+def _parts(text: str) -> set[str]:
+    return {*re.findall(r"[^\W_]+", text)}
+
+
+def _edit_distance(given: str, meant: str) -> int:
+    """How many letters left out, added, replaced, or swapped with the next make one text the other."""
+    rows: list[list[int]] = [[*range(len(meant) + 1)]]
+    for i, letter in enumerate(given):
+        rows.append([i + 1])
+        for j, other in enumerate(meant):
+            least = min(rows[i][j + 1] + 1, rows[i + 1][j] + 1, rows[i][j] + (letter != other))
+            if i > 0 and j > 0 and letter == meant[j - 1] and other == given[i - 1]:
+                least = min(least, rows[i - 1][j - 1] + 1)
+            rows[i + 1].append(least)
+    return rows[-1][-1]

@@ -1,6 +1,9 @@
 """Imports that wait until they are needed, and those of packages that only some commands need."""
 
 import importlib
+import importlib.util
+import os
+import pkgutil
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -26,6 +29,19 @@ def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str]
     return get, names
 
 
+def import_name(text: str) -> Any:
+    """What is at ``package.module:name`` or ``package.module.name``, which the user names."""
+    search_present_folder(text.partition(":")[0])
+    return pkgutil.resolve_name(text)
+
+
+def search_present_folder(module: str) -> None:
+    """Let a module that is not installed be imported from the present folder, where installed commands do not look."""
+    here = os.getcwd()
+    if here not in sys.path and importlib.util.find_spec(module.partition(".")[0]) is None:
+        sys.path.append(here)
+
+
 def import_packages(packages: Iterable[str], where: str) -> None:
     """Import modules that the user names, as those that register further environments.
 
@@ -34,6 +50,7 @@ def import_packages(packages: Iterable[str], where: str) -> None:
     """
     for package in packages:
         try:
+            search_present_folder(package)
             importlib.import_module(package)
         except (Exception, SystemExit) as error:  # whatever the module does when it is imported
             raise ConfigError(f"{where} {package}: cannot be imported ({type(error).__name__}: {error})") from None

@@ -45,7 +45,7 @@ def read_record(path: Path, model: type[Model]) -> Model:
     text = read_text(path)
     try:
         return validate(model, json.loads(text), "damaged, or of another version")
-    except ValueError as error:  # no JSON, or no such record
+    except (ValueError, RecursionError) as error:  # no JSON, or no such record
         raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None
 
 

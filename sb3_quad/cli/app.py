@@ -5,7 +5,7 @@ import io
 import pkgutil
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Container, Sequence
 from pathlib import Path
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
@@ -44,10 +44,13 @@ def make_parser() -> Parser:
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"sb3_quad {__version__}")
     subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
+    siblings: dict[str, Container[str]] = {}
     for name, command in COMMANDS.items():
         summary, _, rest = (command.__doc__ or "").partition("\n\n")
         subparser = subparsers.add_parser(name, help=summary, description=summary, epilog=rest)
         command.add_arguments(subparser)
+        subparser.siblings = siblings
+        siblings[name] = subparser._option_string_actions
     return parser
 
 

@@ -16,6 +16,7 @@ from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.tasks import in_words
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
@@ -37,11 +38,13 @@ def task_table(
     """
     seeds = row_seeds(seed, n)
     measured = [metric_cells(summarise(fly_settings(each, settings, seeds))) for each in controllers.values()]
-    scenario = load_suite("thesis").scenario(SCENARIOS[settings.task])
-    shown = [name for name in beside if name in scenario.reference and settings.vehicle == THESIS_VEHICLE]
+    task = in_words(settings.task)
+    scenario = load_suite("thesis").scenario(SCENARIOS.get(task, SCENARIOS["target_tracking"]))  # whose rows others have, too
+    of_thesis = task in SCENARIOS and settings.vehicle == THESIS_VEHICLE
+    shown = [name for name in beside if of_thesis and name in scenario.reference]
     columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
     rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
-    title = f"{settings.task}: {n} fresh episodes, the same for all" + ("" if settings.noise else ", true state")
+    title = f"{task}: {n} fresh episodes, the same for all" + ("" if settings.noise else ", true state")
     return Table(columns, rows, title=title, caption=CAPTION)
 
 
@@ -62,7 +65,10 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     settings = job.flight_settings
-    controllers = {"agent": model, "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle)}
+    controllers = {
+        "agent": model,
+        "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle, layout=settings.rotor_layout),
+    }
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))
 
@@ -87,7 +93,9 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     if result.exit_code != 0:
         return result.exit_code
     flown = result.job.flight_settings
-    controllers = {"expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle)}
+    controllers = {
+        "expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout)
+    }
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
     beside = ("expert", "IL-agent", "RL-agent")
     print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)

@@ -4,17 +4,26 @@ import argparse
 import math
 import random
 import typing
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any, NoReturn
 
 from pydantic import BaseModel
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
+
+_BRIDGE = "Weights & Biases needs rl_zoo3 itself and the bridge, docs/zoo.md"
+ELSEWHERE = {
+    **dict.fromkeys(("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that"),
+    **dict.fromkeys(("--track", *(f"--wandb-{name}" for name in ("project-name", "entity", "group", "tags"))), _BRIDGE),
+}
+"""Flags of rl_zoo3 that no command has, and what has their part."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that raises ConfigError, and names the nearest option to an unknown one."""
+    """An ArgumentParser that raises ConfigError, and says what may be meant by an unknown option."""
+
+    siblings: Mapping[str, Container[str]] = {}  # by command: its options
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs})
@@ -30,10 +39,25 @@ class Parser(argparse.ArgumentParser):
         """
         options, rest = super().parse_known_args(args, namespace)
         if rest:
-            valid = [option for action in self._actions for option in action.option_strings]
-            says = unknown("option", rest[0].split("=")[0], valid).split("(valid:")[0].rstrip(": ")
-            raise ConfigError(f"{says}; see --help, and docs/zoo.md for flags of rl_zoo3")
+            option, _, value = rest[0].partition("=")
+            kind = "option" if option.startswith("-") else "argument"
+            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option, value or [*rest, ''][1])}")
         return options, rest
+
+    def _advice(self, option: str, value: str) -> str:
+        """What to give instead of an unknown option."""
+        valid = self._option_string_actions
+        owners = [f"sb3-quad {name}" for name, options in self.siblings.items() if option in options]
+        if option in ELSEWHERE:
+            return ELSEWHERE[option]
+        if hint := did_you_mean(option, valid):
+            return hint.strip()
+        if owners:
+            return f"it belongs to {' and '.join(owners)}"
+        if "--hyperparams" in valid and option.startswith("--"):
+            pair = f"{option.strip('-').replace('-', '_')}:{'VALUE' if value[:1] in ('', '-') else value}"
+            return f"a hyperparameter is given as --hyperparams {pair}, a keyword of the environment as --env-kwargs {pair}"
+        return "see --help, and docs/zoo.md for flags of rl_zoo3"
 
 
 class Pairs(argparse.Action):

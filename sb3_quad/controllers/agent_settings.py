@@ -12,7 +12,8 @@ from sb3_quad.controllers.zips import saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import KEY, FlightSettings
 from sb3_quad.simulation.tasks import Task
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.simulation.vehicle_distribution import DISTRIBUTIONS
+from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle
 
 
 def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
@@ -29,6 +30,7 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
         where, task, vehicle = f"{zip_file}: {KEY}", record.get("task"), record.get("vehicle")
         if isinstance(task, dict) and "name" in task:  # else a mixture
             record["task"] = validate(Task, task, where)
+        _refuse_paths(record, where)
         return validate(FlightSettings, {**record, "vehicle": validate(Vehicle, vehicle, where)}, where), Path(zip_file)
     folder = Path(zip_file).parent
     statistics = sorted(folder.glob("*/vecnormalize.pkl"))
@@ -48,6 +50,19 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
     for part in parts:
         given |= parse_mapping(part, where)
     return validate(FlightSettings, given, where), files[0]
+
+
+def _refuse_paths(record: dict[str, Any], where: str) -> None:
+    """See that a zip, which may come from anybody, opens no file of this machine: a device may never end.
+
+    :raises ConfigError: it gives a path where there may be a name.
+    """
+    vehicles = record.get("vehicles")
+    distribution = vehicles.get("distribution") if isinstance(vehicles, dict) else vehicles
+    sources = {"rotor_layout": (VEHICLES, record.get("rotor_layout")), "vehicles": (DISTRIBUTIONS, distribution)}
+    for key, (folder, source) in sources.items():
+        if isinstance(source, str) and folder.is_path(source):
+            raise ConfigError(f"{where}: {key}: {source!r} is a path; a zip holds such files or names those of the package")
 
 
 def env_kwargs(agent: str | Path) -> dict[str, Any]:

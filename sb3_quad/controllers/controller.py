@@ -10,6 +10,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ControllerError, ExpertError, SB3QuadError
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.simulation.state import QuadcopterState
 
 
@@ -66,20 +67,26 @@ class Controller:
         if not (self.needs_state or hasattr(source, "predict") or callable(source)):
             raise error(f"{who}: needs the true state, and this environment has no true_state()")
         self._true_state, self._env, self._state = true_state, cast(VecEnv | None, None), cast(Any, None)
+        self._given = source  # of which the source is made, where that is a name
 
     @staticmethod
     def for_env(expert: Any, env: VecEnv, present: "Controller | None" = None) -> "Controller":
         """An expert that labels the states of a vector environment; with ``VecNormalize`` it sees normalised observations.
 
+        :param expert: as above, or what :func:`~sb3_quad.controllers.resolve.resolve_expert` takes, for the vehicle of row 0.
         :param present: given back, with its state, if it is of the same expert and environment.
-        :raises ExpertError: an expert that is none of the three, or whose spaces do not fit the environment.
+        :raises ConfigError: an unknown name. :class:`ExpertError`: an expert that is none of the three, or whose spaces do not
+            fit the environment.
         """
         if expert is None:
             raise ExpertError("no expert: give expert=... when building or loading the model, or call set_expert(expert)")
-        if present is not None and present.source is expert and present._env is env:
+        if present is not None and present._given is expert and present._env is env:
             return present
-        controller = Controller(expert, env.action_space, env.observation_space, true_state_of(env), "expert")
-        controller._env = env
+        vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
+        controller = Controller(
+            resolve_expert(expert, vehicle), env.action_space, env.observation_space, true_state_of(env), "expert"
+        )
+        controller._env, controller._given = env, expert
         return controller
 
     def actions(
@@ -102,7 +109,7 @@ class Controller:
             raise error(f"{self.kind} {self.name}: fails with {type(failed).__name__}: {failed}") from failed
         if raw.dtype.kind not in "fiub":
             raise error(f"{self.kind} {self.name}: gives actions of type {raw.dtype}, must be real numbers")
-        n = len(observation)
+        n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
         if raw.shape not in ((n, *self._space.shape), (n, self._action_dim)):
             raise error(f"{self.kind} {self.name}: gives actions of shape {raw.shape}, must be {(n, *self._space.shape)}")
         actions = raw.reshape(n, self._action_dim).astype(np.float32)

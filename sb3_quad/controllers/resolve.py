@@ -1,11 +1,11 @@
 """Experts by name, as YAML and the command line give them."""
 
-import pkgutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError, ExpertError, SB3QuadError, unknown
+from sb3_quad.base.imports import import_name
 from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
@@ -16,11 +16,16 @@ EXPERTS = {
     "told_geometric": "sb3_quad.experts.geometric:told_geometric",
     "told_cautious": "sb3_quad.experts.geometric:told_cautious",
 }
-DEFAULT_EXPERT = "geometric"
+DEFAULT_EXPERT = "pid"
 """Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
 
 
-def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "itm", kind: str = "expert") -> Any:
+def resolve_expert(
+    spec: Any,
+    vehicle: str | Path | Vehicle | Sequence[Any] = "itm",
+    kind: str = "expert",
+    layout: str | Path | Vehicle | None = None,
+) -> Any:
     """The expert that ``spec`` names.
 
     :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
@@ -28,6 +33,7 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "i
         expert; or an expert itself, returned as it is.
     :param vehicle: what a named expert is designed for; of several, the first.
     :param kind: what messages call it.
+    :param layout: ``rotor_layout`` of the environments that it flies in.
     :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be imported.
     :raises ExpertError: a factory that fails.
     """
@@ -39,7 +45,7 @@ def resolve_expert(spec: Any, vehicle: str | Path | Vehicle | Sequence[Any] = "i
         return load_model(path)
     factory = import_factory(text, kind)
     try:
-        return factory(first_vehicle(vehicle))
+        return factory(first_vehicle(vehicle, layout))
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:
@@ -56,7 +62,7 @@ def import_factory(text: str, kind: str = "expert") -> Any:
         valid = [*EXPERTS, *pretrained_names()]
         raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
     try:
-        return pkgutil.resolve_name(location)
+        return import_name(location)
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported

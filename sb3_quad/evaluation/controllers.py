@@ -15,7 +15,7 @@ from sb3_quad.controllers.zips import saved_algorithm
 from sb3_quad.evaluation.results import ControllerRecord, Scaling, file_name
 from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
 SCALINGS = ("none", "adaptive", "both")
 
@@ -49,16 +49,20 @@ class ControllerSpec:
 
     @property
     def observed(self) -> dict[str, Any]:
-        """What goes with the agent wherever it flies, see :attr:`FlightSettings.observed`."""
-        return (self.own or FlightSettings()).observed
+        """What goes with the agent wherever it flies, see :attr:`FlightSettings.observed`; also where its rotors are."""
+        return FlightSettings().observed if self.own is None else {**self.own.observed, "rotor_layout": self.own.layout}
 
     def notice(self, vehicle: str | Path | Vehicle) -> str:
-        """A warning if the agent was trained on another vehicle than ``vehicle``, or does not say on which; else empty."""
+        """A warning if the agent was trained on another vehicle than ``vehicle``, or does not say on which; else empty.
+
+        :raises ConfigError: it cannot fly the vehicle, whose rotors are elsewhere.
+        """
         flown = load_vehicle(vehicle)
         if self.own is None:
             silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
             return f"{silent} {flown.name}, with the scaling of Table A.2" if self.is_zip else ""
-        known = load_vehicle(self.own.vehicle)
+        flown.in_layout_of(self.own.layout)
+        known = first_vehicle(self.own.vehicle)
         if self.own.vehicles is not None or known.flies_as(flown):  # an agent of many vehicles knows none of them
             return ""
         same = " of other parameters" if known.name == flown.name else ""
@@ -79,6 +83,8 @@ def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[Contr
     found = plain + [ControllerSpec(*each, "adaptive") for each in adapted]
     files = [file_name(entry.label) for entry in found]
     for file, entry in zip(files, found, strict=True):
+        if not entry.label.isprintable():
+            raise ConfigError(f"controller {entry.label!r}: holds control characters; label it: name={entry.spec}")
         if files.count(file) > 1:
             raise ConfigError(f"controller {entry.label!r}: two are called so; label them: name={entry.spec}")
     return found

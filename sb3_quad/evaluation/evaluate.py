@@ -91,16 +91,17 @@ def evaluate(
     for spec in controllers:
         try:
             vehicles = [_vehicle(spec, each) for each in suite.scenarios]
-            records[spec] = describe(spec, vehicles[0])
-            for line in dict.fromkeys(filter(None, map(spec.notice, vehicles))):
+            record, notices = describe(spec, vehicles[0]), dict.fromkeys(map(spec.notice, vehicles))
+            for line in filter(None, notices):
                 report(line)
+            records[spec] = record
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
     _report_vehicles(suite, list(records), report)
     jobs = [Job(spec, record, each, backend) for each in suite.scenarios for spec, record in records.items()]
     digest, done = _digest(jobs), dict[tuple[str, str], Entry]()
 
-    def results(unfinished: str | None) -> Results:
+    def results(finished: bool = True) -> Results:
         return Results(
             suite=suite.name,
             description=suite.description,
@@ -110,15 +111,16 @@ def evaluate(
             scenarios=list(suite.scenarios),
             entries=[done[job.name] for job in jobs if job.name in done],
             failures=failures,
-            unfinished=unfinished,
+            digest=digest,
+            finished=finished,
         )
 
     if not jobs:
-        return results(None)
+        return results()
     try:
         place.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"{folder}: cannot be written ({error.strerror or error})") from None
+    except (OSError, ValueError) as error:  # ValueError: no path
+        raise ConfigError(f"{folder}: cannot be written ({getattr(error, 'strerror', None) or error})") from None
     with locked(place, "folder"):
         done |= _begin(place, digest, jobs, overwrite)
         missing = [job for job in jobs if job.name not in done]
@@ -131,12 +133,12 @@ def evaluate(
                 else:
                     done[job.name], arrays = outcome
                     write_arrays(place / done[job.name].flights, compressed=True, **arrays)
-                    write_text(place / RESULTS, results(digest).model_dump_json(indent=2))
+                    write_text(place / RESULTS, results(finished=False).model_dump_json(indent=2))
                 progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
         if done:
-            write_episodes(place, results(None).entries)  # in the order of the suite, whoever was done first
-            write_text(place / RESULTS, results(None).model_dump_json(indent=2))
-    return results(None)
+            write_episodes(place, results().entries)  # in the order of the suite, whoever was done first
+            write_text(place / RESULTS, results().model_dump_json(indent=2))
+    return results()
 
 
 def fly_scenario(
@@ -221,15 +223,17 @@ def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Call
 
 
 def _begin(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> dict[tuple[str, str], Entry]:
-    """What an interrupted evaluation of the same digest has flown, but for factories, whose code may have changed.
+    """What the same evaluation has flown before it was interrupted, but for factories, whose code may have changed.
+
+    One that was finished has flown all, so that its table can be shown again; with factories it is other results.
 
     :raises ConfigError: the folder holds other results, and they are not to be overwritten; or damaged ones.
     """
     if not (folder / RESULTS).is_file():
         return {}
     before = load_results(folder)
-    if before.unfinished == digest and not overwrite:
-        certain = {job.name for job in jobs if job.record.kind != "factory"}
+    certain = {job.name for job in jobs if job.record.kind != "factory"}
+    if before.digest == digest and not overwrite and (len(certain) == len(jobs) or not before.finished):
         return {entry.name: entry for entry in before.entries if entry.name in certain}
     if not overwrite:
         raise ConfigError(f"{folder}: holds results already; give another folder with -o, or remove them with --overwrite")

@@ -20,7 +20,7 @@ from sb3_quad.envs.batch_env import quadcopter_spaces
 from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS
-from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.settings import FlightSettings, known_layout
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -47,7 +47,7 @@ class Flights:
     stabilised: FloatArray  # (n,), s until it was stable again, NaN if it never was, see Motion
     sideways: FloatArray  # (n,), largest distance from the straight way to the target, m; NaN where there is none
     waypoint_times: FloatArray  # (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
-    start: FloatArray  # (n, 13), position, quaternion, velocity (world frame), body rates; SI
+    start: FloatArray  # (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates (body); SI
     target: FloatArray  # (n, 3), the first target, m
 
     @property
@@ -96,7 +96,8 @@ def fly(
     :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
         ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
     :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise`` and
-        ``environment``: ``task_kwargs``, ``observation_std`` and ``observation_mean``.
+        ``environment``: ``task_kwargs``, ``observation_std`` and ``observation_mean``. A model that says on which vehicle it
+        was trained flies in that one's ``rotor_layout``, unless another is given here.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
     :param tolerances: of arrival, |r - r_T|, m.
@@ -107,6 +108,8 @@ def fly(
     if n_episodes < 1:
         raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
     environment |= {"task": task, "vehicle": vehicle, "noise": noise, "max_episode_steps": max_steps}
+    if environment.get("rotor_layout") is None:
+        environment["rotor_layout"] = known_layout(controller)
     settings = FlightSettings().with_changes(**environment)
     return fly_settings(controller, settings, row_seeds(seed, n_episodes), backend, tolerances, hooks)
 

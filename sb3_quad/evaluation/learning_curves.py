@@ -10,7 +10,8 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays
 
-NAMES = {"timesteps", "seconds", "successes", "results"}  # of the arrays in a file
+NAMES = {"timesteps", "seconds", "results"}  # of the arrays that every file has
+SHARES = "successes", "survivals"  # where the environment reports them
 
 
 class Curve(NamedTuple):
@@ -18,9 +19,9 @@ class Curve(NamedTuple):
 
     timesteps: FloatArray  # (k,)
     seconds: FloatArray  # of training, evaluations along the way included, (k,)
-    success: FloatArray  # share of successful episodes, (k,)
+    success: FloatArray | None  # share of successful episodes, (k,); None: the environment reports none, as of survival
     reward: FloatArray  # mean per episode, (k,)
-    survival: FloatArray | None = None  # share of episodes, (k,); None: the environment reports none
+    survival: FloatArray | None = None  # share of episodes, (k,)
     losses: Mapping[str, FloatArray] = {}  # by name, of the update before each evaluation, (k,); NaN where there was none
 
     def values(self, name: str) -> FloatArray:
@@ -42,12 +43,15 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
     arrays = read_arrays(path)
     if missing := NAMES - arrays.keys():
         raise ConfigError(f"{path}: cannot be read ({', '.join(sorted(missing))}: no such array)")
-    shapes = [arrays[name].shape for name in ("timesteps", "seconds", "successes", "results")]
-    count = shapes[0][0] if shapes[0] else 0
-    right = [len(each) for each in shapes] == [1, 1, 2, 2] and all(each[0] == count for each in shapes)
-    if not (right and count and all(arrays[name].dtype.kind in "fiub" for name in NAMES)):
-        raise ConfigError(f"{path}: cannot be read (timesteps, seconds, successes and results do not fit together)")
+    known = {name: array for name, array in arrays.items() if name in NAMES or name in SHARES}
+    count = known["timesteps"].size
+    right = count > 0 and all(
+        array.ndim == (1 if name in ("timesteps", "seconds") else 2) and len(array) == count and array.dtype.kind in "fiub"
+        for name, array in known.items()
+    )
+    if not right:
+        raise ConfigError(f"{path}: cannot be read ({', '.join(sorted(known))} do not fit together)")
     timesteps, seconds = (np.asarray(arrays[name], dtype=np.float64) for name in ("timesteps", "seconds"))
-    survival = arrays["survivals"].mean(axis=1) if "survivals" in arrays else None
+    success, survival = (known[name].mean(axis=1) if name in known else None for name in SHARES)
     losses = {name.removeprefix("train/"): array for name, array in arrays.items() if name.startswith("train/")}
-    return Curve(timesteps, seconds, arrays["successes"].mean(axis=1), arrays["results"].mean(axis=1), survival, losses)
+    return Curve(timesteps, seconds, success, arrays["results"].mean(axis=1), survival, losses)

@@ -83,9 +83,8 @@ class Results(Frozen):
     scenarios: list[Scenario]
     entries: list[Entry]
     failures: list[Failure] = Field(default_factory=list)
-    unfinished: str | None = Field(
-        default=None, description="SHA-256 of all that an evaluation under way depends on: only the same one goes on from here"
-    )
+    digest: str = Field(default="", description="SHA-256 of all that the evaluation depends on: only the same one goes on")
+    finished: bool = Field(default=True, description="whether it has come to its end")
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
         """The entry of a controller's label and a scenario's name, None if there is none."""

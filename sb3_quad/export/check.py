@@ -12,10 +12,11 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly_settings
 from sb3_quad.export.load import Call
 from sb3_quad.simulation.frames import ObservationSettings
-from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.simulation.tasks import Task
+from sb3_quad.vehicles.layout import Turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
@@ -30,8 +31,10 @@ class Reference(NamedTuple):
     """A trained policy in its own environment: what an exported file must agree with.
 
     :param mean: μ of Eq. 3.16, (18,), as in training; ``std`` σ, likewise.
+    :param vehicle: in the layout that the policy knows.
     :param output: ``thrusts`` (N) or ``speeds`` (rad/s).
     :param observation: the frames that the policy sees.
+    :param turn: from the vehicle's own axes and rotors, which are the file's, to that layout.
     """
 
     model: BaseAlgorithm
@@ -40,6 +43,20 @@ class Reference(NamedTuple):
     std: FloatArray = DEFAULT_STD
     output: str = "thrusts"
     observation: ObservationSettings = ObservationSettings()
+    turn: Turn = Turn()
+
+    @property
+    def turned_features(self) -> FloatArray:
+        """(18, 18), from features in the vehicle's own body frame to those that the policy knows."""
+        matrix, axes = np.eye(OBSERVATION_SIZE), self.turn.axes
+        for group, block in (("rotation", np.kron(axes, np.eye(3))), ("velocity", axes), ("body_rates", axes)):
+            matrix[GROUPS[group], GROUPS[group]] = block
+        return matrix
+
+    @property
+    def own_mean(self) -> FloatArray:
+        """μ in the vehicle's own body frame, (18,)."""
+        return self.mean @ self.turned_features
 
     def results(self, actions: npt.ArrayLike) -> FloatArray:
         """Rotor thrusts, N (Eq. 3.18), or speeds, rad/s (Eq. 2.4), of actions of any shape; in float64."""
@@ -59,6 +76,7 @@ class Comparison(Hook):
         integral = seen.position_integral
         self._limits = {"position": integral.distance, "velocity": integral.speed} if integral else {}
         self._state, self._sure, self.count, self.error = None, np.True_, 0, 0.0
+        self._turned, self._order = reference.turned_features.astype(np.float32), [*reference.turn.order]
 
     def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
         if self._reference.observation.is_extended:
@@ -67,7 +85,8 @@ class Comparison(Hook):
             features = (observation * self._reference.std + self._reference.mean).astype(np.float32)
         for group, limit in self._limits.items():  # so close to one, rounding may begin to integrate a step later, or earlier
             self._sure = self._sure & (np.abs(np.linalg.norm(features[:, GROUPS[group]], axis=1) / limit - 1.0) > _ROUNDING)
-        self._results, self._state = self._call(features, self._state)
+        results, self._state = self._call(features @ self._turned, self._state)
+        self._results = results[:, self._order]
         self._compared = flying & self._sure
 
     def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:

@@ -19,6 +19,7 @@ from sb3_quad.base.imports import require
 from sb3_quad.evaluation.flights import ACTIONS
 from sb3_quad.export.check import Reference
 from sb3_quad.simulation.observation import GROUPS, OBSERVATION_SIZE
+from sb3_quad.vehicles.layout import Turn
 
 ACTIVATIONS: dict[type[Any], str] = {th.nn.Tanh: "tanh", th.nn.ReLU: "relu"}
 OUTPUTS = {"thrusts": ("thrust", "N"), "speeds": ("rotor_speed", "rad/s")}
@@ -33,7 +34,7 @@ class Network(th.nn.Module):
     For speeds, middle and half_range are divided by kF, and the result is the root of q, rad/s (Eq. 2.4).
 
     :param layers: linear layers, each with the activation that follows it, if any; they are copied.
-    :param reference: its scaling, vehicle and output.
+    :param reference: its scaling, vehicle and output; features and rotors are those of the vehicle's own layout.
     """
 
     mean: th.Tensor
@@ -49,11 +50,11 @@ class Network(th.nn.Module):
         self.result, self.unit = OUTPUTS[self.output]
         self.inputs, self.outputs = ["observation"], [self.result]
         low, high = np.array(vehicle.thrust_range) / (1.0 if self.output == "thrusts" else vehicle.thrust_coefficient)
-        buffers = {"mean": reference.mean, "inverse_std": 1.0 / reference.std}
+        buffers = {"mean": reference.own_mean, "inverse_std": 1.0 / reference.std}
         buffers |= {"middle": (high + low) / 2, "half_range": (high - low) / 2}
         for name, value in buffers.items():
             self.register_buffer(name, th.as_tensor(value, dtype=th.float32))
-        self.layers = copy.deepcopy(layers).to("cpu", th.float32).requires_grad_(False)
+        self.layers = own_layers(layers, reference).to(th.float32)
         self.eval()
 
     def forward(self, observation: th.Tensor) -> th.Tensor:
@@ -136,6 +137,25 @@ def build_network(reference: Reference, where: str = "model") -> Network:
         raise ConfigError(f"{where}: holds parameters that are not finite")
     kind = StatefulNetwork if reference.observation.is_extended else Network
     return kind(layers, reference)
+
+
+def own_layers(layers: th.nn.Sequential, reference: Reference) -> th.nn.Sequential:
+    """A copy of a policy's layers for features in the vehicle's own body frame and its own order of the rotors.
+
+    Turning the features, and the last action, is a part of the first layer; the order of the rotors is one of the last.
+    """
+    layers = copy.deepcopy(layers).to("cpu", th.float64).requires_grad_(False)
+    linear = [each for each in layers if isinstance(each, th.nn.Linear)]
+    if reference.turn == Turn() or not linear:
+        return layers
+    seen, std, own = reference.observation, reference.std, reference.turn.own
+    frame, n = np.eye(seen.frame_size), OBSERVATION_SIZE
+    frame[:n, :n] = reference.turned_features * std / std[:, None]
+    frame[n:, n:] = np.eye(4)[[*reference.turn.order]] if seen.last_action else 0.0
+    linear[0].weight.copy_(linear[0].weight @ th.from_numpy(np.kron(np.eye(len(seen.ages)), frame)))
+    linear[-1].weight.copy_(linear[-1].weight[own])
+    linear[-1].bias.copy_(linear[-1].bias[own])
+    return layers
 
 
 def deterministic_layers(policy: Any, where: str) -> th.nn.Sequential:

@@ -17,7 +17,7 @@ from sb3_quad.export.c_header import c_name, write_header
 from sb3_quad.export.check import N_OBSERVATIONS, Reference, compare
 from sb3_quad.export.network import Network, build_network, write_onnx, write_torchscript
 from sb3_quad.simulation.batch import QuadcopterBatch
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 FORMATS = {"onnx": ".onnx", "torchscript": ".pt", "c": ".h"}  # with the endings of their files
 
@@ -48,12 +48,12 @@ def export_policy(
     beside the zip, or else ``itm`` and Table A.2.
 
     :param file_format: ``onnx``, ``torchscript`` or ``c``; ``output``: ``thrusts`` or ``speeds``.
-    :param vehicle: its hover thrust and thrust limits, and for speeds its kF.
+    :param vehicle: in whose body frame and order of the rotors the file speaks; its thrust limits, and for speeds its kF.
     :param name: the C function is called ``NAME_policy``; None: as the zip.
     :param n_observations: of the check, at most, see :func:`~sb3_quad.export.check.compare`.
     :raises ConfigError: an unknown format or output; a zip that cannot be read, whose spaces are not the quadcopter's or
-        whose policy is no ``MlpPolicy``; one that flies any vehicle, and none is given; a package or a C compiler that is
-        not installed.
+        whose policy is no ``MlpPolicy``; one that flies any vehicle, and none is given; a vehicle whose rotors cannot be
+        brought to where the policy knows them; a package or a C compiler that is not installed.
     :raises ExportError: the file computes something else than the policy, or does not compile.
     """
     prefix = c_name(Path(path).stem) if name is None else name
@@ -68,13 +68,16 @@ def export_policy(
         raise ConfigError(unknown("format", file_format, formats))
     write, read = formats[file_format]
     algorithm, model, (settings, source) = saved_algorithm(path), load_model(path), agent_settings(path)
+    layout = settings.layout
     settings = settings if vehicle is None else settings.with_changes(vehicle=vehicle)
     if settings.vehicles is not None:
         raise ConfigError(f"model {path}: flies any vehicle; say with --vehicle which one's thrusts the file is to give")
-    row = QuadcopterBatch(1, settings, n_threads=1)  # it checks them
-    reference = Reference(model, row.vehicle_list[0], row.mean[:, 0], row.std[:, 0], output, row.observation)
+    flown = first_vehicle(settings.vehicle)
+    row = QuadcopterBatch(1, settings.with_changes(vehicle=flown, rotor_layout=layout), n_threads=1)  # it checks them
+    known, turn = row.vehicle_list[0], flown.turn_to(layout)
+    reference = Reference(model, known, row.mean[:, 0], row.std[:, 0], output, row.observation, turn)
     network = build_network(reference, f"model {path}")
-    metadata = _describe(Path(path), algorithm, network, reference)
+    metadata = _describe(Path(path), algorithm, network, reference, flown)
     with warnings.catch_warnings():
         # torch calls TorchScript deprecated: it still loads everywhere, also where torch.export's files do not.
         warnings.simplefilter("ignore", DeprecationWarning)
@@ -86,14 +89,13 @@ def export_policy(
     return Export(content, metadata, checked.error, network.unit, source)
 
 
-def _describe(path: Path, algorithm: str, network: Network, reference: Reference) -> dict[str, str]:
+def _describe(path: Path, algorithm: str, network: Network, reference: Reference, vehicle: Vehicle) -> dict[str, str]:
     """What users of the file must know; ASCII but for names."""
-    vehicle = reference.vehicle
     low, high = reference.results([-1.0, 1.0])
     rotors = enumerate(zip(vehicle.rotor_positions, vehicle.rotor_directions, strict=True))
     sizes = [network.steps[0][0].in_features, *(layer.out_features for layer, _ in network.steps)]
     hidden = ", ".join(activation for _, activation in network.steps[:-1]) or "none"
-    mean, std = (", ".join(f"{value:.6g}" for value in values) for values in (reference.mean, reference.std))
+    mean, std = (", ".join(f"{value:.6g}" for value in values) for values in (reference.own_mean, reference.std))
     n_parameters = sum(parameter.numel() for parameter in network.parameters())
     return {
         "policy": f"{path.name} ({algorithm}), sha256 {hashlib.sha256(path.read_bytes()).hexdigest()}",

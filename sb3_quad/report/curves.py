@@ -21,18 +21,20 @@ def plot_curves(
     groups: Mapping[str, Sequence[Curve]],
     lines: Mapping[str, Mapping[str, float]],
     title: str = "",
-    show: Sequence[str] = (SUCCESS, REWARD),
+    show: Sequence[str] = (),
 ) -> Figure:
     """Two panels, over timesteps and over wall-clock time, for each of ``show``; a marker at each evaluation.
 
     :param groups: from the name of an agent to the curves of its seeds; their mean is drawn, with their range around it.
     :param lines: from a name to heights by panel, shares for success and survival: horizontal lines, such as the expert's.
-    :param show: of success, survival, reward and losses, which take a row for each that a curve has.
+    :param show: of success, survival, reward and losses, which take a row for each that a curve has; success, if there is
+        some, and reward by default.
     :raises ConfigError: a panel that no curve has values for.
     """
+    curves = [curve for group in groups.values() for curve in group]
+    show = show or ([REWARD] if all(curve.success is None for curve in curves) else [SUCCESS, REWARD])
     names = [row for each in show for row in (_losses(groups) if each == LOSSES else [each])]
     for name in names or show:
-        curves = [curve for group in groups.values() for curve in group]
         if name == LOSSES or all(np.isnan(curve.values(name)).all() for curve in curves):
             raise ConfigError(f"{name}: the runs' evaluations hold none")
     figure = Figure(figsize=(11, 1.2 + 2.65 * len(names)), layout="constrained")

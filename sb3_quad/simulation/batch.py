@@ -215,13 +215,13 @@ class QuadcopterBatch:
 
         :raises ConfigError: the snapshot is of other environments.
         """
-        for name, array in snapshot.items():
-            own = getattr(self, name) if name in _KEPT else np.empty(0)
-            fits = (array.dtype, array.shape) == (own.dtype, own.shape)
-            if not fits or (name == "task_index" and (array >= self.task_weights.size).any()):
+        for name in dict.fromkeys((*_KEPT, *snapshot)):
+            array, own = snapshot.get(name), getattr(self, name) if name in _KEPT else None
+            fits = array is not None and own is not None and (array.dtype, array.shape) == (own.dtype, own.shape)
+            if not fits or (name == "task_index" and not ((array >= 0) & (array < self.task_weights.size)).all()):
+                found = "missing" if array is None else f"{array.dtype} of shape {array.shape}"
                 raise ConfigError(
-                    "the saved state of the environments does not fit these "
-                    f"({name}: {array.dtype} of shape {array.shape}); use the run's own settings"
+                    f"the saved state of the environments does not fit these ({name}: {found}); use the run's own settings"
                 )
         for name, array in snapshot.items():
             getattr(self, name)[...] = array

@@ -2,7 +2,6 @@
 
 import functools
 import hashlib
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,8 @@ import numba
 from numba import types
 from numba.core import event
 from numba.extending import intrinsic
+
+from sb3_quad.base.notices import tell
 
 LANES = 64  # rows of a block; a multiple of every vector width, small enough for a block to stay in the first cache
 _COMPILED_IN = ("simulation", "vehicles", "experts", "algorithms/networks")
@@ -28,7 +29,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     try:
         dispatcher.enable_caching()
     except RuntimeError:  # neither the package's folder nor the user's folder for caches can be written
-        _tell("compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder")
+        tell("compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder")
     else:
         dispatcher._cache._cache_file._source_stamp = _source_stamp()
     return dispatcher
@@ -44,14 +45,9 @@ def _source_stamp() -> str:
     return digest.hexdigest()
 
 
-@functools.cache
-def _tell(line: str) -> None:
-    sys.stderr.write(f"sb3_quad: {line}\n")
-
-
 class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
-        _tell("compiling the simulation, once; it is kept for later runs (about 15 s)")
+        tell("compiling the simulation, once; it is kept for later runs (about 15 s)")
 
     def on_end(self, event: event.Event) -> None:
         pass

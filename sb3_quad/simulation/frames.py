@@ -4,6 +4,8 @@ A frame is the scaled features of a control step, with ``last_action`` followed 
 the frames of some ages, one after the other. The compiled functions keep the frames of a row and make observations of them.
 """
 
+from typing import Any
+
 from numba import float32
 from pydantic import Field, PositiveFloat, field_validator
 
@@ -22,10 +24,10 @@ class PositionIntegral(Frozen):
     bias of its own leaves an error. It need not have been trained with the integral.
     """
 
-    gain: PositiveFloat = Field(default=0.5, description="1/s")
-    distance: PositiveFloat = Field(default=1.0, description="m")
-    speed: PositiveFloat = Field(default=1.5, description="m/s")
-    limit: PositiveFloat = Field(default=3.0, description="m")
+    gain: PositiveFloat = Field(default=0.5, le=100, description="1/s")
+    distance: PositiveFloat = Field(default=1.0, le=1e3, description="m")
+    speed: PositiveFloat = Field(default=1.5, le=1e3, description="m/s")
+    limit: PositiveFloat = Field(default=3.0, le=1e3, description="m")
 
     def numbers(self, control_step: float) -> list[float]:
         """What :func:`integrate_position` reads: gain dt, distance², speed², limit."""
@@ -40,6 +42,13 @@ class ObservationSettings(Frozen):
         default=None, description="ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode began"
     )
     position_integral: PositionIntegral | None = Field(default=None, description="see PositionIntegral; {} for its defaults")
+
+    @field_validator("history", mode="before")
+    @classmethod
+    def _ages(cls, value: Any) -> Any:
+        if isinstance(value, (list, tuple)) and any(isinstance(age, bool) for age in value):
+            raise ValueError(f"{list(value)}: must be ages, whole control steps")
+        return value
 
     @field_validator("history")
     @classmethod

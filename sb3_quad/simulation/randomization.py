@@ -20,8 +20,11 @@ FIXED, UNIFORM, LOG_UNIFORM, CUBE_ROOT = range(4)
 _KINDS = {"uniform": UNIFORM, "log_uniform": LOG_UNIFORM, "uniform_cube_root": CUBE_ROOT}
 FIXED_NUMBERS = (0.0, 0.0, float(FIXED))  # of a range that is left out
 Share = Annotated[float, Field(ge=0, le=1)]
-Vector = tuple[float, float, float]
+AxisFactor = Annotated[float, Field(ge=0, le=10)]
 MAX_DELAY = 100  # control steps
+MAX_PUSH = {"SI": 1e4, "weight": 100.0}  # of a force or torque, by unit
+Number = Annotated[float, Field(ge=-1e6, le=1e6)]  # of a quadcopter, SI
+Vector = tuple[Number, Number, Number]
 _RANGE = len(FIXED_NUMBERS)
 VECTOR = {"length": _RANGE, "by_weight": 1, "in_body": 1, "direction": 3, "axes": 3}
 V = first_rows(VECTOR)
@@ -41,8 +44,8 @@ R = first_rows(RANDOMIZATION)
 class Range(Frozen):
     """Numbers from ``low`` to ``high``; ``[low, high]`` for short, or one number."""
 
-    low: float = Field(description="the least number")
-    high: float = Field(description="the greatest number, at least low")
+    low: Number = Field(description="the least number")
+    high: Number = Field(description="the greatest number, at least low")
     distribution: Literal["uniform", "log_uniform", "uniform_cube_root"] = Field(
         default="uniform", description="of the number, of its logarithm (low > 0), or of its cube root"
     )
@@ -80,7 +83,14 @@ class NonNegativeRange(Range):
 class PositiveRange(Range):
     """A :class:`Range` of numbers above 0."""
 
-    low: PositiveFloat = Field(description="the least number, above 0")
+    low: Annotated[float, Field(ge=1e-9)] = Field(description="the least number, at least 1e-9")
+
+
+class Offset(Range):
+    """A :class:`Range` of distances of at most 1 m either way."""
+
+    low: Annotated[float, Field(ge=-1, le=1)] = Field(description="the least number, at least -1")
+    high: Annotated[float, Field(ge=-1, le=1)] = Field(description="the greatest number, from low to 1")
 
 
 class Factor(Range):
@@ -104,7 +114,7 @@ class RandomVector(Frozen):
         default=None, description="the axes it keeps to; left out: a force to the world's, a torque to the body's"
     )
     direction: Vector | None = Field(default=None, description="where to; left out: uniformly random")
-    axes: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
+    axes: tuple[AxisFactor, AxisFactor, AxisFactor] = Field(
         default=(1.0, 1.0, 1.0), description="factor of each component, such as [1, 1, 0] for a horizontal one"
     )
 
@@ -119,6 +129,11 @@ class RandomVector(Frozen):
         if value is not None and not any(value):
             raise ValueError("direction must not be zero")
         return value
+
+    @model_validator(mode="after")
+    def _of_a_quadcopter(self) -> "RandomVector":
+        _check_push(self.magnitude, self.unit)
+        return self
 
     def numbers(self, frame: str) -> list[float]:
         """Numbers in the order of ``VECTOR``; ``frame`` holds if none is given."""
@@ -139,7 +154,12 @@ class Gusts(Frozen):
 
     std: NonNegativeRange = Field(description="standard deviation of each component, N or as unit says; sampled per episode")
     unit: Literal["SI", "weight"] = Field(default="SI", description="weight: in weights m g of the vehicle")
-    time_constant: PositiveFloat = Field(default=1.0, description="after which a gust has faded to 1/e, s")
+    time_constant: PositiveFloat = Field(default=1.0, le=1e6, description="after which a gust has faded to 1/e, s")
+
+    @model_validator(mode="after")
+    def _of_a_quadcopter(self) -> "Gusts":
+        _check_push(self.std, self.unit)
+        return self
 
 
 class Randomization(Frozen):
@@ -157,7 +177,7 @@ class Randomization(Frozen):
     motor_gain: Factor | None = Field(default=None, description="factor of k_m (Eq. 4.1)")
     thrust: Factor | None = Field(default=None, description="factor of the thrust of a command, as a tired battery has it")
     arm: Factor | None = Field(default=None, description="factor of the rotors' distances from the centre of mass")
-    center_of_mass: Range | None = Field(default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]")
+    center_of_mass: Offset | None = Field(default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]")
     delay: Range | None = Field(
         default=None,
         description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
@@ -220,6 +240,11 @@ class Randomization(Frozen):
             return np.array([*numbers, *FIXED_NUMBERS, 0.0, 0.0])
         keeps = math.exp(-control_step / self.gusts.time_constant)
         return np.array([*numbers, *self.gusts.std.numbers(), float(self.gusts.unit == "weight"), keeps])
+
+
+def _check_push(numbers: Range, unit: str) -> None:
+    if numbers.high > MAX_PUSH[unit]:
+        raise ValueError(f"{numbers.high:g} ({unit}): must be at most {MAX_PUSH[unit]:g}")
 
 
 @compiled

@@ -4,13 +4,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field, NonNegativeFloat
+from pydantic import BeforeValidator, Field, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.frames import ObservationSettings
 from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.tasks import resolve_tasks
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
 
@@ -19,6 +20,7 @@ Steps = Annotated[int, Field(gt=0, le=ENDLESS)]
 AsList = BeforeValidator(lambda value: value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value)
 Scaling = Annotated[list[float] | list[list[float]] | None, AsList]
 KEY = "flight_settings"  # of a model, and so of the JSON in its zip
+Level = Annotated[float, Field(ge=0, le=100)]
 
 
 class Noise(Frozen):
@@ -27,11 +29,11 @@ class Noise(Frozen):
     That is the sum of two independent normal disturbances; one number for short is ``relative``.
     """
 
-    relative: NonNegativeFloat = Field(default=0.0, description="in shares of the feature itself, 0.05 in the thesis")
-    additive: NonNegativeFloat = Field(default=0.0, description="in shares of σ, the same wherever the vehicle is")
+    relative: Level = Field(default=0.0, description="in shares of the feature itself, 0.05 in the thesis")
+    additive: Level = Field(default=0.0, description="in shares of σ, the same wherever the vehicle is")
 
 
-NoiseLevel = NonNegativeFloat | list[NonNegativeFloat] | Noise
+NoiseLevel = Level | list[Level] | Noise
 
 
 class FlightSettings(ObservationSettings):
@@ -59,6 +61,11 @@ class FlightSettings(ObservationSettings):
         default=MAX_EPISODE_STEPS, description="control steps after which an episode is truncated; or a list of them"
     )
 
+    @model_validator(mode="after")
+    def _known_task(self) -> "FlightSettings":
+        resolve_tasks(self.task, self.task_kwargs)
+        return self
+
     @property
     def longest_episode(self) -> int:
         """Control steps of an episode, or of the longest where rows differ."""
@@ -81,6 +88,11 @@ class FlightSettings(ObservationSettings):
         scaling = {"observation_mean": self.observation_mean, "observation_std": self.observation_std}
         return {**scaling, **self.model_dump(mode="json", include={*ObservationSettings.model_fields, "rotor_layout"})}
 
+    @property
+    def layout(self) -> Vehicle:
+        """The vehicle whose axes and order of the rotors an agent with these settings knows."""
+        return first_vehicle(self.vehicle if self.rotor_layout is None else self.rotor_layout)
+
     def with_changes(self, **changes: Any) -> "FlightSettings":
         """The same with some fields changed; a ``vehicle`` replaces ``vehicles``.
 
@@ -100,6 +112,17 @@ class FlightSettings(ObservationSettings):
         layout = None if self.rotor_layout is None else load_vehicle(self.rotor_layout)
         changes = {"vehicle": first_vehicle(self.vehicle), "vehicles": self.vehicles, "rotor_layout": layout}
         setattr(model, KEY, self.with_changes(**changes).model_dump(mode="json"))
+
+
+def known_layout(model: Any) -> Vehicle | None:
+    """The layout that a model knows, by what :meth:`FlightSettings.write_into` wrote; None: it holds nothing of that kind.
+
+    :raises ConfigError: what it holds does not fit.
+    """
+    own = getattr(model, KEY, None)
+    if not isinstance(own, dict):
+        return None
+    return validate(Vehicle, own.get("rotor_layout") or own.get("vehicle"), f"{type(model).__name__}.{KEY}: vehicle")
 
 
 def levels(noise: Any) -> tuple[FloatArray, FloatArray]:

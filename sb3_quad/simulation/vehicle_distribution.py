@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PositiveFloat, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
@@ -30,6 +30,9 @@ D = first_rows(DISTRIBUTION_NUMBERS)
 NO_DISTRIBUTION = np.array([*FIXED_NUMBERS * len(_RANGES), *np.zeros(4)])
 
 
+Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
+
+
 class VehicleDistribution(Frozen):
     """Ranges of a quadcopter's parameters, ``[low, high]``, a number, or a mapping with a ``distribution``.
 
@@ -43,7 +46,7 @@ class VehicleDistribution(Frozen):
     motor_time_constant: PositiveRange = Field(description="1 / k_m, s (Eq. 4.1)")
     moment_thrust_ratio: PositiveRange = Field(description="kM / kF, m")
     least_thrust: Range = Field(default=Range(low=0.0, high=0.0), description="of a rotor, in hover thrusts")
-    inertia_ratios: tuple[PositiveFloat, PositiveFloat, PositiveFloat] | None = Field(
+    inertia_ratios: tuple[Ratio, Ratio, Ratio] | None = Field(
         default=None, description="of Ixx, Iyy and Izz; left out: the base vehicle's"
     )
     size_deviation: Annotated[float, Field(ge=0, le=1)] = Field(default=0.0, description="of the arms, see above")
@@ -54,6 +57,8 @@ class VehicleDistribution(Frozen):
         """``distribution``: a name, or the path of a YAML file, whose ranges the others replace; or that alone."""
         data = {"distribution": data} if isinstance(data, (str, Path)) else data
         if isinstance(data, Mapping) and "distribution" in data:
+            if not isinstance(data["distribution"], (str, Path)):
+                raise ValueError("distribution: must be a name, or the path of a YAML file")
             own = {key: value for key, value in data.items() if key != "distribution"}
             return {**DISTRIBUTIONS.read(data["distribution"])[0], **own}
         return data

@@ -24,6 +24,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.training.options import RunOptions, SettingsOptions
 from sb3_quad.training.values import as_list
+from sb3_quad.vehicles.vehicle import NAME
 
 SWEEPS = YamlFolder("sweep", "sb3_quad.zoo_configs.sweeps", ".yml")
 MAX_RUNS = 10_000
@@ -32,7 +33,7 @@ MAX_RUNS = 10_000
 class Configuration(SettingsOptions, RunOptions):
     """What one training is given, less its seed; what is left out is as for ``train``."""
 
-    name: str | None = Field(default=None, min_length=1, description="in tables and folders; made of what differs without it")
+    name: str | None = Field(default=None, pattern=NAME, description="in tables and folders; made of what differs without it")
     algo: str | None = Field(default=None, description="algorithm of a single run")
     env: str | None = Field(default=None, description="environment id of a single run")
     conf_file: str | None = Field(default=None, description="settings file, of a single run or of a pipeline")

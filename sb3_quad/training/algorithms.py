@@ -7,6 +7,7 @@ from typing import Any
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, unknown
 
@@ -38,7 +39,7 @@ def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.
     The annotation of each is a type; Any where there is none, or where a name in the annotations cannot be resolved.
     """
     try:
-        types = typing.get_type_hints(algorithm.__init__)
+        types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})  # a forward reference of GymEnv
     except NameError:
         types = {}
     return {

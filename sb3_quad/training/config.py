@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args
 import gymnasium
 from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, ValidationInfo, field_validator, model_validator
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
@@ -27,7 +27,7 @@ SETTINGS = YamlFolder(
     "settings file",
     "sb3_quad.zoo_configs",
     ".yml",
-    folders=("any_quadcopter", "nominal", "pid", "robust", "thesis", "value_based"),
+    folders=("any_quadcopter", "nominal", "robust", "thesis", "value_based"),
 )
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
@@ -71,6 +71,7 @@ class TrainingConfig(Frozen):
     env_kwargs: Keywords = Field(default={}, description="keywords of the environment's constructor")
     eval_env_kwargs: Keywords = Field(default={}, description="put over env_kwargs in the evaluation's environments")
     eval_tasks: Tasks = Field(default=(), description="further tasks to evaluate on; the own one decides which model is best")
+    best_by: Literal["success", "survival"] = Field(default="success", description="which share makes a model the best")
     policy: str = "MlpPolicy"
     policy_kwargs: Keywords = Field(default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'")
     expert: Any = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory, to learn from")
@@ -137,9 +138,12 @@ class TrainingConfig(Frozen):
     @field_validator("env_kwargs", "eval_env_kwargs")
     @classmethod
     def _known_keywords(cls, value: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
-        for key in value:
-            if info.data["env_id"] in ENVIRONMENTS and key not in FlightSettings.model_fields:
-                raise ConfigError(unknown(f"keyword of {info.data['env_id']}", key, FlightSettings.model_fields))
+        env_id = info.data["env_id"]
+        if env_id in ENVIRONMENTS:
+            for key in value:
+                if key not in FlightSettings.model_fields:
+                    raise ConfigError(unknown(f"keyword of {env_id}", key, FlightSettings.model_fields))
+            FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **info.data.get("env_kwargs", {}), **value})
         return value
 
     @field_validator(*BASES)
@@ -252,5 +256,7 @@ def check_environment(env_id: str) -> None:
     """:raises ConfigError: an environment that Gymnasium does not know; the message names the nearest."""
     if env_id in gymnasium.registry:
         return
-    nearest, _, _ = unknown("environment", env_id, gymnasium.registry).partition(" (valid:")
-    raise ConfigError(f"{nearest} (of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)")
+    hint = did_you_mean(env_id, gymnasium.registry)
+    raise ConfigError(
+        f"unknown environment {env_id!r}: {hint}(of this package: {', '.join(ENVIRONMENTS)}; others: --gym-packages)"
+    )

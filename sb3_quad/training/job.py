@@ -6,6 +6,7 @@ from typing import Any
 from pydantic import Field
 
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.tasks import in_words
 from sb3_quad.training.config import TrainingConfig
 from sb3_quad.training.options import JobOptions
 
@@ -47,8 +48,7 @@ def describe(job: TrainingJob) -> str:
     start = f", from {job.trained_agent}" if job.trained_agent else ""
     expert = f", expert {config.expert}" if config.expert is not None else ""
     task = config.env_kwargs.get("task")
-    shares = {name: share / sum(task.values()) for name, share in task.items()} if isinstance(task, Mapping) else {}
-    mixture = f", tasks {', '.join(f'{share:.0%} {name}' for name, share in shares.items())}" if shares else ""
+    mixture = f", tasks {in_words(task)}" if isinstance(task, Mapping) else ""
     return (
         f"{config.algo} on {config.env_id}: {timesteps:,} timesteps{asked}, rollouts of {n_steps} steps, "
         f"{config.n_envs} environments ({config.vec_env}){mixture}{expert}, seed {job.seed}{start}{idle}"

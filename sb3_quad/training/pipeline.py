@@ -36,7 +36,7 @@ from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
-from sb3_quad.training.trainer import resume, train
+from sb3_quad.training.trainer import resume, train, trained_seconds
 from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
@@ -60,7 +60,9 @@ class Stage(Frozen):
     seed_offset: NonNegativeInt = Field(
         default=0, description="added to the seed, so that a stage sees other episodes than one before it on the same task"
     )
-    pass_on: Literal["best", "last"] = Field(default="best", description="the best evaluation, by success, then by reward")
+    pass_on: Literal["best", "last"] = Field(
+        default="best", description="the best evaluation, as best_by of its settings says"
+    )
     trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
@@ -215,7 +217,7 @@ def _train_stages(
             for number, (stage, job) in enumerate(zip(status.stages, jobs, strict=True)):
                 run = open_run(runs[number]) if number < len(runs) else None
                 if run is not None and run.timesteps >= job.config.n_timesteps:
-                    timesteps, seconds = run.timesteps, read_curve(run.path).seconds[-1] if run.evaluations.is_file() else 0.0
+                    timesteps, seconds = run.timesteps, trained_seconds(run)
                 else:
                     start = job.model_copy(update={"trained_agent": agent}) if agent else job
                     report(f"{stage.name}: {describe(start)}")
@@ -230,8 +232,8 @@ def _train_stages(
                     run, timesteps, seconds = trained.run, trained.model.num_timesteps, trained.seconds
                 if signals.received is not None:
                     break
-                agent = str(_trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, run))
-                results[stage.name] = StageResult(str(run.path), agent, timesteps, float(seconds))
+                agent = str(_trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, job, run))
+                results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
         except KeyboardInterrupt:
             if signals.received is None:
                 raise
@@ -240,15 +242,16 @@ def _train_stages(
     return PipelineResult(folder, results, jobs[0], signals.exit_code)
 
 
-def _passed_on(stage: Stage, run: RunFolder) -> Path:
+def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
     """The zip that a stage passes on, before it is trimmed.
 
     :raises TrainingError: its best evaluation misses the stage's requirement.
     """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        scores = list(zip(curve.success.tolist(), curve.reward.tolist(), strict=True))
-        success, reward = max(scores) if stage.pass_on == "best" else scores[-1]
+        share, success = (np.nan_to_num(curve.values(name)) for name in (job.config.best_by, "success"))
+        scores = list(zip(share, curve.reward, success, strict=True))
+        _, reward, success = max(scores) if stage.pass_on == "best" else scores[-1]
         wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
         if success < stage.require.success_rate or reward < wanted:
             raise TrainingError(
@@ -262,7 +265,7 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
     """The trimmed agent of a stage, which lies beside the one that it is made of."""
     if run.trimmed_model.is_file():
         return run.trimmed_model
-    model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, run), device=job.device)
+    model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, job, run), device=job.device)
     seed = seed_for("trim", job.seed)
     if stage.trim == "hover":
         did = trim_hover(model, seed, job.flight_settings)

@@ -142,8 +142,9 @@ def make_folder(path: str | Path, what: str, flag: str) -> None:
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=path).close()
-    except OSError as error:
-        raise ConfigError(f"{what} {path}: cannot be written ({error.strerror}); give another with {flag}") from None
+    except (OSError, ValueError) as error:  # ValueError: no path
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
 
 
 def _runs(parent: Path, name: str) -> dict[int, Path]:
@@ -178,6 +179,7 @@ def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) ->
     number = exp_id if exp_id > 0 else max(with_agent or runs, default=0)
     if number in runs:
         return RunFolder(runs[number], name)
-    there = ", ".join(entry.name for entry in runs.values()) or "no run of this environment"
-    wanted = f"{name}_{number}" if number else name
-    raise ConfigError(f"{parent}: there is no run {wanted}, but {there}; give another with --env, --algo, -f or --exp-id")
+    if not runs:
+        raise ConfigError(f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f")
+    there = ", ".join(entry.name for entry in runs.values())
+    raise ConfigError(f"{parent}: there is no run {name}_{number}; there is {there}; give another with --exp-id")

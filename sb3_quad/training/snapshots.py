@@ -6,24 +6,30 @@ import os
 import random
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import torch as th
+from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, write_arrays, write_bytes
+from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.callbacks.interruption import LastGoodModel
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 ENVIRONMENT, DATASET = "environment.", "dataset."  # before the names of their arrays
+LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])  # by name: value, how many it is the mean of, not shown by
+NO_BYTES = np.zeros(0, np.uint8)
+ANY_LENGTH = ("model", "best_model", "random", "log")
 SHARE = 0.03  # of the run's time that snapshots may take
 
 
@@ -48,6 +54,10 @@ class SnapshotFile(LastGoodModel):
         """Whether the rollout under way is in its first step after the snapshot, so that no buffer holds more than it."""
         after = self.num_timesteps - self.training_env.num_envs
         return not isinstance(self.model, OffPolicyAlgorithm) or self.snapshot is None or self.snapshot.timesteps == after
+
+    def _on_training_start(self) -> None:
+        if self._run.resume_state.is_file():  # the log of a resumed run says what it would have said
+            set_log(self.logger, read_arrays(self._run.resume_state, "log").get("log"), self._run.resume_state)
 
     def _is_due(self) -> bool:
         return super()._is_due() or self._hurry()
@@ -74,12 +84,11 @@ class SnapshotFile(LastGoodModel):
         """
         model: Any = self.model
         batch: Any = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
-        state = random_state()
+        state = random_state() | {"log": log_state(self.logger)}
         state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
-        if self._run.episodes.is_file():
-            state["episodes"] = np.array(self._run.episodes.stat().st_size)
-        if self._run.best_model.is_file():
-            state["best_model"] = np.fromfile(self._run.best_model, dtype=np.uint8)
+        episodes, best_model = self._run.episodes, self._run.best_model
+        state["episodes"] = np.array(episodes.stat().st_size if episodes.is_file() else 0)
+        state["best_model"] = np.fromfile(best_model, dtype=np.uint8) if best_model.is_file() else NO_BYTES
         if hasattr(model, "dataset"):
             state[f"{DATASET}added"] = np.array(model.dataset.added)
         for name, buffer in _replay_buffers(model).items():
@@ -109,27 +118,66 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
     """The model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``; what came after it is taken back.
 
     :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
-    :raises ConfigError: a file that is missing or damaged.
+    :raises ConfigError: a file that is missing or damaged, or of other settings; nothing has been taken back then.
     """
     path = run.resume_state
     if not path.is_file():
         further = f"; to train its model further use -i {run.result}" if run.result.is_file() else ""
         raise ConfigError(f"run folder {run.path}: holds no interrupted run{further}")
-    state = read_arrays(path)
-    if "model" not in state:
-        raise ConfigError(f"{path}: not a snapshot")
+    state, batch = read_arrays(path), getattr(env.unwrapped, "batch", None)
     environment, algorithm = _part(state, ENVIRONMENT), get_algorithm(algo)
-    zip_file, batch = io.BytesIO(state["model"].tobytes()), getattr(env.unwrapped, "batch", None)
-    model: Any = load_zip(algorithm, zip_file, env=env, device=device, force_reset=not environment, **attributes)
+    _check(state, {"model": NO_BYTES}, path)
+    zip_file, where = io.BytesIO(state["model"].tobytes()), f"{path}: model"
+    model: Any = load_zip(algorithm, zip_file, where=where, env=env, device=device, force_reset=batch is None, **attributes)
+    one = np.array(0)
+    _check(state, {"timesteps": one, "episodes": one, "best_model": NO_BYTES, "log": np.array(""), **random_state()}, path)
+    _check(state, _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {}), path)
+    _require(batch is not None or not environment, f"{ENVIRONMENT}… is of environments of another kind", path)
+    _require(int(state["episodes"]) >= 0, "episodes is negative", path)
+    try:
+        set_random_state(state)
+    except Exception as error:  # what is no state raises what it likes
+        _require(False, f"random and torch are no states of random numbers ({one_line(error)})", path)
+    _require(model.num_timesteps == int(state["timesteps"]), "timesteps is not that of model", path)
     if hasattr(model, "dataset"):
+        _check(state, {f"{DATASET}added": one}, path)
+        added = int(state[f"{DATASET}added"])
+        _require(added >= 0, f"{DATASET}added is negative", path)
+        _check(state, _with_prefix(DATASET, model.dataset.snapshot(added)), path)
         model.dataset.restore(_part(state, DATASET), path)
     for name, buffer in _replay_buffers(model).items():
-        _fill(buffer, _part(state, f"{name}."))
+        _check(state, {f"{name}.pos": one, f"{name}.full": np.array(False)}, path)
+        buffer.pos, buffer.full = int(state[f"{name}.pos"]), bool(state[f"{name}.full"])
+        _require(0 <= buffer.pos < buffer.buffer_size, f"{name}.pos is beyond its rows", path)
+        own = _with_prefix(f"{name}.", _filled(buffer))
+        # What was written later than the rest may hold more rows.
+        state |= {each: state[each][: len(rows)] for each, rows in own.items() if each in state and state[each].ndim}
+        _check(state, own, path)
+        for each, rows in own.items():
+            rows[...] = state[each]
     if batch is not None:
-        batch.restore(environment)
+        try:
+            batch.restore(environment)
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
     _take_back(run, state, model.num_timesteps)
     set_random_state(state)
     return cast(BaseAlgorithm, model)
+
+
+def _check(state: Arrays, expected: Arrays, path: Path) -> None:
+    """See that a snapshot has arrays of the names, types and shapes of those that are expected."""
+    for name, like in expected.items():
+        _require(name in state, f"{name} is missing", path)
+        array = state[name]
+        kinds = [(each.dtype.kind, each.ndim) if name in ANY_LENGTH else (each.dtype, each.shape) for each in (array, like)]
+        found = f"{name} is {array.dtype} of shape {array.shape}, must be {like.dtype} of shape {like.shape}"
+        _require(kinds[0] == kinds[1], found, path)
+
+
+def _require(fits: bool, otherwise: str, path: Path) -> None:
+    if not fits:
+        raise ConfigError(f"{path}: {otherwise}; it is damaged, or of other settings; -i trains an agent of the run further")
 
 
 def _with_prefix(prefix: str, arrays: Arrays) -> Arrays:
@@ -147,7 +195,7 @@ def _replay_buffers(model: Any) -> dict[str, ReplayBuffer]:
 
 
 def _filled(buffer: ReplayBuffer) -> Arrays:
-    """Views of the rows that a replay buffer holds, by name.
+    """Views of the rows that a replay buffer of this ``pos`` and ``full`` holds, by name.
 
     :raises ConfigError: observations that are a Dict.
     """
@@ -157,28 +205,45 @@ def _filled(buffer: ReplayBuffer) -> Arrays:
     return {name: array[:rows] for name, array in vars(buffer).items() if isinstance(array, np.ndarray)}
 
 
-def _fill(buffer: ReplayBuffer, arrays: Arrays) -> None:
-    """Give a new replay buffer the rows of :func:`_filled`, and its ``pos`` and ``full``."""
-    for name in arrays.keys() - {"pos", "full"}:
-        getattr(buffer, name)[: len(arrays[name])] = arrays[name]
-    buffer.pos, buffer.full = int(arrays["pos"]), bool(arrays["full"])
-
-
 def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:
     """Let evaluations, best model and episodes be those of the snapshot, so that nothing is there twice."""
-    for path in run.path.glob("evaluations*.npz"):
-        rows = read_arrays(path)
+    evaluations = {path: read_arrays(path) for path in run.path.glob("evaluations*.npz")}
+    for path, rows in evaluations.items():
+        is_table = "timesteps" in rows and len({each.shape[:1] for each in rows.values()}) == 1
+        _require(is_table and rows["timesteps"].dtype.kind == "i", "holds no evaluations", path)
+    for path, rows in evaluations.items():
         earlier = rows["timesteps"] <= timesteps
         if not earlier.any():
             path.unlink()
         elif not earlier.all():
             write_arrays(path, **{name: array[earlier] for name, array in rows.items()})
-    if "best_model" in state:
+    if state["best_model"].size:
         write_bytes(run.best_model, state["best_model"].tobytes())
     else:
         run.best_model.unlink(missing_ok=True)
     if run.episodes.is_file():
-        os.truncate(run.episodes, min(run.episodes.stat().st_size, int(state.get("episodes", 0))))
+        os.truncate(run.episodes, min(run.episodes.stat().st_size, int(state["episodes"])))
+
+
+def log_state(logger: Logger) -> Any:
+    """What was recorded since the logger's last dump, such as the losses of the latest update, as JSON."""
+    numbers = {name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))}
+    kept = {name: (float(each), logger.name_to_count[name], logger.name_to_excluded[name]) for name, each in numbers.items()}
+    return np.array(json.dumps(kept))
+
+
+def set_log(logger: Logger, state: Any, path: Path) -> None:
+    """Record what :func:`log_state` gave.
+
+    :raises ConfigError: something else, which the file at ``path`` holds.
+    """
+    try:
+        kept = LOG.validate_python(json.loads(str(state)))
+    except ValueError as error:
+        raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
+    for name, (value, count, excluded) in kept.items():
+        logger.name_to_value[name], logger.name_to_excluded[name] = value, excluded
+        logger.name_to_count[name] = count
 
 
 def random_state() -> Arrays:

@@ -30,6 +30,8 @@ from sb3_quad.callbacks.every import Checkpoint
 from sb3_quad.callbacks.interruption import Snapshot
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.controllers.zips import load_model
+from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.training.algorithms import get_algorithm, takes_expert
 from sb3_quad.training.config import TrainingConfig, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
@@ -91,7 +93,7 @@ def train(
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
     """Go on with an interrupted or killed run, in its folder: same settings, seed, optimiser, dataset and step count.
 
-    A run that has not come to its first rollout is begun.
+    A run that has not come to its first rollout is begun; one that is complete gives its result.
 
     :param changes: arguments of the job to change, such as ``progress``.
     :raises SB3QuadError: a folder without such a run, one that another process trains, or with damaged files; else as
@@ -105,6 +107,9 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
     given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs", *MADE_WITH)}
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
     with StopSignals() as signals, locked(run.path, "run folder"), _environments(job) as (env, eval_envs):
+        if run.timesteps >= config.n_timesteps:
+            report(f"complete, {run.timesteps:,} timesteps; to train its agent further: -i {run.path}")
+            return TrainingResult(job, run, load_model(run.model, job.device), trained_seconds(run))
         if run.not_begun:
             model = build_model(job, env)
         else:
@@ -138,7 +143,8 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
 def _expert(config: TrainingConfig) -> dict[str, Any]:
     if not takes_expert(get_algorithm(config.algo)):
         return {}
-    return {"expert": resolve_expert(config.expert, config.env_kwargs.get("vehicle", "itm"))}
+    vehicle, layout = config.env_kwargs.get("vehicle", "itm"), config.env_kwargs.get("rotor_layout")
+    return {"expert": resolve_expert(config.expert, vehicle, layout=layout)}
 
 
 def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
@@ -207,6 +213,7 @@ def _learn(
             report=report,
             others={task: env for task, env in eval_envs.items() if task is not None},
             should_continue=should_continue,
+            by=job.config.best_by,
         )
         callbacks.append(best)
     if job.save_freq > 0:
@@ -226,8 +233,8 @@ def _learn(
                 tb_log_name=f"{config.algo}_{run.path.name}",
                 reset_num_timesteps=model.num_timesteps == 0,
             )
-            if best is not None and signals.received is None and not best.stopped:
-                best.evaluate()
+            if best is not None and signals.received is None and not best.stopped and best.latest < model.num_timesteps:
+                best.evaluate()  # a callback has ended the training before its time
         finally:
             signals.hold()
     except (Exception, KeyboardInterrupt) as error:
@@ -238,6 +245,7 @@ def _learn(
     if signals.received is None:
         save_model(model, run.model)
         run.resume_state.unlink(missing_ok=True)
+        _refuse_removed(run, model.num_timesteps)
         return TrainingResult(job, run, model, seconds)
     after = "before the first rollout"
     if last_good.snapshot is not None:
@@ -247,8 +255,23 @@ def _learn(
             last_good.write()
         except ConfigError as error:
             raise ConfigError(f"{error}; interrupted {after}") from error
+        _refuse_removed(run, last_good.snapshot.timesteps)
     report(f"interrupted by {signals.name} {after}; to go on: --resume {run.path}")
     return TrainingResult(job, run, model, seconds, signals.name, signals.exit_code)
+
+
+def trained_seconds(run: RunFolder) -> float:
+    """Wall-clock time that a complete run took, as far as its evaluations say."""
+    return float(read_curve(run.path).seconds[-1]) if run.evaluations.is_file() else 0.0
+
+
+def _refuse_removed(run: RunFolder, timesteps: int) -> None:
+    """:raises TrainingError: the run's folder was removed while it trained, and has been made again for the model alone."""
+    if not run.arguments.is_file():
+        raise TrainingError(
+            f"run folder {run.path}: was removed while the training wrote to it; the model after {timesteps:,} timesteps is in"
+            f" {run.model}, the run's settings and what it had noted before are lost"
+        )
 
 
 def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None, model: BaseAlgorithm) -> None:

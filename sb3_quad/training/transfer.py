@@ -11,8 +11,32 @@ from stable_baselines3.common.save_util import load_from_zip_file
 
 from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.base.files import one_line
+from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.zips import load_model
+from sb3_quad.training.config import TrainingConfig
+
+
+def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) -> dict[str, Any]:
+    """``changes`` to a settings file, and with them what makes its agent's successor: observation and networks, as in the zip.
+
+    What ``changes`` give themselves holds. Evaluations fly with the agent's integral, if it has one, as it does; training does
+    without. A zip that says nothing of its flights changes nothing.
+
+    :param config: what the file and ``changes`` alone amount to.
+    """
+    own, source = agent_settings(path)
+    if source is None or config.task is None:
+        return changes
+    seen = {name: own.observed[name] for name in ("last_action", "history", "observation_mean", "observation_std")}
+    flown = {"position_integral": own.observed["position_integral"]}
+    given = {**changes, "env_kwargs": {**seen, **changes.get("env_kwargs", {})}}
+    given["eval_env_kwargs"] = {**flown, **config.eval_env_kwargs, **changes.get("eval_env_kwargs", {})}
+    if "policy_kwargs" not in changes and not config.is_off_policy:
+        policy: Any = load_model(path).policy
+        unit = f"nn.{policy.activation_fn.__name__}"  # as config.yml names it
+        given["policy_kwargs"] = {**config.policy_kwargs, "net_arch": policy.net_arch, "activation_fn": unit}
+    return given
 
 
 def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
@@ -48,7 +72,8 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
         model.policy.load_state_dict(theirs)
     except RuntimeError as error:
         what = one_line(error).partition(": ")[2]
-        raise ConfigError(f"{path}: environment spaces and policy_kwargs must be the same ({what})") from None
+        way_out = "train takes them from it unless --conf-file is given"
+        raise ConfigError(f"{path}: environment spaces and policy_kwargs must be the same ({what}); {way_out}") from None
 
 
 CLONE_ROWS = 20_000  # states that are flown for a clone, at least

@@ -2,7 +2,6 @@
 
 import inspect
 import math
-import pkgutil
 from contextlib import suppress
 from typing import Any
 
@@ -13,6 +12,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError
+from sb3_quad.base.imports import import_name
 from sb3_quad.base.literals import parse_mapping, parse_number, parse_value
 
 BASES: dict[str, type] = {"callback": BaseCallback, "env_wrapper": gymnasium.Wrapper, "vec_env_wrapper": VecEnvWrapper}
@@ -100,9 +100,9 @@ def import_class(path: str, where: str) -> Any:
     :raises ConfigError: a module or a name that is not there, or anything but a class of the kind that the key is for.
     """
     try:
-        found = pkgutil.resolve_name(path)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ConfigError(f"{where}: {path} cannot be imported ({error})") from None
+        found = import_name(path)
+    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+        raise ConfigError(f"{where}: {path} cannot be imported ({type(error).__name__}: {error})") from None
     base = BASES[where]
     if not (isinstance(found, type) and issubclass(found, base)):
         raise ConfigError(f"{where}: {path} is no {base.__name__}; name a subclass of {base.__module__}.{base.__name__}")

@@ -41,6 +41,7 @@ BEGUN_WITH = "begun_with"  # user attribute of a study: what all its trials shar
 OWNER = "owner"  # user attribute of a trial: the machine and the process that train it
 SETTINGS, SUCCESS, REWARD, RUN, ERROR = "settings", "success_rate", "mean_reward", "run", "error"  # others
 INTERRUPTED = "interrupted"  # the error of trials that are tried again
+AGAIN = {"again": True}  # user attributes of the trials that do so
 
 
 class Search:
@@ -131,7 +132,7 @@ class Search:
             trial.set_user_attr(ERROR, f"{type(error).__name__}: {one_line(error)}")
         except KeyboardInterrupt:
             trial.set_user_attr(ERROR, INTERRUPTED)
-            self.study.enqueue_trial(trial.params)
+            self.study.enqueue_trial(trial.params, AGAIN)
         return None, TrialState.FAIL
 
     def _value(self, trial: optuna.Trial) -> float | None:
@@ -142,7 +143,7 @@ class Search:
         config = build_config(known.algo, known.env_id, settings, f"trial {trial.number}")
         rollout = config.rollout_steps * config.n_envs
         total = math.ceil(config.n_timesteps / rollout) * rollout  # the last rollout is a whole one
-        every = total // count + 1 if count > 1 else -1  # never due with the last timestep: that one follows the last update
+        every = math.ceil(total / count)
         evaluations: list[float] = []
 
         def should_continue(success: float, reward: float) -> bool:
@@ -191,6 +192,8 @@ class Search:
 class NumberedSampler(BaseSampler):
     """One of :data:`SAMPLERS`, made anew for each trial, from a seed, the trial's number and the trials known.
 
+    The number is that among the trials that do not try another again.
+
     So processes that share a study propose different trials, and a study that is resumed goes on as if never left.
     """
 
@@ -198,7 +201,8 @@ class NumberedSampler(BaseSampler):
         self._kind, self._seed, self._startup = kind, seed, n_startup_trials
 
     def infer_relative_search_space(self, study: optuna.Study, trial: FrozenTrial) -> dict[str, BaseDistribution]:
-        own = int(np.random.SeedSequence([self._seed, trial.number]).generate_state(1)[0])
+        again = sum("again" in each.user_attrs for each in study.get_trials(deepcopy=False) if each.number < trial.number)
+        own = int(np.random.SeedSequence([self._seed, trial.number - again]).generate_state(1)[0])
         self._sampler = SAMPLERS[self._kind](own, self._startup)
         return self._sampler.infer_relative_search_space(study, trial)
 
@@ -238,7 +242,7 @@ def retry_dead_trials(study: optuna.Study) -> None:
                 os.kill(process, 0)  # does nothing but fail where there is none
             except ProcessLookupError:
                 study.tell(trial.number, state=TrialState.FAIL)
-                study.enqueue_trial(trial.params)
+                study.enqueue_trial(trial.params, AGAIN)
             except PermissionError:  # another user's
                 pass
 

@@ -10,12 +10,15 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import CannotHover, ConfigError
+from sb3_quad.base.notices import tell
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.vehicles.gains import GeometricGains
+from sb3_quad.vehicles.layout import Turn, find_turn
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 MAX_SUBSTEPS = 1000  # physics steps in a control step
+INACCURACY = 1.05  # of published moments of inertia: what the largest may be by the sum of the other two
 MAX_PHYSICS_STEP = 0.0025  # s, for which the compiled rotation is exact
 PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
@@ -26,7 +29,6 @@ PARAMETER_NAMES = (
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
 )
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
-LAYOUT_ANGLE = math.radians(20.0)  # by which rotors in the same place may differ, seen from the centre of mass
 Limits = tuple[NonNegativeFloat, PositiveFloat]
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 
@@ -95,9 +97,8 @@ class Vehicle(Frozen):
             raise CannotHover(f"{limits}: hover (1.0) must lie between them, or it cannot hover; is the mass in kg?")
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
             raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
-        ixx, iyy, izz = self.inertia
-        if max(ixx, iyy, izz) > (ixx + iyy + izz) / 2 * (1 + 1e-9):
-            raise ValueError(f"inertia {list(self.inertia)}: no rigid body has one moment larger than the other two together")
+        if self.largest_moment > INACCURACY:
+            raise ValueError(f"inertia {list(self.inertia)}: {self.inertia_fault}")
         substeps = self.control_step / self.physics_step
         if abs(substeps - round(substeps)) > 1e-9 or not 1 <= round(substeps) <= MAX_SUBSTEPS:
             raise ValueError(
@@ -127,6 +128,19 @@ class Vehicle(Frozen):
         own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & {*LIMITS} else None)
         return Vehicle.model_validate({**own, **changes})
 
+    def turn_to(self, other: "Vehicle") -> Turn:
+        """The turn of the body axes, and the order of the rotors, by which each is where ``other`` has it.
+
+        :raises ConfigError: there is none.
+        """
+        turn = find_turn(self.rotor_positions, self.rotor_directions, other.rotor_positions, other.rotor_directions)
+        if turn is None:
+            raise ConfigError(
+                f"rotor_layout: no turn brings the rotors of {self.name} to where those of {other.name} are, directions "
+                "included; an agent flies only vehicles whose rotors are where it knows them, once turned and renumbered"
+            )
+        return turn
+
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
         """The same vehicle, its body axes turned about z and its rotors renumbered: each is where ``other`` has it.
 
@@ -136,23 +150,17 @@ class Vehicle(Frozen):
         :raises ConfigError: no turn brings its rotors there; or it would turn axes of different moments of inertia, off which
             there are products of inertia.
         """
-        ours, theirs = (np.array(each.rotor_positions) @ (1.0, 1.0j) for each in (self, other))
-        for turn in theirs[0] / ours:
-            turned = ours * turn / abs(turn)
-            order = [int(np.abs(np.angle(turned / each)).argmin()) for each in theirs]
-            near = bool((np.abs(np.angle(turned[order] / theirs)) < LAYOUT_ANGLE).all())
-            if near and [self.rotor_directions[k] for k in order] == [*other.rotor_directions]:
-                break
-        else:
-            raise ConfigError(f"rotor_layout: no turn brings the rotors of {self.name} to where those of {other.name} are")
-        (cosine, sine), (ixx, iyy, izz) = (turn.real / abs(turn), turn.imag / abs(turn)), self.inertia
-        if abs(turn.imag) < 1e-9 * abs(turn) and order == [0, 1, 2, 3]:
+        turn = self.turn_to(other)
+        if turn == Turn():
             return self
+        cosine, sine, (ixx, iyy, izz) = math.cos(turn.angle), math.sin(turn.angle), self.inertia
         if abs((ixx - iyy) * sine * cosine) > 0.02 * min(ixx, iyy):
-            raise ConfigError(f"rotor_layout: {self.name} has to be turned, but its Ixx and Iyy differ")
+            turned = f"{self.name} has to be turned by {math.degrees(turn.angle):.0f}° to the layout of {other.name}"
+            raise ConfigError(f"rotor_layout: {turned}, but its Ixx and Iyy differ")
+        positions = (np.array(self.rotor_positions) @ turn.axes[:2, :2].T)[[*turn.order]]
         changes = {
             "inertia": (ixx * cosine**2 + iyy * sine**2, ixx * sine**2 + iyy * cosine**2, izz),
-            "rotor_positions": tuple((float(each.real), float(each.imag)) for each in turned[order]),
+            "rotor_positions": tuple(map(tuple, positions.tolist())),
             "rotor_directions": other.rotor_directions,
             "geometric_gains": self.geometric_gains,
         }
@@ -215,6 +223,18 @@ class Vehicle(Frozen):
         return np.asarray(np.sqrt(np.array(self.inertia) / self.mass) / self.arm_length)
 
     @property
+    def largest_moment(self) -> float:
+        """The largest moment of inertia by the sum of the other two; of a rigid body at most 1."""
+        return max(self.inertia) / (sum(self.inertia) - max(self.inertia))
+
+    @property
+    def inertia_fault(self) -> str:
+        """Why no rigid body has this inertia; empty where one can."""
+        excess = self.largest_moment - 1.0
+        fault = f"no rigid body has one moment larger than the other two together, here by {100 * excess:.2g} %"
+        return fault if excess > 1e-9 else ""
+
+    @property
     def hover_rotor_speed(self) -> float:
         """Speed of one rotor in hover, rad/s."""
         return math.sqrt(self.hover_thrust / self.thrust_coefficient)
@@ -250,19 +270,28 @@ class Vehicle(Frozen):
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
 
+    An inertia that no rigid body has, but within ``INACCURACY``, is said once on stderr.
+
     :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
     """
     if isinstance(source, Vehicle):
         return source
     data, where = VEHICLES.read(source if isinstance(source, Path) else str(source))
-    return validate(Vehicle, data, where)
+    vehicle = validate(Vehicle, data, where)
+    if vehicle.inertia_fault:
+        tell(f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; it is flown as it is")
+    return vehicle
 
 
-def first_vehicle(given: Any) -> Vehicle:
-    """As :func:`load_vehicle`; of a list of vehicles, as ``env_kwargs`` may have one, the first."""
+def first_vehicle(given: Any, layout: str | Path | Vehicle | None = None) -> Vehicle:
+    """As :func:`load_vehicle`; of a list of vehicles, as ``env_kwargs`` may have one, the first.
+
+    :param layout: the vehicle in whose layout it is flown, as of ``rotor_layout``; None: its own.
+    """
     if isinstance(given, (list, tuple)):
         if not given:
             raise ConfigError("vehicle []: give at least one")
         given = given[0]
-    return load_vehicle(given)
+    vehicle = load_vehicle(given)
+    return vehicle if layout is None else vehicle.in_layout_of(load_vehicle(layout))

@@ -1,4 +1,4 @@
-"""Kills trainings at random moments, lets them go on, and compares them with undisturbed ones.
+"""Kills commands at random moments, lets them go on, and compares what they leave with what undisturbed ones leave.
 
     python tests/faults/campaign.py FOLDER KILLS [SEED]
 
@@ -6,11 +6,15 @@ Prints a line for each kill that cost something, and in the end how many there w
 forks of this process, which has imported everything and has no threads: a kill may then hit their first millisecond.
 """
 
+import csv
+import multiprocessing
 import os
 import random
+import re
 import signal
 import sys
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -18,11 +22,13 @@ import torch
 import yaml
 from stable_baselines3.common.save_util import load_from_zip_file
 
+import sb3_quad.callbacks.interruption
 import sb3_quad.cli.closing
+import sb3_quad.executors.local
 import sb3_quad.training.trim
 from sb3_quad.cli import main
 
-RUNS = ("dagger", "ppo_bc", "pipeline")
+RUNS = ("dagger", "ppo_bc", "pipeline", "sac_bc", "evaluate", "sweep", "tune", "ppo", "sac")
 TINY = {
     "n_timesteps": 8000,
     "n_envs": 16,
@@ -33,6 +39,35 @@ TINY = {
     "policy_kwargs": {"net_arch": [16]},
 }
 DAGGER = {**TINY, "dataset_capacity": 4000, "gradient_steps": 5}  # a ring that has been round
+OFF_POLICY = {
+    **{key: TINY[key] for key in ("n_envs", "env_kwargs", "policy_kwargs")},
+    "n_timesteps": 4000,
+    "learning_starts": 400,
+    "train_freq": 5,
+    "buffer_size": 2000,
+    "batch_size": 64,
+}
+SETTINGS = {"dagger": DAGGER, "tune": {**DAGGER, "n_timesteps": 4000}, "sac": OFF_POLICY, "sac_bc": OFF_POLICY}
+MARKS = {"pipeline": "pipeline.yml", "sweep": "plan.json"}  # what a folder has that somebody goes on with; a run */args.yml
+NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline|sweep)_\d+"
+SUITE = """
+name: one
+scenarios:
+  - {name: near, target: {distance: 1}, duration: 2, episodes: 400}
+  - {name: thrown, start: {attitude: {distribution: uniform}, velocity: {std: 2}}, duration: 2, episodes: 400}
+"""
+SWEEP = {
+    **{key: DAGGER[key] for key in ("n_timesteps", "n_envs", "env_kwargs")},
+    "hyperparams": {key: DAGGER[key] for key in DAGGER if key not in ("n_timesteps", "n_envs", "env_kwargs")},
+    "name": "sweep",
+    "conf_file": "nominal/dagger.yml",
+    "algo": "dagger",
+    "env": "QuadTargetTracking-v0",
+    "seed": [0, 1],
+    "eval_freq": 2000,
+    "eval_episodes": 4,
+    "evaluation": {"episodes": 4},
+}
 STAGES = [
     {
         "name": "one",
@@ -55,14 +90,26 @@ STAGES = [
 
 
 def command(kind: str, folder: Path) -> list[str]:
-    """Arguments of a training of a second or two, into ``folder``."""
-    settings = folder / f"{kind}.yml"
+    """Arguments of a command of a few seconds, into ``folder``."""
+    logs, settings = folder / "logs", folder / f"{kind}.yml"
     folder.mkdir(exist_ok=True)
-    content = {"stages": STAGES} if kind == "pipeline" else {"QuadTargetTracking-v0": DAGGER if kind == "dagger" else TINY}
-    settings.write_text(yaml.safe_dump(content))
+    if kind == "evaluate":
+        settings.write_text(SUITE)
+        return ["evaluate", "pid", "geometric", "itm-recovery", "--suite", str(settings), "-o", str(logs / kind / "out")]
+    small = {"QuadTargetTracking-v0": SETTINGS.get(kind, TINY)}
+    settings.write_text(yaml.safe_dump({"stages": STAGES} if kind == "pipeline" else small))
+    if kind == "sweep":
+        settings.write_text(yaml.safe_dump(SWEEP))
+        return ["sweep", str(settings), "-f", str(logs), "--workers", "2", "--no-progress"]
+    more = ["--conf-file", str(settings), "-f", str(logs), "--no-progress"]
+    if kind == "tune":
+        space = folder / "space.yml"
+        space.write_text("learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}\n")
+        more += ["--search-space", str(space), "--storage", str(folder / "study.log"), "--max-total-trials", "3"]
+        return ["tune", "--algo", "dagger", *more, "--eval-episodes", "4", "--n-evaluations", "2"]
     single = [] if kind == "pipeline" else ["--algo", kind, "--env", "QuadTargetTracking-v0"]
-    more = ["--eval-freq", "2000", "--eval-episodes", "4", "--save-freq", "4000", "--snapshot-every", "0.2"]
-    return ["train", *single, "--conf-file", str(settings), "-f", str(folder / "logs"), *more, "--no-progress"]
+    often = ["--eval-freq", "1500", "--eval-episodes", "4", "--save-freq", "4000", "--snapshot-every", "0.2"]
+    return ["train", *single, *more, *often]
 
 
 def forked(arguments: list[str], log: Path, folder: str | Path = ".", seconds: int = 0) -> int:
@@ -102,36 +149,44 @@ def run(arguments: list[str], log: Path, kill_after: float | None = None) -> int
 
 def again(kind: str, folder: Path) -> list[str]:
     """What a user types after a kill: ``--resume``, or the same command if there is nothing to go on with yet."""
-    if kind == "pipeline":
-        begun = [path.parent for path in folder.glob("logs/pipeline/*/pipeline.yml")]
-    else:
-        begun = [path.parent.parent for path in folder.glob(f"logs/{kind}/*/*/args.yml")]
-    return ["train", "--resume", str(begun[-1])] if begun else command(kind, folder)
+    begun = {"pipeline": "pipeline/*/pipeline.yml", "sweep": "sweep/*/plan.json"}.get(kind, f"{kind}/*/*/args.yml")
+    found = sorted(folder.glob(f"logs/{begun}"))
+    if not found:
+        return command(kind, folder)
+    place = found[-1].parent if kind in ("pipeline", "sweep") else found[-1].parent.parent
+    return ["sweep" if kind == "sweep" else "train", "--resume", str(place)]
 
 
-def at_its_end(kind: str, folder: Path) -> bool:
-    """Whether a single run's model is saved already, and only its table was cut short."""
-    zips = [*folder.glob(f"logs/{kind}/*/Quad*.zip")]
-    return kind != "pipeline" and bool(zips) and not (zips[0].parent / "resume.npz").exists()
+def never_began(path: Path) -> bool:
+    """Whether a file is in a folder of a command that was killed before it had written its settings; it is nobody's."""
+    folders = [each for each in path.parents if re.fullmatch(NUMBERED, each.name)]
+    return not all(any(each.glob(MARKS.get(each.name.rpartition("_")[0], "*/args.yml"))) for each in folders)
 
 
 def outcome(folder: Path) -> dict[str, object]:
-    """What the trainings have left, by file: weights of agents, rows of evaluations and episodes, only names else.
+    """What a command has left, by file: weights of agents, all arrays and numbers but seconds and dates; only names else.
 
-    A run that was killed before its settings were written never began; what is half-written there is nobody's.
+    Of a search: settings and values of its trials that were finished, in their order.
     """
     found: dict[str, object] = {}
+    tables = sorted(folder.glob("logs/tune/*/*/trials.csv"), key=lambda path: path.stat().st_mtime_ns)
+    if tables:  # the runs of killed trials are there beside those that were tried again
+        rows = csv.DictReader(tables[-1].read_text().splitlines())
+        return {"trials": [(row["learning_rate"], row["value"]) for row in rows if row["state"] == "COMPLETE"]}
     for path in sorted(folder.glob("logs/*/*/**/*")):
-        if path.name.endswith(".tmp") and not (path.parent / "args.yml").exists():
+        if never_began(path):
             continue
-        name = "/".join(part.rsplit("_", 1)[0] if part[-1].isdigit() else part for part in path.relative_to(folder).parts)
+        name = re.sub(rf"(?<=/){NUMBERED}(?=/|$)", r"\1", str(path.relative_to(folder)))
         if path.suffix == ".zip":
             found[name] = {key: each.tolist() for key, each in load_from_zip_file(path, device="cpu")[1]["policy"].items()}
-        elif path.name.startswith("evaluations"):
+        elif path.suffix == ".npz":
             with np.load(path) as file:
-                found[name] = [file[key].tolist() for key in ("timesteps", "results", "successes")]
-        elif path.name == "0.monitor.csv":
-            found[name] = [line.split(",")[:2] for line in path.read_text().splitlines()[1:]]
+                found[name] = {key: (file[key].dtype.str, file[key].tobytes()) for key in file.files if key != "seconds"}
+        elif path.name in ("0.monitor.csv", "episodes.csv"):
+            timed = path.name == "0.monitor.csv"
+            found[name] = [line.split(",")[: 2 if timed else None] for line in path.read_text().splitlines()[timed:]]
+        elif path.name == "results.json":
+            found[name] = re.sub(r'"(seconds|date)": [^,}\n]+', "", path.read_text())
         elif path.is_file():
             found[name] = None
     return found
@@ -140,13 +195,17 @@ def outcome(folder: Path) -> dict[str, object]:
 def campaign(folder: Path, kills: int, seed: int) -> int:
     """How many kills cost something."""
     for module, name, value in (
+        (sb3_quad.cli.closing, "FRESH_EPISODES", 4),
         (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
+        (sb3_quad.callbacks.interruption, "PAUSE", 0.1),
+        (sb3_quad.executors.local, "_context", lambda: multiprocessing.get_context("fork")),  # workers need not import again
         (sb3_quad.training.trim, "N_FLIGHTS", 4),
         (sb3_quad.training.trim, "N_HEADINGS", 4),
     ):
         assert hasattr(module, name)
         setattr(module, name, value)
     rng, done, failed, trial = random.Random(seed), 0, 0, 0
+    kills_of = Counter[str]()
     whole: dict[str, dict[str, object]] = {}
     seconds: dict[str, float] = {}
     while done < kills:
@@ -162,15 +221,16 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
             if code is not None:
                 break
             done += 1
+            kills_of[kind] += 1
             arguments = again(kind, place)
         if code is None:
-            code = 0 if at_its_end(kind, place) else run(arguments, log)
+            code = run(arguments, log)
         ours = outcome(place)
         differing = sorted(name for name in ours | whole[kind] if ours.get(name, 0) != whole[kind].get(name, 0))
         if code != 0 or differing:
             failed += 1
             print(f"{place.name}: exit code {code}, differing: {differing}; {log.read_text()[-600:]}")
-    print(f"{done} kills, {failed} cost something")
+    print(f"{done} kills of {', '.join(f'{kind} {count}' for kind, count in kills_of.items())}; {failed} cost something")
     return failed
 
 

@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 import publish
 import pytest
+from optuna.distributions import FloatDistribution
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.evaluation.results import load_results
-from sb3_quad.tuning.search import OWNER, open_study, retry_dead_trials
+from sb3_quad.tuning.search import OWNER, NumberedSampler, open_study, retry_dead_trials
 
 
 def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
@@ -35,6 +36,17 @@ def test_trials_without_a_process_are_tried_again(tmp_path, process, dead):
     study.ask().set_user_attr(OWNER, [platform.node(), process])
     retry_dead_trials(study)
     assert [trial.state.name for trial in study.trials] == (["FAIL", "WAITING"] if dead else ["RUNNING"])
+
+
+def test_a_trial_that_is_tried_again_moves_no_later_one(tmp_path):
+    space = {"gamma": FloatDistribution(0.5, 1.0)}
+    whole, killed = (open_study(name, tmp_path / "study.log") for name in ("whole", "killed"))
+    whole.sampler, killed.sampler = NumberedSampler("random", 0, 0), NumberedSampler("random", 0, 0)
+    wanted = [whole.ask(space).params for _ in range(3)]
+    asked = [killed.ask(space) for _ in range(2)]
+    asked[1].set_user_attr(OWNER, [platform.node(), 2**22 + 1])
+    retry_dead_trials(killed)
+    assert [asked[0].params, *(killed.ask(space).params for _ in range(2))] == wanted
 
 
 class KilledAtSecond(BaseCallback):

@@ -1,6 +1,7 @@
 """What comes from strangers, zips, run folders and settings, runs nothing of theirs: each would leave a file named MARK."""
 
 import base64
+import io
 import json
 import os
 import pickle
@@ -12,10 +13,13 @@ import numpy as np
 import pytest
 import torch
 from stable_baselines3 import A2C, DDPG, DQN, PPO, SAC, TD3
+from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import CloudpickleWrapper
 
+from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.controllers.agent_settings import agent_settings
@@ -64,6 +68,19 @@ PICKLES = {
 }
 
 
+def changed(name: str, hook: tuple[str, str]) -> bytes:
+    """Sets an attribute of a class, by which each is taken for a subclass of it; then SB3's own wrapper of pickles."""
+    state = b"N}" + text("__subclasshook__") + text(hook[0]) + text(hook[1]) + b"\x93s\x86"
+    wrapper = pickle.dumps(CloudpickleWrapper(FOREIGN), 4)[11:]  # without its own PROTO and FRAME
+    return b"\x80\x04" + text("stable_baselines3.common.buffers") + text(name) + b"\x93" + state + b"b0" + wrapper
+
+
+CHANGED = {  # not to be read by pickle here: the change would stay
+    "no class of a zip": changed("BaseBuffer", ("builtins", "bool")),
+    "a class of zips": changed("RolloutBuffer", ("numpy", "float64")),
+}
+
+
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -71,15 +88,15 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def foreign_zip(key: str, source: Path = AGENT, path: str = "foreign.zip") -> str:
+def foreign_zip(key: str, source: Path = AGENT, path: str = "foreign.zip", content: bytes = PICKLES["os.system"]) -> str:
     """A copy of an agent's zip, in which a pickle is put; as an attribute of the model, or as a file of weights."""
     with zipfile.ZipFile(source) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     if key.endswith(".pth"):
-        parts[key] = PICKLES["os.system"]
+        parts[key] = content
     else:
         data = json.loads(parts["data"])
-        data[key] = {":type:": "harmless", ":serialized:": base64.b64encode(PICKLES["os.system"]).decode()}
+        data[key] = {":type:": "harmless", ":serialized:": base64.b64encode(content).decode()}
         parts["data"] = json.dumps(data).encode()
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in parts.items():
@@ -101,6 +118,20 @@ def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
     assert not MARK.exists()
     pickle.loads(PICKLES[name])
     assert MARK.exists()  # so it does what it is here for
+
+
+@pytest.mark.parametrize("content", CHANGED.values(), ids=CHANGED)
+def test_no_class_is_changed(content, capsys, dagger_run):
+    with pytest.raises(ConfigError, match=r"here (names \S+BaseBuffer|is not what Stable-Baselines3 pickles).* --trust"):
+        unpickle(base64.b64encode(content).decode(), "here")
+    assert main(["enjoy", foreign_zip("policy_kwargs", content=content), "--no-render", "-n", "1"]) == 2
+    foreign_zip("lr_schedule", dagger_run / "QuadStateRecovery-v0.zip", content=content)
+    model = np.fromfile("foreign.zip", dtype=np.uint8)
+    np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=model)
+    assert main(["train", "--resume", str(dagger_run)]) == 2
+    assert len([line for line in capsys.readouterr().err.splitlines() if "--trust" in line]) == 2
+    assert not any("__subclasshook__" in vars(kind) for kind in (BaseBuffer, RolloutBuffer))
+    assert not MARK.exists()
 
 
 @pytest.mark.parametrize(
@@ -222,3 +253,49 @@ def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
     with pytest.raises(ConfigError, match=r"foreign\.zip: flight_settings: name: "):
         agent_settings("foreign.zip")
     assert sorted(path.name for path in here.rglob("*")) == ["foreign.yaml", "foreign.zip", "own"]
+
+
+def zip_with(changes: dict) -> str:
+    """A copy of an agent's zip, some attributes of whose JSON are others."""
+    with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:
+        for name in archive.namelist():
+            content = archive.read(name)
+            copy.writestr(name, json.dumps(json.loads(content) | changes) if name == "data" else content)
+    return "foreign.zip"
+
+
+@pytest.mark.parametrize("source", ["/dev/zero", "fifo.yaml", "./fifo"])
+@pytest.mark.parametrize("key", ["rotor_layout", "vehicles", "vehicles.distribution", "vehicle"])
+def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
+    os.mkfifo("fifo.yaml")  # who opens it waits for ever
+    settings = agent_settings(AGENT)[0].model_dump(mode="json")
+    name, _, inner = key.partition(".")
+    foreign = zip_with({"flight_settings": settings | {name: {inner: source} if inner else source}})
+    assert main(["enjoy", foreign, "--no-render", "-n", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: foreign.zip: flight_settings: " + (f"{name}: " if name != "vehicle" else ""))
+
+
+def test_a_zip_names_what_comes_with_the_package():
+    settings = agent_settings(AGENT)[0].model_dump(mode="json")
+    named = {"rotor_layout": "itm", "vehicles": {"distribution": "raptor"}}
+    assert agent_settings(zip_with({"flight_settings": settings | named}))[0].rotor_layout == "itm"
+
+
+def test_a_zip_imports_nothing(monkeypatch):
+    """SB3 makes the environment that a zip names, and Gymnasium imports a module that stands before its colon."""
+    Path("foreign_module.py").write_text(f"open({str(MARK)!r}, 'w')")
+    monkeypatch.syspath_prepend(".")
+    foreign = zip_with({"env": "foreign_module:Foreign-v0", "expert": "foreign_module:factory"})
+    assert load_zip(DAgger, foreign, device="cpu").expert is None
+    assert load_model(foreign).env is None
+    assert not MARK.exists()
+
+
+def test_weights_are_put_only_where_algorithms_have_some():
+    """SB3 writes what is beside the weights wherever its name leads, as to a class of its own."""
+    buffer = io.BytesIO()
+    torch.save({"policy_class": torch.zeros(1)}, buffer)
+    with pytest.raises(ConfigError, match="holds variables that no algorithm has"):
+        load_model(foreign_zip("pytorch_variables.pth", content=buffer.getvalue()))
+    assert not hasattr(ActorCriticPolicy, "data")

@@ -1,5 +1,6 @@
 """Whatever ends a training, it goes on from its snapshot to the same agent, and its files say nothing twice."""
 
+import shutil
 import signal
 
 import numpy as np
@@ -9,7 +10,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.algorithms.dagger import DAgger
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli import main
@@ -76,7 +77,8 @@ def the_same(run, whole):
     ours, theirs = (PPO.load(each.model).get_parameters()["policy"] for each in (run, whole))
     same = all(torch.equal(ours[name], theirs[name]) for name in theirs)
     with np.load(run.evaluations) as first, np.load(whole.evaluations) as second:
-        same &= first["timesteps"].tolist() == second["timesteps"].tolist()
+        same &= {*first} == {*second} and "train/bc_loss" in first
+        same &= all(np.array_equal(first[name], second[name], equal_nan=True) for name in {*first} - {"seconds"})
     episodes = [[line.split(",")[:2] for line in each.episodes.read_text().splitlines()[1:]] for each in (run, whole)]
     files = [sorted(path.name for path in each.path.rglob("*")) for each in (run, whole)]
     return same and episodes[0] == episodes[1] and files[0] == files[1]
@@ -168,6 +170,33 @@ def test_two_signals_within_the_update_leave_the_dataset_of_the_snapshot(tmp_pat
     monkeypatch.setattr(DAgger, "train", interrupted)
     result = train(job(tmp_path), quiet)
     assert result.signal == "SIGINT" and the_same(resume(str(result.run.path), quiet).run, whole)
+
+
+def test_a_complete_run_says_so_and_shows_its_table(whole, capsys):
+    before = {path: path.stat().st_mtime_ns for path in whole.path.rglob("*")}
+    assert main(["train", "--resume", str(whole.path)]) == 0
+    shown = capsys.readouterr().out
+    assert (
+        f"complete, 1,600 timesteps; to train its agent further: -i {whole.path}" in shown
+        and "target_tracking: 4 fresh episodes" in shown
+    )
+    assert {path: path.stat().st_mtime_ns for path in whole.path.rglob("*")} == before
+
+
+@pytest.mark.parametrize("pressed", [False, True])
+def test_a_run_folder_that_is_removed_costs_what_was_in_it_and_no_more(tmp_path, pressed):
+    run = tmp_path / "dagger" / f"{ENV}_1"
+
+    def remove():
+        shutil.rmtree(tmp_path / "dagger")
+        if pressed:
+            signal.raise_signal(signal.SIGTERM)
+
+    Trouble.what = remove
+    steps = 800 if pressed else 1600
+    with pytest.raises(TrainingError, match=rf"{run.name}: was removed .* the model after {steps:,} timesteps is in"):
+        train(job(tmp_path), quiet)
+    assert PPO.load(run / f"{ENV}.zip").num_timesteps == steps
 
 
 def test_sighup_stays_ignored_under_nohup():

@@ -4,7 +4,7 @@ examples:
   sb3-quad benchmark                                   everything, about a minute
   sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
   sb3-quad benchmark --training                        rollouts and updates of trainings
-  sb3-quad benchmark --algo ppo_bc --conf-file pid/ppo_bc.yml --output benchmark.json
+  sb3-quad benchmark --algo ppo_bc --conf-file robust/ppo_bc.yml --output benchmark.json
 """
 
 import argparse
@@ -23,7 +23,7 @@ from sb3_quad.base.files import write_text
 from sb3_quad.cli.parser import YES_OR_NO, Parser, above_zero, positive
 
 ENV_ID = "QuadTargetTracking-v0"
-TRAINED = "QuadStateRecovery-v0"  # by train without arguments
+TRAINED = "QuadStateRecovery-v0"  # in the training loops
 REPETITIONS = 5
 PACKAGES = ("sb3_quad", "stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 Rates = dict[str, list[float]]  # control steps per second of each repetition, all environments together
@@ -35,7 +35,7 @@ def add_arguments(parser: Parser) -> None:
     add("--n-envs", type=positive, default=8, metavar="N", help="environments of DummyVecEnv and SubprocVecEnv (8)")
     add("--seconds", type=above_zero, default=3.0, metavar="S", help="duration of each measurement (3)")
     add("--algo", nargs="+", default=["dagger", "ppo_bc"], help="algorithms of the training loops (dagger ppo_bc)")
-    add("-conf", "--conf-file", metavar="FILE", help="its settings (those of train without arguments)")
+    add("-conf", "--conf-file", metavar="FILE", help="its settings (ALGO.yml)")
     add("--training", help="only, or no, training loops: their rollouts and updates", **YES_OR_NO)
     add("--output", metavar="FILE", help="write everything as JSON, with versions and thread counts")
 
@@ -87,7 +87,7 @@ def _steps(sizes: list[int], n_envs: int, seconds: float) -> Iterator[tuple[int,
         settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": keywords}
         return closing(make_environments(build_config("ppo", ENV_ID, settings), n, 0))
 
-    randomize = load_config("dagger", TRAINED).env_kwargs["randomize"]
+    randomize = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
     with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
         env.reset(seed=0)
         yield 1, _rates({"PyBullet, one environment": env}, (4,), seconds)

@@ -67,7 +67,8 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
     hover = vehicle.hover_rotor_speed
     action = f"{vehicle.hover_action:+.3f}" if abs(vehicle.hover_action) > 5e-4 else "0"
     ixx, iyy, izz = vehicle.inertia
-    share = max(vehicle.inertia) / (sum(vehicle.inertia) - max(vehicle.inertia))
+    physical = "unphysical" if vehicle.inertia_fault else "physical"
+    share = f"{physical}: the largest moment is {vehicle.largest_moment:.2f} of the other two together"
     ratios = ", ".join(f"{ratio:.2f}" for ratio in vehicle.gyration_ratios)
     least, most = vehicle.thrust_limits
     up, down, sideways = (vehicle.gravity * share for share in (most - 1.0, 1.0 - least, math.sqrt(most**2 - 1.0)))
@@ -86,7 +87,7 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
         ("greatest moments", f"{', '.join(f'{each:.4g}' for each in moments)} N m about roll, pitch and yaw"),
         ("", f"which accelerate it by {turns} rad/s²"),
         ("inertia", f"{ixx:.4g}, {iyy:.4g}, {izz:.4g} kg m²"),
-        ("", f"physical: the largest moment is {share:.2f} of the other two together, at most 1 (triangle inequality)"),
+        ("", f"{share}, at most 1 (triangle inequality)"),
         ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
         (
             "motors",

@@ -151,6 +151,7 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     from sb3_quad.evaluation.controllers import ControllerSpec, build, parse_controllers
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
     from sb3_quad.simulation.settings import FlightSettings
+    from sb3_quad.vehicles.vehicle import first_vehicle
 
     env_id, specs = options.env or DEFAULT_ENV, parse_controllers(options.controllers)
     if env_id not in ENVIRONMENTS:
@@ -169,9 +170,10 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
         changes = {"task": task} | ({} if task == kept.task else {"task_kwargs": None}) | options.env_kwargs
         setting = fixed_setting(kept.with_changes(**changes), options.target)
     controllers, own = {}, {}
+    vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
-        warn(spec.notice(setting.vehicle))
-        controllers[spec.label] = build(spec, setting.vehicle)
+        warn(spec.notice(vehicle))
+        controllers[spec.label] = build(spec, vehicle)
         own[spec.label] = {name: value for name, value in spec.observed.items() if name not in options.env_kwargs}
     return setting._replace(own=own), controllers
 

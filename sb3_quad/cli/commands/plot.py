@@ -1,6 +1,7 @@
 """Draw learning curves: success, reward and losses over timesteps and wall-clock time, with mean and range over seeds.
 
 examples:
+  sb3-quad plot logs/ppo_bc/QuadStateRecovery-v0_1
   sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
   sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:32.25:-16.1 --title "state recovery" -o curves.svg
   sb3-quad plot "PPO+BC=logs/ppo_bc/QuadStateRecovery-v0_*" --thesis state_recovery --show survival reward losses
@@ -9,6 +10,7 @@ examples:
 import argparse
 import glob
 from pathlib import Path
+from typing import Any
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes
@@ -20,7 +22,7 @@ THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}  # its sc
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("groups", nargs="+", metavar="NAME=PATTERN", help="an agent's name and its run folders; quote a *")
+    add("groups", nargs="+", metavar="RUN", help="a run folder, or NAME=PATTERN: an agent's name and its runs; quote a *")
     lines = "horizontal lines: success in %%, reward"
     add("--line", action="append", default=[], type=_line, metavar="NAME:SUCCESS:REWARD", help=lines)
     thesis = f"draw what the thesis prints of {', '.join(THESIS)} as horizontal lines"
@@ -46,14 +48,15 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.report.curves import plot_curves
     from sb3_quad.report.plots import picture
 
-    groups = {}
+    groups: dict[str, Any] = {}
     for text in options.groups:
-        name, separator, pattern = text.partition("=")
-        folders = sorted(glob.glob(pattern))
-        if not separator or not name:
-            raise ConfigError(f"{text!r}: give NAME=PATTERN, such as 'RL-agent=logs/ppo_bc/*'")
-        if not folders:
-            raise ConfigError(f"{name}: no folder fits {pattern}")
+        bare = Path(text).is_dir() or "=" not in text
+        name, _, pattern = ("/".join(Path(text).parts[-2:]), "", text) if bare else text.partition("=")
+        folders = [pattern] if Path(pattern).is_dir() else sorted(glob.glob(pattern))
+        if not name or not folders:
+            raise ConfigError(f"{text!r}: no such folder; give run folders, or NAME=PATTERN such as 'RL-agent=logs/ppo_bc/*'")
+        if name in groups:
+            raise ConfigError(f"{name!r}: two are called so; give NAME=PATTERN with names of their own")
         groups[name] = [read_curve(folder, options.task) for folder in folders]
     kind = Path(options.output).suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
@@ -62,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     if options.thesis:  # its success is our survival
         for name, reference in load_suite("thesis").scenario(THESIS[options.thesis]).reference.items():
             lines[f"thesis: {name}"] = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
-    show = options.show or (["survival" if options.thesis else "success", "reward"])
+    show = options.show or (["survival", "reward"] if options.thesis else [])
     curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     write_bytes(options.output, picture(curves, kind, dpi=130))
     print(f"saved {options.output}")

@@ -4,7 +4,7 @@ examples:
   sb3-quad sweep my_sweep.yaml --dry-run                   lists the runs
   sb3-quad sweep my_sweep.yaml --workers 4                 four worker processes, one core each
   sb3-quad sweep pid                                       a sweep of the package: nominal, pid, random_worlds, recovery
-  sb3-quad sweep --seed 0 1 2 --conf-file imitation.yml two_stage.yml
+  sb3-quad sweep --seed 0 1 2 --conf-file two_stage.yml thesis.yml
   sb3-quad sweep --seed 0 1 2 --algo dagger --env QuadStateRecovery-v0 -n 240000 --suite quick
   sb3-quad sweep my_sweep.yaml --executor ray --address auto
   sb3-quad sweep --resume logs/sweep/my_sweep_1            goes on after Ctrl-C or a crash
@@ -30,7 +30,7 @@ def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("sweep", nargs="?", metavar="SWEEP", help="YAML file, or a name; the flags below go before what it says")
     add("--seed", nargs="+", type=seed, metavar="N", help="seeds of each configuration (0)")
-    add("-conf", "--conf-file", nargs="+", metavar="FILE", help="settings files, of single runs or pipelines (imitation.yml)")
+    add("-conf", "--conf-file", nargs="+", metavar="FILE", help="settings files, of single runs or pipelines (two_stage.yml)")
     add("--algo", nargs="+", help="algorithms of single runs (dagger)")
     add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
     add_fields(parser, SettingsOptions)

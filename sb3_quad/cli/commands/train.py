@@ -1,17 +1,16 @@
-"""Train an agent. Without arguments: DAgger in random worlds, from the geometric expert that is told the truth.
+"""Train an agent. Without arguments: DAgger, then PPO with cloning, in random worlds, from an expert that is told the truth.
 
 examples:
-  sb3-quad train                                          imitation in random worlds, in the batched environment
-  sb3-quad train --conf-file two_stage.yml                the same, then PPO with a cloning term
+  sb3-quad train                                          both stages in random worlds, in the batched environment
+  sb3-quad train --thesis                                 the thesis's method: both stages from its PID expert, in minutes
   sb3-quad train --conf-file nominal/two_stage.yml        both stages for one vehicle in still air
-  sb3-quad train --conf-file pid/two_stage.yml            both stages from the PID expert
   sb3-quad train --conf-file thesis/two_stage.yml         the thesis's recipe as it prints it; hours
   sb3-quad train --algo dagger --vec-env subproc --n-envs 8   imitation on PyBullet, a process per environment
   sb3-quad train --seed 1 -P -tb logs/tb                  another seed, progress bar, TensorBoard
   sb3-quad train --conf-file thesis/dagger.yml            Table A.4 as the thesis prints it
   sb3-quad train --hyperparams n_steps:500 learning_rate:lin_5e-4 "policy_kwargs:dict(net_arch=[32, 32])"
   sb3-quad train --env-kwargs noise:0 "task_kwargs:dict(target_distance=15)"
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadStateRecovery-v0_1/trimmed_model.zip
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -i thesis-imitation      stage two from an agent
   sb3-quad train --resume logs/dagger/QuadTargetTracking-v0_1
   sb3-quad train --env Pendulum-v1 --conf-file my.yml --expert teacher.zip
 """
@@ -26,7 +25,7 @@ from sb3_quad.cli.parser import PAIRS, Parser, add_common, add_fields, given, po
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.training.options import JobOptions, SettingsOptions
 
-DEFAULT_PIPELINE = "imitation.yml"
+DEFAULT_PIPELINE, THESIS = "two_stage.yml", "thesis.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 KEPT_BY_RESUME = (
     *("algo", "env", "conf_file", "hyperparams", "eval_env_kwargs", "trained_agent", "log_folder", "seed"),
@@ -39,7 +38,8 @@ def add_settings(parser: Parser) -> None:
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
     add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
-    add("-conf", "--conf-file", metavar="FILE", help="settings: a YAML file, or one of the package, such as thesis/dagger.yml")
+    file = "settings: a YAML file, or one of the package, such as thesis/dagger.yml (ALGO.yml: still air, PID expert)"
+    add("-conf", "--conf-file", metavar="FILE", help=file)
     add_fields(parser, SettingsOptions)
     add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
     add_fields(
@@ -54,6 +54,7 @@ def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
     add = parser.add_argument
+    add("--thesis", action="store_const", const=THESIS, dest="conf_file", help=f"the thesis's method: --conf-file {THESIS}")
     add("--seed", type=seed, metavar="N", help="seed (0); negative: a random one, recorded in args.yml")
     add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
     add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose")
@@ -113,8 +114,13 @@ def prepare(options: argparse.Namespace) -> None:
 def make_config(options: argparse.Namespace) -> Any:
     """The :class:`~sb3_quad.training.config.TrainingConfig` that a command line describes."""
     from sb3_quad.training.config import load_config
+    from sb3_quad.training.transfer import as_agent
 
-    return load_config(options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file, changed_settings(options))
+    asked, changes = (options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file), changed_settings(options)
+    config = load_config(*asked, changes)
+    if options.trained_agent is None or options.conf_file is not None:
+        return config
+    return load_config(*asked, as_agent(options.trained_agent, config, changes))
 
 
 def changed_settings(options: argparse.Namespace) -> dict[str, Any]:

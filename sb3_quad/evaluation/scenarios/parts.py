@@ -93,8 +93,15 @@ class Start(Frozen):
 
     position: Vector = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
     attitude: Attitude = Field(default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}")
-    velocity: VectorDistribution = Field(default=ZERO, description="world frame, m/s: [x, y, z], {std: …} or {magnitude: …}")
+    velocity: VectorDistribution = Field(default=ZERO, description="m/s: [x, y, z], {std: …} or {magnitude: …}")
+    velocity_frame: Frame = Field(default="world", description="world or body: the axes of velocity")
     body_rates: VectorDistribution = Field(default=ZERO, description="body frame, rad/s: given as velocity is")
+
+    @model_validator(mode="after")
+    def _turnable(self) -> "Start":
+        if self.velocity_frame == "body" and (self.velocity.value is None or self.attitude.distribution is not None):
+            raise ValueError("velocity_frame: body goes with a fixed velocity and an attitude that is not uniform")
+        return self
 
 
 class Target(OneOf):

@@ -1,0 +1,116 @@
+"""Every `sb3-quad` line of README, docs/ and --help runs, on one rollout, a few flights and a few seconds of film."""
+
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import pytest
+from stable_baselines3 import PPO
+
+from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.cli import main
+from sb3_quad.cli.app import COMMANDS
+from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.training import pipeline
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+PENDULUM = "Pendulum-v1: {policy: MlpPolicy, n_timesteps: 100, n_steps: 100, batch_size: 50, gradient_steps: 2}"
+ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
+    "--executor ray": "tests/test_ray.py",
+    "--resume": "tests/test_runs.py",
+    "my_experts:lqr": "tests/test_docs.py",
+    "my_package.control:make": "a module of the user's",
+    "…": "a line in short",
+}
+SHORTER = {  # flags that a command is given beside those that stand there
+    "evaluate": ["--episodes", "2", "--overwrite"],
+    "enjoy": ["-n", "20", "--overwrite"],
+    "export": ["--overwrite"],
+    "sweep": ["--dry-run"],
+    "train": ["--eval-episodes", "2", "--no-progress"],
+    "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", "--no-progress"],
+    "benchmark": ["--seconds", "0.02", "--sizes", "8"],
+    "check-vehicle": ["-n", "2"],
+}
+WITHOUT = ("-n", "--n-trials", "--max-total-trials", "--sizes", "-P")  # flags that SHORTER gives, or that need a screen
+
+
+def documented() -> list[str]:
+    """Lines of shell blocks and of the commands' help, less remarks and folders of modules; each once."""
+    found = []
+    for page in PAGES:
+        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.S | re.M):
+            if language == "bash":
+                found += block.replace("\\\n", " ").splitlines()
+    for command in COMMANDS.values():
+        found += (command.__doc__ or "").splitlines()
+    called = [re.match(r"(?:\w+=\S+ +)*\s*(?:sb3-quad|python -m sb3_quad\.cli) +(\w.*)", line) for line in found]
+    lines = [re.sub(r"\s+(#.*|&)$| {3,}[^ -].*", "", match[1]).strip() for match in called if match]
+    return [*dict.fromkeys(re.sub(r" +", " ", line) for line in lines)]
+
+
+LINES = [line for line in documented() if not any(part in line for part in ELSEWHERE)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, trained_runs):
+    """What the lines read: runs, agents, files of the user's."""
+    place = tmp_path_factory.mktemp("documented")
+    for name in ("agent.zip", "path/to/agent.zip"):
+        (place / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(pretrained("thesis-recovery"), place / name)
+    for algo, env in (("dagger", "Tracking"), ("dagger", "Recovery"), ("ppo_bc", "Recovery")):
+        for number in (1, 2):
+            source = trained_runs("ppo_bc" if algo == "ppo_bc" else "dagger")
+            env_id = {"Tracking": "QuadTargetTracking-v0", "Recovery": "QuadStateRecovery-v0"}[env]
+            run = shutil.copytree(source, place / "logs" / algo / f"{env_id}_{number}")
+            for path in [*run.glob("QuadStateRecovery-v0*")]:
+                path.rename(path.with_name(path.name.replace("QuadStateRecovery-v0", env_id)))
+            shutil.copy(pretrained("thesis-recovery"), run / "trimmed_model.zip")
+            shutil.copy(pretrained("thesis-imitation"), run / "best_model.zip")
+    for algo in ("ppo", "logs/ppo"):
+        shutil.copytree(place / "logs/ppo_bc", place / algo / "ppo_bc" if algo == "ppo" else place / algo)
+    shutil.copytree(ROOT / "examples", place / "examples")
+    for name in ("my.yaml", "my_vehicle.yaml", "mine_tuned.yaml"):
+        shutil.copy(ROOT / "examples/my_quadcopter.yaml", place / name)
+    shutil.copy(ROOT / "zoo_configs/search_spaces/dagger.yml", place / "my_space.yml")
+    best = place / "logs/tune/dagger/QuadTargetTracking-v0_1/best.yml"
+    best.parent.mkdir(parents=True)
+    shutil.copy(ROOT / "zoo_configs/dagger.yml", best)
+    for page, key in (("docs/evaluate.md", "my_scenarios.yaml"), ("docs/sweeps.md", "my_sweep.yaml")):
+        (block, *_) = re.findall(r"^```yaml\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
+        (place / key).write_text(block)
+    (place / "my.yml").write_text(PENDULUM)
+    PPO("MlpPolicy", "Pendulum-v1", device="cpu").save(place / "teacher.zip")
+    return place
+
+
+def shorter(content):
+    """Settings with one short rollout, no requirement and no trim, which an agent of one rollout would not pass."""
+    if not isinstance(content, dict):
+        return [shorter(each) for each in content] if isinstance(content, list) else content
+    kept = {key: shorter(value) for key, value in content.items() if key not in ("require", "trim", "position_scale")}
+    return kept | ({"n_timesteps": 960} if isinstance(kept.get("n_timesteps"), int) else {})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", LINES)
+def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
+    command, *arguments = shlex.split(line)
+    read = YamlFolder.read
+    monkeypatch.setattr(YamlFolder, "read", lambda self, source: (shorter(read(self, source)[0]), read(self, source)[1]))
+    monkeypatch.setattr(pipeline, "is_pipeline_run", lambda path: False)
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    monkeypatch.chdir(folder)
+    while any(flag in arguments for flag in WITHOUT):
+        first = next(place for place, each in enumerate(arguments) if each in WITHOUT)
+        del arguments[first : first + 1 + (arguments[first] != "-P")]
+        while first < len(arguments) and arguments[first].isdigit():
+            del arguments[first]
+    screen = [] if command != "enjoy" or "-o" in arguments or "--no-render" in arguments else ["--no-render"]
+    if command == "report":
+        main(["evaluate", "pid", "--suite", "quick", "--episodes", "2", "-o", arguments[0], "--overwrite"])
+        arguments += [] if "--overwrite" in arguments else ["--overwrite"]
+    assert main([command, *arguments, *screen, *SHORTER.get(command, [])]) == 0, capsys.readouterr().err
