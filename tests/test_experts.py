@@ -16,6 +16,7 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains
 from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY, QuadcopterState
 from sb3_quad.training.values import import_class
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -87,9 +88,15 @@ def test_pid_error_under_a_constant_force():
 
 
 def test_pid_gains_of_itm_are_those_of_table_a1():
-    _, (proportional, derivative), *_ = PIDExpert()._constants
+    (kp, kd, ki_dt, *_), (proportional, derivative), *_ = PIDExpert()._constants
+    assert (kp, kd, ki_dt) == (1.5, 4.1, 50 * 0.01)
     np.testing.assert_allclose(proportional, [0.54165, 0.81810, 0.80676], rtol=1e-4)
     np.testing.assert_allclose(derivative, [0.12037, 0.18180, 0.17928], rtol=1e-4)
+
+
+def test_the_scaling_is_that_of_table_a2():
+    np.testing.assert_array_equal(DEFAULT_MEAN, np.zeros(18))
+    np.testing.assert_array_equal(DEFAULT_STD, np.repeat([10 / np.sqrt(3), np.sqrt(3), 5.0, 5.0], [3, 9, 3, 3]))
 
 
 def test_geometric_gains_come_from_the_vehicle_or_its_authority():
