@@ -22,6 +22,7 @@ ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "--resume": "tests/test_runs.py",
     "my_experts:lqr": "tests/test_docs.py",
     "my_package.control:make": "a module of the user's",
+    "$RUNS": "agents of a sweep of an hour and a half",
     "…": "a line in short",
 }
 SHORTER = {  # flags that a command is given beside those that stand there
