@@ -158,9 +158,11 @@ def test_an_interrupted_evaluation_goes_on_by_the_same_command_alone(here, capsy
         assert evaluate(*command) == 130
         names = [(entry.scenario, entry.controller) for entry in load_results("out").entries]
         assert names == [("tracking", "pid"), ("tracking", "x"), ("course", "pid")]
-        before = times_of_change(here)
+        before, half = times_of_change(here), here / "out" / "flights" / "pid" / ".course.npz.1.tmp"
+        half.write_bytes(b"half")
         sys.modules["my_controllers"].calls = 5
         code = evaluate(*again)
+        assert not half.exists()
         kept = [path.parts[-2] for path, time in before.items() if times_of_change(here)[path] == time]
         if again == command[:1]:
             assert code == 2 and len(kept) == 3

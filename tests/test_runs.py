@@ -9,6 +9,7 @@ import pytest
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_bytes, write_text
+from sb3_quad.training import runs
 from sb3_quad.training.runs import claim_run, find_run, open_run
 
 ENV = "QuadTargetTracking-v0"
@@ -64,7 +65,10 @@ def test_environment_ids_with_slashes_stay_in_their_folder(tmp_path):
 def test_settings_arguments_and_the_command_come_back(tmp_path, monkeypatch):
     run = claim_run(tmp_path, "dagger", ENV)
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/sb3-quad", "train", "--expert", "my file.zip"])
+    written = []
+    monkeypatch.setattr(runs, "write_text", lambda path, text: written.append(path.name) or path.write_text(text))
     run.write_yaml({"n_envs": 3}, {"seed": 7, "trained_agent": None})
+    assert {*written} == {"config.yml", "command.txt", "args.yml"} and written[-1] == "args.yml"  # who has it lacks nothing
     assert run.command.read_text() == "sb3-quad train --expert 'my file.zip'\n"
     assert vars(open_run(run.path)) == vars(run)
     assert run.read_yaml() == ({"n_envs": 3}, {"seed": 7, "trained_agent": None})

@@ -79,7 +79,8 @@ def close_run(result: TrainingResult) -> int:
         return result.exit_code
     if result.job.config.task is not None:
         console().print(agent_and_expert(result.job, result.model))
-    print(f"trained in {result.seconds:.1f} s")
+    if result.seconds:  # else a complete run that made no evaluations
+        print(f"trained in {result.seconds:.1f} s")
     print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
     _print_next(result.run)
     return 0

@@ -74,13 +74,13 @@ class RunFolder:
         return self.checkpoint(max(steps))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
-        """Write config.yml, args.yml and command.txt."""
+        """Write config.yml and command.txt, then args.yml: a run that has it has begun."""
         self.config.parent.mkdir(exist_ok=True)
         write_text(self.config, yaml.safe_dump(settings, sort_keys=False))
-        write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
         program = Path(sys.argv[0]).name
         start = ["sb3-quad"] if program in ("sb3-quad", "__main__.py") else ["python", program]
         write_text(self.command, shlex.join([*start, *sys.argv[1:]]) + "\n")
+        write_text(self.arguments, yaml.safe_dump(arguments, sort_keys=False))
 
     def read_yaml(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """config.yml and args.yml, also of a run of rl_zoo3's.

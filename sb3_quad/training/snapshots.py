@@ -239,7 +239,7 @@ def set_log(logger: Logger, state: Any, path: Path) -> None:
     """
     try:
         kept = LOG.validate_python(json.loads(str(state)))
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: not a snapshot (log: {one_line(error)})") from None
     for name, (value, count, excluded) in kept.items():
         logger.name_to_value[name], logger.name_to_excluded[name] = value, excluded
