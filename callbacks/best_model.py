@@ -107,8 +107,8 @@ class BestModel(EveryTimesteps):
                     raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")
         rows = self._rows["eval"]
         self._start = time.perf_counter() - rows.get("seconds", [0.0])[-1]
-        none = [[]] * len(rows.get("results", []))
-        self.best = max(map(_score, rows.get("successes", none), rows.get("results", [])), default=self.best)
+        results = rows.get("results", [])
+        self.best = max(map(_score, rows.get("successes", [()] * len(results)), results), default=self.best)
         self._last = last_timestep(self.model)
 
     def _on_event(self) -> bool:
@@ -165,7 +165,12 @@ class BestModel(EveryTimesteps):
         env.seed(self._seed)
         flown = evaluate_policy(self.model, env, self._n_episodes, callback=note, return_episode_rewards=True, warn=False)
         rewards, lengths = flown
-        values = {"timesteps": self.num_timesteps, "results": rewards, "ep_lengths": lengths, "seconds": seconds}
+        values: dict[str, Any] = {
+            "timesteps": self.num_timesteps,
+            "results": rewards,
+            "ep_lengths": lengths,
+            "seconds": seconds,
+        }
         reported = {"successes": successes, "survivals": survivals, "final_errors": errors}
         values |= {name: each for name, each in reported.items() if not np.isnan(each).all()}
         if "successes" in values:
