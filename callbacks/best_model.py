@@ -171,7 +171,12 @@ class BestModel(EveryTimesteps):
         env.seed(self._seed)
         flown = evaluate_policy(self.model, env, self._n_episodes, callback=note, return_episode_rewards=True, warn=False)
         rewards, lengths = flown
-        values: dict[str, Any] = {"timesteps": self.num_timesteps, "results": rewards, "ep_lengths": lengths, "seconds": seconds}
+        values: dict[str, Any] = {
+            "timesteps": self.num_timesteps,
+            "results": rewards,
+            "ep_lengths": lengths,
+            "seconds": seconds,
+        }
         reported = {"successes": successes, "survivals": survivals, "final_errors": errors}
         values |= {name: each for name, each in reported.items() if not np.isnan(each).all()}
         if "successes" in values:
