@@ -28,7 +28,7 @@ LOGGED: dict[str, tuple[str, Callable[[Any], Any]]] = {
 }
 """By the name in the log: an array of an evaluation, and its statistic."""
 RATES = {"success": "success_rate", "survival": "survival_rate"}
-SHARES = {"success": "successes", "survival": "survivals"}  # their arrays
+SHARES = {name: LOGGED[rate][0] for name, rate in RATES.items()}  # their arrays
 
 
 class BestModel(EveryTimesteps):

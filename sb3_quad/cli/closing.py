@@ -65,12 +65,15 @@ def agent_and_expert(job: TrainingJob, model: Any) -> Table:
     :param job: of an environment of this package.
     """
     settings = job.flight_settings
-    controllers = {
-        "agent": model,
-        "expert": resolve_expert(job.config.expert or DEFAULT_EXPERT, settings.vehicle, layout=settings.rotor_layout),
-    }
+    controllers = {"agent": model, "expert": _expert(job)}
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
     return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))
+
+
+def _expert(job: TrainingJob) -> Any:
+    """The expert of a training, or the default one, for the vehicle that the agent flies and in its layout."""
+    flown = job.flight_settings
+    return resolve_expert(job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout)
 
 
 def close_run(result: TrainingResult) -> int:
@@ -94,9 +97,7 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     if result.exit_code != 0:
         return result.exit_code
     flown = result.job.flight_settings
-    controllers = {
-        "expert": resolve_expert(result.job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout)
-    }
+    controllers = {"expert": _expert(result.job)}
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
     beside = ("expert", "IL-agent", "RL-agent")
     print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)

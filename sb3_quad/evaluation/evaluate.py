@@ -135,10 +135,11 @@ def evaluate(
                     write_arrays(place / done[job.name].flights, compressed=True, **arrays)
                     write_text(place / RESULTS, results(finished=False).model_dump_json(indent=2))
                 progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
+        found = results()  # in the order of the suite, whoever was done first
         if done:
-            write_episodes(place, results().entries)  # in the order of the suite, whoever was done first
-            write_text(place / RESULTS, results().model_dump_json(indent=2))
-    return results()
+            write_episodes(place, found.entries)
+            write_text(place / RESULTS, found.model_dump_json(indent=2))
+    return found
 
 
 def fly_scenario(

@@ -107,8 +107,7 @@ class QuadcopterState:
     @property
     def rotation(self) -> FloatArray:
         """Rotation matrices R, body to world, shape (n, 3, 3)."""
-        rows = rotation_rows.py_func(*self.array[QUATERNION])
-        return np.moveaxis(np.array(rows), -1, 0)
+        return rotation_matrices(self.quaternion)
 
     @property
     def distance(self) -> FloatArray:
@@ -138,6 +137,11 @@ class QuadcopterState:
 
         array = np.concatenate([state.array for state in states], axis=1)
         return QuadcopterState(array, joined([each.vehicles for each in states]), joined([each.wrench for each in states]))
+
+
+def rotation_matrices(quaternions: FloatArray) -> FloatArray:
+    """Rotation matrices R, body to world, (n, 3, 3), of unit quaternions (n, 4), (w, x, y, z)."""
+    return np.moveaxis(np.array(rotation_rows.py_func(*quaternions.T)), -1, 0)
 
 
 def make_wrench(force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body") -> FloatArray:

@@ -9,8 +9,7 @@ from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import SCENARIO_STREAM
 from sb3_quad.evaluation.scenarios.parts import Attitude, VectorDistribution, Wrench
 from sb3_quad.evaluation.scenarios.scenario import Scenario
-from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench
+from sb3_quad.simulation.state import WRENCH_SIZE, make_wrench, rotation_matrices
 from sb3_quad.vehicles.vehicle import Vehicle
 
 Generators = Sequence[np.random.Generator]  # one for each episode
@@ -48,8 +47,7 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
         if distribution.std is None:
             start[name] = _vectors(distribution, generators)
     if scenario.start.velocity_frame == "body":
-        rows = rotation_rows.py_func(*start["quaternion"].T)
-        start["velocity"] = np.einsum("ijn,nj->ni", np.array(rows), start["velocity"])
+        start["velocity"] = np.einsum("nij,nj->ni", rotation_matrices(start["quaternion"]), start["velocity"])
     if target.points:
         start["target"] = np.tile(np.array(target.points[0]), (len(seeds), 1))
     wrenches = sample_wrenches(scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators)
