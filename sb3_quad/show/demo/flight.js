@@ -54,7 +54,8 @@ export class Flight {
     this.noise = 0;
     this.time = 0; // s
     this.lost = ""; // collision, out of range, or not
-    this.arrival = NaN; // s: first within NEAR of the target
+    this.away = false; // whether it has been farther than NEAR from the target
+    this.arrival = NaN; // s: first within NEAR of the target, once it has been away
     this.settled = NaN; // s: within it ever since
     if (agent.kind === "network") {
       const turn = findTurn(vehicle, agent.layout ?? vehicle);
@@ -85,6 +86,7 @@ export class Flight {
     this.queue = Array.from({ length: delay }, () => [...hover]);
     this.time = 0;
     this.lost = "";
+    this.away = false;
     this.arrival = this.settled = NaN;
     if (this.observer) {
       this.observer.noise = this.noise;
@@ -126,9 +128,11 @@ export class Flight {
     const distance = distanceOf(this.state);
     if (this.state[2] <= this.parameters.radius) this.lost ||= "collision";
     else if (distance > MAX_DISTANCE) this.lost ||= "out of range";
-    if (distance > NEAR) this.settled = NaN;
-    else {
-      if (Number.isNaN(this.arrival)) this.arrival = this.time;
+    if (distance > NEAR) {
+      this.away = true;
+      this.settled = NaN;
+    } else {
+      if (this.away && Number.isNaN(this.arrival)) this.arrival = this.time;
       if (Number.isNaN(this.settled)) this.settled = this.time;
     }
   }

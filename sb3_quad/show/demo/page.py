@@ -15,8 +15,9 @@ import jinja2
 import numpy as np
 
 from sb3_quad.base.arrays import Float32Array
-from sb3_quad.base.colours import colours_of
+from sb3_quad.base.colours import COLOURS, colours_of
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.version import __version__
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
@@ -25,14 +26,14 @@ from sb3_quad.export.network import Network, build_network
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
-DEFAULT_AGENTS = ("pid", "geometric", "stage one=itm-imitation", "stage two=itm-recovery", "itm-robust", "any-quadcopter")
+DEFAULT_AGENTS = ("pid", "geometric", "stage two=itm-recovery", "any-quadcopter", "itm-robust", "stage one=itm-imitation")
 LIMIT = 500_000  # bytes of a page, above which the largest networks are rounded to half precision
 MODEL = ("vehicle", "dynamics", "observation", "network", "experts", "flight", "weights")  # without a browser, in this order
-VIEW = ("camera", "scene", "plots", "hand", "app")
+VIEW = ("fleet", "camera", "scene", "plots", "hand", "app")
 EXPERTS = ("pid", "geometric")
 
 
-def write_page(specs: Sequence[ControllerSpec], vehicle: str | Vehicle | None = None) -> tuple[str, list[str]]:
+def make_page(specs: Sequence[ControllerSpec], vehicle: str | Vehicle | None = None) -> tuple[str, list[str]]:
     """The page as text, and the labels of the agents whose weights are rounded to half precision to make it small.
 
     :param specs: who flies, from the first on as many as are shown.
@@ -51,14 +52,17 @@ def write_page(specs: Sequence[ControllerSpec], vehicle: str | Vehicle | None = 
     vehicles = {each.name: each for each in (*map(load_vehicle, VEHICLES.names()), *owned, first)}
     rounded: list[str] = []
     while True:
-        packed = [agent | pack(networks[agent["label"]], agent["label"] in rounded) for agent in agents if agent["label"] in networks]
+        packed = [
+            agent | pack(networks[agent["label"]], agent["label"] in rounded) for agent in agents if agent["label"] in networks
+        ]
         by_label = {each["label"]: each for each in packed}
         data = {
             "agents": [by_label.get(agent["label"], agent) for agent in agents],
             "vehicles": [each.model_dump(mode="json") for each in vehicles.values()],
             "vehicle": first.name,
+            "colours": COLOURS,
         }
-        page = _render(data)
+        page = _render(data, rounded)
         exact = [label for label in networks if label not in rounded]
         if len(page.encode()) <= LIMIT or not exact:
             return page, rounded
@@ -110,12 +114,16 @@ def pack(network: Network, rounded: bool) -> dict[str, Any]:
 
 
 def script(modules: Iterable[str] = (*MODEL, *VIEW)) -> str:
-    """The named modules as one script, in this order, without their comments."""
-    texts = (files(__package__).joinpath(f"{name}.js").read_text("utf-8") for name in modules)
-    return "\n".join(re.sub(r"^import [^;]*;\n|^export (?=\w)|^\s*/\*\*.*?\*/\n|/\*\*.*?\*/ ?", "", text, flags=re.M | re.S) for text in texts)
+    """The named modules as one script, in this order, without comments of their own lines and without indentation."""
+    sources = files(__package__)
+    text = "\n".join(sources.joinpath(f"{name}.js").read_text("utf-8") for name in modules)
+    return re.sub(r"/\*\*.*?\*/|^import [^;]*;|^export (?=\w)|^\s+|^\s*//[^\n]*", "", text, flags=re.M | re.S)
 
 
-def _render(data: dict[str, Any]) -> str:
+def _render(data: dict[str, Any], rounded: Sequence[str]) -> str:
+    notes = f"sb3_quad {__version__}. The page flies what sb3_quad flies in Python, in double precision."
+    if rounded:
+        notes += f" Weights of {' and '.join(rounded)} are rounded to half precision."
     text = json.dumps(data, separators=(",", ":")).replace("<", "\\u003c")
     environment = jinja2.Environment(loader=jinja2.PackageLoader(__package__, ""), undefined=jinja2.StrictUndefined)
-    return environment.get_template("page.html.j2").render(data=text, script=script())
+    return environment.get_template("page.html.j2").render(data=text, script=script(), notes=notes)

@@ -14,10 +14,10 @@
  * @property {Triple} inertia kg m²
  * @property {number} moment_thrust_ratio m
  * @property {number} thrust_coefficient N s²
- * @property {number} motor_gain 1/s
- * @property {number | null} [motor_gain_up] 1/s, of rotors that gain speed
- * @property {number | null} [motor_gain_down] 1/s, of rotors that lose speed
- * @property {Triple | null} [drag] N s/m, along the body axes
+ * @property {number} [motor_gain] 1/s, in place of the next two where they are the same
+ * @property {number} [motor_gain_up] 1/s, of rotors that speed up
+ * @property {number} [motor_gain_down] 1/s, of rotors that slow down
+ * @property {Triple} [drag] along the body axes, N s/m
  * @property {number} gravity m/s²
  * @property {[number, number]} thrust_limits of a rotor, in hover thrusts
  * @property {number} physics_step s
@@ -75,19 +75,26 @@ export function armsOf(v) {
   return /** @type {Quadruple[]} */ (rows);
 }
 
+/** k_m of rotors that speed up and that slow down, 1/s. @param {Vehicle} v */
+const motorGains = (v) => [v.motor_gain_up ?? v.motor_gain ?? NaN, v.motor_gain_down ?? v.motor_gain ?? NaN];
+
 /** From a command to its thrust, s: delay, half the control step, and the motors. @param {Vehicle} v */
-export const commandLag = (v) => (v.delay + 0.5) * v.control_step + 1 / v.motor_gain;
+export function commandLag(v) {
+  const [up, down] = motorGains(v);
+  return (v.delay + 0.5) * v.control_step + 0.5 / up + 0.5 / down;
+}
 
 /** What the dynamics read of a vehicle in a world. @param {Vehicle} v @param {World} world @returns {Parameters} */
 export function parametersOf(v, world = CALM) {
   const [low, high] = thrustRange(v);
+  const [up, down] = motorGains(v);
   const mass = v.mass * world.mass;
   return {
     mass,
     inertia: v.inertia,
     lift: v.thrust_coefficient,
-    gainUp: (v.motor_gain_up ?? v.motor_gain) * world.motors,
-    gainDown: (v.motor_gain_down ?? v.motor_gain) * world.motors,
+    gainUp: up * world.motors,
+    gainDown: down * world.motors,
     drag: v.drag ?? [0, 0, 0],
     gravity: v.gravity,
     middle: ((high + low) / 2) * world.thrust,
