@@ -34,10 +34,15 @@ const SLIDERS = [
   { id: "motors", label: "Motors", low: 0.3, high: 2, step: 0.01, text: (/** @type {number} */ x) => `× ${x.toFixed(2)}` },
   { id: "battery", label: "Battery", low: 0.5, high: 1.2, step: 0.01, text: (/** @type {number} */ x) => `${Math.round(100 * x)} %` },
   { id: "delay", label: "Delay", low: 0, high: 8, step: 1, text: (/** @type {number} */ x) => `${Math.round(x * fleet.vehicle.control_step * 1000)} ms` },
-  { id: "force", label: "Steady force", low: 0, high: 0.6, step: 0.01, text: (/** @type {number} */ x) => `${x.toFixed(2)} mg` },
-  { id: "gusts", label: "Gusts", low: 0, high: 0.4, step: 0.01, text: (/** @type {number} */ x) => `${x.toFixed(2)} mg` },
+  { id: "force", label: "Steady force", low: 0, high: 0.6, step: 0.01, text: newtons },
+  { id: "gusts", label: "Gusts", low: 0, high: 0.4, step: 0.01, text: newtons },
   { id: "noise", label: "Sensor noise", low: 0, high: 0.25, step: 0.01, text: (/** @type {number} */ x) => `${Math.round(100 * x)} %` },
 ];
+
+/** @param {number} weights */
+function newtons(weights) {
+  return weights ? `${(weights * fleet.weight).toPrecision(2)} N` : "0 N";
+}
 
 /** @template {HTMLElement} T @param {string} id @returns {T} */
 const $ = (id) => /** @type {T} */ (document.getElementById(id));
@@ -415,6 +420,7 @@ async function take(file, offer) {
     const known = vehicle && vehicles.some(({ name }) => name === vehicle.name);
     if (vehicle && !known && agent.vehicle) vehicles.push(vehicle);
     offer();
+    while (fleet.entries.some((entry) => entry.agent.label === agent.label)) agent.label += "′";
     const entry = fleet.add(agent, data.colours[fleet.entries.length % data.colours.length]);
     takeOver();
     buildScore();
@@ -522,7 +528,7 @@ function frame(now) {
   const shown = bodies(carry / fleet.vehicle.control_step);
   if (!hand.isHolding()) {
     const seen = shown.filter((body) => !body.lost);
-    camera.follow((seen.length ? seen : shown).flatMap((body) => [body.position, body.target]), 1.5, seconds);
+    camera.follow([...seen.map((body) => body.position), ...shown.map((body) => body.target)], 1.5, seconds);
   }
   scene.draw(shown, fleet.vehicle, { trails, grabbed: fleet.held });
   if (frames % 4 === 0) drawPlots();
@@ -548,4 +554,4 @@ requestAnimationFrame((now) => {
   frame(now);
 });
 /** For the console, and for tests. */
-Object.assign(window, { demo: { fleet, camera, start, bodies: () => bodies(1), frames: () => frames, take } });
+Object.assign(window, { demo: { fleet, camera, start, bodies: () => bodies(1), frames: () => frames, take, ready: performance.now() } });
