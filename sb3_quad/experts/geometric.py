@@ -10,8 +10,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import FORCE_WORLD, STATE, WRENCH_SIZE, P, QuadcopterState, W, drag_forces
-from sb3_quad.simulation.state import first_rows, row_slices
+from sb3_quad.simulation.state import (
     FORCE_WORLD,
     STATE,
     WRENCH_SIZE,
