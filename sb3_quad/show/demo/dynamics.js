@@ -38,9 +38,10 @@ export function physicsStep(s, wanted, p, wrench) {
   const dt = p.dt;
   const thrusts = [0, 0, 0, 0];
   for (let k = 0; k < 4; k++) {
-    const speed = s[13 + k];
-    s[13 + k] = speed + (wanted[k] > speed ? p.gainUp : p.gainDown) * dt * (wanted[k] - speed);
-    thrusts[k] = p.lift * s[13 + k] * s[13 + k];
+    const old = s[13 + k], missing = wanted[k] - old;
+    const speed = old + missing * (missing > 0 ? p.up : p.down);
+    s[13 + k] = speed;
+    thrusts[k] = p.lift * speed * (speed + p.exact * (old - speed));
   }
   const r = rotation(s);
   const [cx, cy, cz] = p.drag;

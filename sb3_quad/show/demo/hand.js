@@ -45,12 +45,12 @@ export function listen(canvas, camera, deeds) {
     return best;
   };
 
-  const velocity = () => {
-    if (!held || held.samples.length < 2) return [0, 0, 0];
-    const now = performance.now() / 1000;
-    const recent = held.samples.filter(([time]) => now - time < FLICK);
-    if (recent.length < 2) return [0, 0, 0];
-    const [first, last] = [recent[0], recent[recent.length - 1]];
+  /** The velocity of what is held, m/s. @param {PointerEvent} event of the moment */
+  const velocity = (event) => {
+    const samples = held?.samples ?? [];
+    const now = event.timeStamp / 1000, last = samples[samples.length - 1];
+    if (!held || samples.length < 2 || now - last[0] > FLICK) return [0, 0, 0];
+    const first = samples.slice(0, -1).find(([time]) => last[0] - time < FLICK) ?? samples[samples.length - 2];
     const way = camera.way(last[1] - first[1], last[2] - first[2], held.depth);
     return way.map((each) => each / Math.max(last[0] - first[0], 0.016));
   };
@@ -60,13 +60,13 @@ export function listen(canvas, camera, deeds) {
     pointers.set(event.pointerId, at);
     canvas.setPointerCapture(event.pointerId);
     if (pointers.size > 1) {
-      if (held) finish();
+      if (held) finish(event);
       return;
     }
     const thing = find(at, event.pointerType === "mouse" ? REACH.mouse : REACH.touch);
     const pushes = deeds.tool() === "push" || event.button === 2 || event.shiftKey;
     const kind = !thing ? "camera" : thing.kind === "target" ? "target" : pushes ? "push" : "throw";
-    held = { kind, index: thing?.index ?? 0, depth: thing?.depth ?? 1, ...at, samples: [[performance.now() / 1000, at.x, at.y]] };
+    held = { kind, index: thing?.index ?? 0, depth: thing?.depth ?? 1, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
     if (kind === "throw") deeds.grab(held.index);
     if (kind === "target") deeds.target(null);
     canvas.dataset.hand = kind;
@@ -88,10 +88,10 @@ export function listen(canvas, camera, deeds) {
     }
     pointers.set(event.pointerId, at);
     if (!held) return;
-    held.samples.push([performance.now() / 1000, at.x, at.y]);
+    held.samples.push([event.timeStamp / 1000, at.x, at.y]);
     if (held.samples.length > 60) held.samples.shift();
     const way = camera.way(at.x - held.x, at.y - held.y, held.depth);
-    if (held.kind === "throw") deeds.carry(way, velocity());
+    if (held.kind === "throw") deeds.carry(way, velocity(event));
     else if (held.kind === "push") deeds.push(way, held.index);
     else if (held.kind === "target") deeds.target(way);
     else {
@@ -100,8 +100,8 @@ export function listen(canvas, camera, deeds) {
     }
   });
 
-  const finish = () => {
-    if (held?.kind === "throw") deeds.release(velocity());
+  const finish = (/** @type {PointerEvent} */ event) => {
+    if (held?.kind === "throw") deeds.release(velocity(event));
     if (held?.kind === "push") deeds.push(null, held.index);
     held = null;
     canvas.dataset.hand = "";
@@ -109,7 +109,7 @@ export function listen(canvas, camera, deeds) {
   for (const name of /** @type {const} */ (["pointerup", "pointercancel"])) {
     canvas.addEventListener(name, (event) => {
       pointers.delete(event.pointerId);
-      if (held) finish();
+      if (held) finish(event);
     });
   }
   const zoom = (/** @type {number} */ factor) => (camera.zoom = Math.min(4, Math.max(0.3, camera.zoom * factor)));

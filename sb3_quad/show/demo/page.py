@@ -43,7 +43,7 @@ def make_page(specs: Sequence[ControllerSpec], vehicle: str | Vehicle | None = N
     colours = colours_of([spec.label for spec in specs])
     agents, networks = [], {}
     for spec in specs:
-        agent, network = _describe(spec)
+        agent, network = describe(spec)
         agents.append({"label": spec.label, "colour": colours[spec.label], **agent})
         if network is not None:
             networks[spec.label] = network
@@ -69,7 +69,7 @@ def make_page(specs: Sequence[ControllerSpec], vehicle: str | Vehicle | None = N
         rounded.append(max(exact, key=lambda label: numbers(networks[label]).size))
 
 
-def _describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
+def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
     """A controller as the page knows it, but for its weights; and its network.
 
     :raises ConfigError: neither an expert of the page nor an agent in a zip that exports.

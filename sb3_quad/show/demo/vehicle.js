@@ -17,6 +17,7 @@
  * @property {number} [motor_gain] 1/s, in place of the next two where they are the same
  * @property {number} [motor_gain_up] 1/s, of rotors that speed up
  * @property {number} [motor_gain_down] 1/s, of rotors that slow down
+ * @property {"euler" | "exact"} [motor_integration] see physics.py
  * @property {Triple} [drag] along the body axes, N s/m
  * @property {number} gravity m/s²
  * @property {[number, number]} thrust_limits of a rotor, in hover thrusts
@@ -39,8 +40,9 @@
  * @property {number} mass
  * @property {Triple} inertia
  * @property {number} lift kF
- * @property {number} gainUp
- * @property {number} gainDown
+ * @property {number} up share of its error that the speed of a rotor that speeds up loses in a physics step
+ * @property {number} down of one that slows down
+ * @property {number} exact 1 where motors are integrated exactly, else 0
  * @property {Triple} drag
  * @property {number} gravity
  * @property {number} middle thrust of action 0, N
@@ -87,14 +89,19 @@ export function commandLag(v) {
 /** What the dynamics read of a vehicle in a world. @param {Vehicle} v @param {World} world @returns {Parameters} */
 export function parametersOf(v, world = CALM) {
   const [low, high] = thrustRange(v);
-  const [up, down] = motorGains(v);
+  const exact = v.motor_integration === "exact" ? 1 : 0;
+  const [up, down] = motorGains(v).map((gain) => {
+    const x = gain * world.motors * v.physics_step;
+    return Math.min(1, x / (1 + exact * (x / 2 + (x * x) / 12)));
+  });
   const mass = v.mass * world.mass;
   return {
     mass,
     inertia: v.inertia,
     lift: v.thrust_coefficient,
-    gainUp: up * world.motors,
-    gainDown: down * world.motors,
+    up,
+    down,
+    exact,
     drag: v.drag ?? [0, 0, 0],
     gravity: v.gravity,
     middle: ((high + low) / 2) * world.thrust,
