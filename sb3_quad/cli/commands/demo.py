@@ -7,7 +7,7 @@ examples:
   sb3-quad demo                                                     PID, geometric, and agents of the package
   sb3-quad demo -o docs/demo.html --overwrite
   sb3-quad demo logs/dagger/QuadStateRecovery-v0_1 pid geometric    your own agent beside the experts
-  sb3-quad demo new=agent.zip old=old_agent.zip -o compare.html
+  sb3-quad demo new=agent.zip old=path/to/agent.zip -o compare.html
   sb3-quad demo pid geometric any-quadcopter --vehicle my_vehicle.yaml
 
 A controller is pid, geometric, an agent of the package such as itm-recovery, the path of an SB3 zip, or a run folder;

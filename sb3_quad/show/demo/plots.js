@@ -63,11 +63,11 @@ export class Plot {
       g.strokeStyle = colour;
       g.lineWidth = thick;
       g.beginPath();
-      points.forEach(([time, value], k) => {
-        if (k % 4 && k !== points.length - 1) return;
-        if (k) g.lineTo(x(time), y(value));
-        else g.moveTo(x(time), y(value));
-      });
+      for (let k = 0; k < points.length; k++) {
+        const [time, value] = points[k];
+        if ((k % 4 && k !== points.length - 1) || time < end - seconds) continue;
+        g.lineTo(x(time), y(value));
+      }
       g.stroke();
     }
   }
