@@ -92,13 +92,14 @@ class Recorder(Hook):
 
 def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     """The ``episode_`` arrays of this module's table."""
-    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset", "stabilised", "sideways")
+    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset", "stabilised", "sideways", "overshoot")
     return {
         "episode_seed": np.asarray(seeds, dtype=np.int64),
         "episode_outcome": np.select([flights.success, flights.survival, flights.collision], [*OUTCOMES][:3], [*OUTCOMES][3]),
         **{f"episode_{name}": getattr(flights, name) for name in as_they_are},
         "episode_path": flights.path_length,
         "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),
+        "episode_time_to_stay": np.stack(list(flights.time_to_stay.values()), axis=1),
         "episode_tolerances": np.array(list(flights.time_to)),
         "episode_waypoints": flights.waypoint_times,
     }

@@ -24,9 +24,11 @@ class Moment(Frozen):
 
 
 class Arrival(Moment):
-    """Arrival within one tolerance."""
+    """Arrival within one tolerance: when it is first touched, and after which time it is not left again."""
 
     tolerance: float = Field(description="m")
+    stays: Moment = Field(description="flights that end within it, and after which time they stay")
+    leaves: Estimate | None = Field(description="share that leaves it again, of the flights that came to it")
 
 
 class Course(Frozen):
@@ -48,6 +50,7 @@ class Metrics(Frozen):
     reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
     flown: Estimate = Field(description="mean time flown, until lost or the end, s")
     arrivals: list[Arrival] = Field(description="by tolerance, the tightest first")
+    overshoot: float | None = Field(description="median of the largest |r - r_T| since the tightest tolerance, m")
     path: Estimate | None = Field(description="mean length of the path over the whole episode, m")
     final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
     final_error_median: float | None = Field(description="m")
@@ -76,7 +79,8 @@ def summarise(flights: Flights) -> Metrics:
         out_of_range=int((~done & ~flights.collision).sum()),
         reward=bootstrap(flights.reward),
         flown=bootstrap(flights.flown),
-        arrivals=[Arrival(tolerance=each, **_moment(times)) for each, times in sorted(flights.time_to.items())],
+        arrivals=[_arrival(each, times, flights.time_to_stay[each]) for each, times in sorted(flights.time_to.items())],
+        overshoot=float(np.nanmedian(flights.overshoot)) if np.isfinite(flights.overshoot).any() else None,
         path=mean(flights.path_length[done]),
         final_error=mean(error),
         final_error_median=float(np.median(error)) if some else None,
@@ -87,6 +91,12 @@ def summarise(flights: Flights) -> Metrics:
         sideways=mean(flights.sideways[done]),
         course=course,
     )
+
+
+def _arrival(tolerance: float, times: FloatArray, stays: FloatArray) -> Arrival:
+    arrived = np.isfinite(times)
+    leaves = share((stays != times)[arrived]) if arrived.any() else None
+    return Arrival(tolerance=tolerance, stays=Moment(**_moment(stays)), leaves=leaves, **_moment(times))
 
 
 def _moment(times: FloatArray) -> dict[str, Any]:

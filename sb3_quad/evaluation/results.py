@@ -127,8 +127,10 @@ def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
     columns["waypoints_reached"] = np.isfinite(arrays["episode_waypoints"]).sum(axis=1)
     for name, axes in _AXES.items():
         columns |= {f"{name}_{axis}": values for axis, values in zip(axes, arrays[f"episode_{name}"].T, strict=True)}
-    times = zip(arrays["episode_tolerances"], arrays["episode_time_to"].T, strict=True)
-    columns |= {f"time_to_{tolerance:g}": values for tolerance, values in times}
+    for name in ("time_to", "time_to_stay"):
+        times = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
+        columns |= {f"{name}_{tolerance:g}": values for tolerance, values in times}
+    columns["overshoot"] = arrays["episode_overshoot"]
     columns |= {f"waypoint_{number}": values for number, values in enumerate(arrays["episode_waypoints"].T, 1)}
     return [
         {"controller": entry.controller, "scenario": entry.scenario, "episode": episode}

@@ -32,7 +32,7 @@ DEFAULT_FOLDER = "evaluations"
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
-    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, quadcopters, quick, or a YAML file")
+    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, wind, quadcopters, quick or a file")
     add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
     add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
