@@ -27,7 +27,7 @@
  * @property {number} noise relative
  * @property {number} battery factor of the thrust
  */
-import { Flight, MAX_DISTANCE, normals, NO_WRENCH, uniforms } from "./flight.js";
+import { Flight, normals, NO_WRENCH, uniforms } from "./flight.js";
 import { thrustRange } from "./vehicle.js";
 
 export const LOG_SECONDS = 8;
@@ -242,9 +242,9 @@ export class Fleet {
  * @returns {number | null}
  */
 export function physicalLimit(vehicle, start) {
-  const times = /** @type {any} */ (vehicle.time_optimal);
+  const times = vehicle.time_optimal;
   const level = start.quaternion[0] === 1 && ![...start.velocity, ...start.rates].some(Boolean);
   const distance = Math.hypot(...start.target.map((each, k) => each - start.position[k]));
-  if (!times || !level || distance > MAX_DISTANCE) return null;
-  return typeof times === "number" && Math.abs(distance - 10) < 1e-6 ? times : null;
+  const limit = level && times ? times[String(Math.round(distance * 1000) / 1000)] : null;
+  return typeof limit === "number" ? limit : null;
 }

@@ -26,7 +26,7 @@
  * @property {number} delay control steps
  * @property {number} collision_radius m
  * @property {Object<string, any> | null} [geometric_gains]
- * @property {unknown} [time_optimal] least times to targets, where a file has them
+ * @property {Object<string, number> | null} [time_optimal] least times to within 0.1 m of targets by their distance, m, where a file has them
  *
  * @typedef {VehicleFields & Layout} Vehicle
  *
