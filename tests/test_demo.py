@@ -355,7 +355,7 @@ def test_a_throw_comes_back_and_a_push_is_felt(browser, page):
     assert browser.value("demo.fleet.flying.length") == 4
     browser.wait_for("demo.fleet.flying.some((each) => each.flight.time > 0.5)")  # it flies by itself
     rounds = browser.value("demo.fleet.rounds")
-    place = "demo.camera.project(demo.bodies()[1].position).slice(0, 2)"
+    place = "demo.camera.project(demo.player.bodies()[1].position).slice(0, 2)"
     x, y = browser.value(place)
     browser.drag((x, y), (x + 60, y - 90))
     assert browser.value("demo.fleet.rounds") == rounds + 1  # all begin anew, from where they were let go

@@ -138,6 +138,14 @@ export class Fleet {
     }
   }
 
+  /** A controller on or off, from the present start. @param {number} k */
+  toggle(k) {
+    const entry = this.entries[k];
+    Object.assign(entry, { active: !entry.active, log: [], trail: [], judged: true });
+    entry.flight?.begin(this.start);
+    if (entry.flight) entry.before.set(entry.flight.state);
+  }
+
   /** @param {Partial<Settings>} changes */
   set(changes) {
     Object.assign(this.settings, changes);

@@ -10,11 +10,11 @@
  *
  * @typedef {object} Deeds
  * @property {() => Holdable[]} things
- * @property {() => "throw" | "push"} tool
+ * @property {"throw" | "push"} tool what dragging a vehicle does
  * @property {(index: number) => void} grab
  * @property {(way: number[], velocity: number[]) => void} carry way from where it was grabbed, m; m/s
  * @property {(velocity: number[]) => void} release
- * @property {(way: number[] | null, index: number) => void} push an arrow from the vehicle, m; null: no longer
+ * @property {(way: number[] | null) => void} push an arrow from the vehicle, m; null: no longer
  * @property {(way: number[] | null) => void} target way from where it was, m; null: the drag begins
  */
 
@@ -64,7 +64,7 @@ export function listen(canvas, camera, deeds) {
       return;
     }
     const thing = find(at, event.pointerType === "mouse" ? REACH.mouse : REACH.touch);
-    const pushes = deeds.tool() === "push" || event.button === 2 || event.shiftKey;
+    const pushes = deeds.tool === "push" || event.button === 2 || event.shiftKey;
     const kind = !thing ? "camera" : thing.kind === "target" ? "target" : pushes ? "push" : "throw";
     held = { kind, index: thing?.index ?? 0, depth: thing?.depth ?? 1, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
     if (kind === "throw") deeds.grab(held.index);
@@ -92,7 +92,7 @@ export function listen(canvas, camera, deeds) {
     if (held.samples.length > 60) held.samples.shift();
     const way = camera.way(at.x - held.x, at.y - held.y, held.depth);
     if (held.kind === "throw") deeds.carry(way, velocity(event));
-    else if (held.kind === "push") deeds.push(way, held.index);
+    else if (held.kind === "push") deeds.push(way);
     else if (held.kind === "target") deeds.target(way);
     else {
       camera.yaw -= (at.x - before.x) * 0.006;
@@ -102,7 +102,7 @@ export function listen(canvas, camera, deeds) {
 
   const finish = (/** @type {PointerEvent} */ event) => {
     if (held?.kind === "throw") deeds.release(velocity(event));
-    if (held?.kind === "push") deeds.push(null, held.index);
+    if (held?.kind === "push") deeds.push(null);
     held = null;
     canvas.dataset.hand = "";
   };

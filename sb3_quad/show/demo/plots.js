@@ -10,7 +10,7 @@
 export class Plot {
   /**
    * @param {HTMLCanvasElement} canvas
-   * @param {{low: number, high: number, ticks: number[], log?: boolean, unit: string}} axis
+   * @param {{low: number, high: number, ticks: number[], log?: boolean}} axis
    */
   constructor(canvas, axis) {
     this.canvas = canvas;

@@ -40,14 +40,14 @@ export class Scene {
     this.palette = {};
   }
 
-  /** @param {Body[]} bodies @param {Vehicle} vehicle @param {{trails: boolean, grabbed: boolean}} how */
-  draw(bodies, vehicle, how) {
+  /** @param {Body[]} bodies @param {Vehicle} vehicle @param {boolean} trails whether they are drawn */
+  draw(bodies, vehicle, trails) {
     this.camera.prepare();
     this.#ground();
     const lanes = new Map(bodies.map((body) => [body.lane.join(), body]));
     for (const body of bodies) this.#shadow(body);
     for (const body of lanes.values()) this.#target(body);
-    if (how.trails) for (const body of bodies) this.#trail(body);
+    if (trails) for (const body of bodies) this.#trail(body);
     const far = (/** @type {Body} */ body) => this.camera.project(body.position)[2];
     for (const body of [...bodies].sort((a, b) => far(b) - far(a))) this.#vehicle(body, vehicle);
     this.#labels(bodies, lanes.size === bodies.length);
