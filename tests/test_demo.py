@@ -387,7 +387,7 @@ def test_everything_has_a_name_and_fits(browser, page, width, height):
         .map((each) => each.outerHTML)"""
     assert browser.value(nameless) == []
     browser.value("dispatchEvent(new KeyboardEvent('keydown', { key: 'r' }))")
-    assert browser.value("document.querySelector('[data-start=random]').ariaPressed") == "true"
+    assert browser.value("document.querySelector('#start-random').ariaPressed") == "true"
     browser.value("dispatchEvent(new KeyboardEvent('keydown', { key: ' ' }))")
     frozen = browser.value("demo.fleet.entries[0].flight.time")
     frames = browser.value("demo.frames()")

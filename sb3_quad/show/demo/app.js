@@ -8,21 +8,22 @@ import { Player } from "./player.js";
 import { Scene } from "./scene.js";
 import { unpackLayers } from "./weights.js";
 
-const COLOURS = ["zenith", "haze", "ground", "grid", "gridFar", "shadow", "target", "frame", "lost", "blade", "force", "rule", "quiet"];
+const SKY = ["zenith", "haze", "ground", "grid", "gridFar", "shadow"];
+const COLOURS = [...SKY, "target", "frame", "lost", "blade", "force", "rule", "quiet"]; // of style.css
 const SHOWN = { wide: 4, narrow: 3 }; // controllers that fly at first
 const MARGIN = 1.5; // around what the camera follows, m
 
 const data = JSON.parse($("data").textContent ?? "");
-const agents = await Promise.all(
-  data.agents.map(async (/** @type {any} */ agent) => (agent.shapes ? { ...agent, layers: await unpackLayers(agent) } : agent)),
-);
+/** @param {any} agent */
+const unpacked = async (agent) => (agent.shapes ? { ...agent, layers: await unpackLayers(agent) } : agent);
+const agents = await Promise.all(data.agents.map(unpacked));
 const canvas = /** @type {HTMLCanvasElement} */ ($("scene"));
 const context = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d", { alpha: false }));
 const narrow = matchMedia("(max-width: 860px)");
 const camera = new Camera();
 const scene = new Scene(context, camera);
 const vehicle = data.vehicles.find((/** @type {{name: string}} */ { name }) => name === data.vehicle);
-const fleet = new Fleet(agents, data.agents.map((/** @type {{colour: string}} */ { colour }) => colour), vehicle, Date.now() % 65536);
+const fleet = new Fleet(agents, agents.map(({ colour }) => colour), vehicle, Date.now() % 65536);
 fleet.entries.forEach((entry, k) => (entry.active = k < (narrow.matches ? SHOWN.narrow : SHOWN.wide)));
 const player = new Player(fleet, camera);
 const board = new Board(fleet, (k) => controls.toggle(k));

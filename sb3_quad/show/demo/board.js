@@ -5,7 +5,7 @@
  */
 import { Fleet, LOG_SECONDS, physicalLimit } from "./fleet.js";
 import { Plot } from "./plots.js";
-import { faded } from "./scene.js";
+import { faded } from "./airframe.js";
 
 /** An element of the page. @template {HTMLElement} T @param {string} id @returns {T} */
 export const $ = (id) => /** @type {T} */ (document.getElementById(id));

@@ -47,7 +47,10 @@ export class Camera {
     this.scale = this.free.height / 2 / SLOPE;
   }
 
-  /** Where a point is in the picture, pixels, and how far away, m; a point behind the camera has no positive distance. @param {ArrayLike<number>} p */
+  /**
+   * Where a point is in the picture, pixels, and how far away, m; a point behind the camera has no positive distance.
+   * @param {ArrayLike<number>} p
+   */
   project(p) {
     const { eye, right, up, forward } = this;
     const x = p[0] - eye[0], y = p[1] - eye[1], z = p[2] - eye[2];
@@ -62,14 +65,24 @@ export class Camera {
     return this.scale / Math.max(depth, 0.05);
   }
 
-  /** The way in the world of a way in the picture, in the plane that faces the camera. @param {number} dx @param {number} dy @param {number} depth */
+  /**
+   * The way in the world of a way in the picture, in the plane that faces the camera.
+   * @param {number} dx
+   * @param {number} dy
+   * @param {number} depth
+   */
   way(dx, dy, depth) {
     const { right, up } = this.axes;
     const size = this.pixels(depth);
     return [0, 1, 2].map((k) => (right[k] * dx - up[k] * dy) / size);
   }
 
-  /** Follow some points. @param {number[][]} points @param {number} margin around them, m @param {number} seconds since the last picture */
+  /**
+   * Follow some points.
+   * @param {number[][]} points
+   * @param {number} margin around them, m
+   * @param {number} seconds since the last picture
+   */
   follow(points, margin, seconds) {
     if (!points.length) return;
     const { right, up, forward } = this.axes;

@@ -46,11 +46,11 @@ export class Controls {
   /** Show what is switched on. */
   show() {
     const { player } = this;
-    const press = (/** @type {Element} */ element, /** @type {boolean} */ on) => element.setAttribute("aria-pressed", String(on));
+    const press = (/** @type {Element} */ element, /** @type {boolean} */ on) => (element.ariaPressed = String(on));
     for (const each of SWITCHES) press($(each), player[each]);
     for (const each of SPEEDS) press($(`speed-${each}`), player.speed === each);
     for (const each of TOOLS) press($(`tool-${each}`), player.tool === each);
-    for (const button of $("starts").children) press(button, /** @type {HTMLElement} */ (button).dataset.start === player.startName);
+    for (const button of $("starts").children) press(button, button.id === `start-${player.startName}`);
     document.body.classList.toggle("touched", player.touched);
   }
 
@@ -71,16 +71,20 @@ export class Controls {
   #buildStarts() {
     $("starts").append(...Object.keys(STARTS).map((name) => {
       const button = document.createElement("button");
-      Object.assign(button, { type: "button", title: TITLES[name], textContent: name.length > 2 ? name[0].toUpperCase() + name.slice(1) : name });
-      button.dataset.start = name;
+      const textContent = name.length > 2 ? name[0].toUpperCase() + name.slice(1) : name;
+      Object.assign(button, { type: "button", id: `start-${name}`, title: TITLES[name], textContent });
       button.addEventListener("click", () => this.start(name));
       return button;
     }));
   }
 
-  /** What each slider sets, from where to where, and how its value reads. @returns {[keyof Settings, string, number, number, number, (x: number) => string][]} */
+  /**
+   * What each slider sets, from where to where, and how its value reads.
+   * @returns {[keyof Settings, string, number, number, number, (x: number) => string][]}
+   */
   #sliders() {
-    const factor = (/** @type {number} */ x) => `× ${x.toFixed(2)}`, percent = (/** @type {number} */ x) => `${Math.round(100 * x)} %`;
+    const factor = (/** @type {number} */ x) => `× ${x.toFixed(2)}`;
+    const percent = (/** @type {number} */ x) => `${Math.round(100 * x)} %`;
     const newtons = (/** @type {number} */ x) => (x ? `${(x * this.fleet.weight).toPrecision(2)} N` : "0 N");
     const delay = (/** @type {number} */ x) => `${Math.round(1000 * x * this.fleet.vehicle.control_step)} ms`;
     return [
@@ -114,7 +118,8 @@ export class Controls {
 
   #offerVehicles() {
     const select = /** @type {HTMLSelectElement} */ ($("vehicle"));
-    select.replaceChildren(...this.vehicles.map(({ name }) => new Option(name, name, false, name === this.fleet.vehicle.name)));
+    const flown = this.fleet.vehicle.name;
+    select.replaceChildren(...this.vehicles.map(({ name }) => new Option(name, name, false, name === flown)));
   }
 
   #listen() {

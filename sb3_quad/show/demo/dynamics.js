@@ -25,7 +25,11 @@ export function rotation(s) {
   ];
 }
 
-/** Rotor speeds that actions command (Eqs. 3.18 and 2.4), rad/s. @param {ArrayLike<number>} actions @param {Parameters} p */
+/**
+ * Rotor speeds that actions command (Eqs. 3.18 and 2.4), rad/s.
+ * @param {ArrayLike<number>} actions
+ * @param {Parameters} p
+ */
 export function commandedSpeeds(actions, p) {
   return [0, 1, 2, 3].map((k) => Math.sqrt((p.middle + p.half * Math.min(Math.max(actions[k], -1), 1)) / p.lift));
 }
@@ -33,7 +37,13 @@ export function commandedSpeeds(actions, p) {
 /** @param {number} value */
 const cut = (value) => Math.min(Math.max(value, -MAX_VELOCITY), MAX_VELOCITY);
 
-/** One physics step of a state, in place. @param {Float64Array} s @param {number[]} wanted rotor speeds, rad/s @param {Parameters} p @param {Wrench} wrench */
+/**
+ * One physics step of a state, in place.
+ * @param {Float64Array} s
+ * @param {number[]} wanted rotor speeds, rad/s
+ * @param {Parameters} p
+ * @param {Wrench} wrench
+ */
 export function physicsStep(s, wanted, p, wrench) {
   const dt = p.dt;
   const thrusts = [0, 0, 0, 0];
@@ -73,7 +83,11 @@ function limitVelocities(s, r) {
   for (let k = 0; k < 3; k++) s[10 + k] = r[k] * w[0] + r[3 + k] * w[1] + r[6 + k] * w[2];
 }
 
-/** Position and attitude by the new velocities; the rotation is exact to double precision. @param {Float64Array} s @param {number} dt */
+/**
+ * Position and attitude by the new velocities; the rotation is exact to double precision.
+ * @param {Float64Array} s
+ * @param {number} dt
+ */
 function move(s, dt) {
   for (let k = 0; k < 3; k++) s[k] += dt * s[7 + k];
   const half = 0.5 * dt;
@@ -84,7 +98,14 @@ function move(s, dt) {
   turnBody(s, aw, x * sinc, y * sinc, z * sinc);
 }
 
-/** Turn the body of a state by a quaternion in its own axes. @param {Float64Array} s @param {number} aw @param {number} ax @param {number} ay @param {number} az */
+/**
+ * Turn the body of a state by a quaternion in its own axes.
+ * @param {Float64Array} s
+ * @param {number} aw
+ * @param {number} ax
+ * @param {number} ay
+ * @param {number} az
+ */
 export function turnBody(s, aw, ax, ay, az) {
   const qw = s[3], qx = s[4], qy = s[5], qz = s[6];
   const w = qw * aw - qx * ax - qy * ay - qz * az;

@@ -80,7 +80,12 @@ export function derivedGains(v) {
   };
 }
 
-/** Speed towards a target from which it can be braked. @param {number} distance @param {number} gain @param {number} deceleration */
+/**
+ * Speed towards a target from which it can be braked.
+ * @param {number} distance
+ * @param {number} gain
+ * @param {number} deceleration
+ */
 function brakingProfile(distance, gain, deceleration) {
   return (deceleration / gain) * (sqrt(1 + (2 * gain * gain * distance) / deceleration) - 1);
 }
@@ -107,7 +112,13 @@ export function geometric(v) {
   };
 }
 
-/** Desired force of the rotors per mass, world frame, m/s². @param {number[]} e @param {number[]} v @param {any} gains @param {number} g */
+/**
+ * Desired force of the rotors per mass, world frame, m/s².
+ * @param {number[]} e
+ * @param {number[]} v
+ * @param {any} gains
+ * @param {number} g
+ */
 function desiredForce([ex, ey, ez], [vx, vy, vz], gains, g) {
   const distance = sqrt(ex * ex + ey * ey);
   const speed = distance > 0 ? brakingProfile(distance, gains.position, gains.deceleration) / distance : gains.position;
@@ -120,7 +131,14 @@ function desiredForce([ex, ey, ez], [vx, vy, vz], gains, g) {
   return [scale * fx, scale * fy, fz];
 }
 
-/** A direction fixed in the world as the body sees it some time later. @param {number[]} b @param {number} p @param {number} q @param {number} r @param {number} time */
+/**
+ * A direction fixed in the world as the body sees it some time later.
+ * @param {number[]} b
+ * @param {number} p
+ * @param {number} q
+ * @param {number} r
+ * @param {number} time
+ */
 function rotated([b1, b2, b3], p, q, r, time) {
   const rate = sqrt(p * p + q * q + r * r);
   if (rate < 1e-9) return [b1, b2, b3];
@@ -134,7 +152,15 @@ function rotated([b1, b2, b3], p, q, r, time) {
   ];
 }
 
-/** Axis and rate that turn the thrust to a direction, the long way round where the spin makes that quicker. @param {number} b1 @param {number} b2 @param {number} b3 @param {number} p @param {number} q @param {any} gains */
+/**
+ * Axis and rate that turn the thrust to a direction, the long way round where the spin makes that quicker.
+ * @param {number} b1
+ * @param {number} b2
+ * @param {number} b3
+ * @param {number} p
+ * @param {number} q
+ * @param {any} gains
+ */
 function wantedTurn(b1, b2, b3, p, q, gains) {
   const braking = gains.angular_deceleration;
   const sine = sqrt(b1 * b1 + b2 * b2);
@@ -147,7 +173,17 @@ function wantedTurn(b1, b2, b3, p, q, gains) {
   return [nx, ny, brakingProfile(angle, gains.attitude, braking)];
 }
 
-/** Roll and pitch before thrust, thrust before yaw, within every rotor's limits. @param {number} thrust @param {number} mx @param {number} my @param {number} mz @param {number[][]} mixer @param {number} low @param {number} high @param {Float32Array} actions */
+/**
+ * Roll and pitch before thrust, thrust before yaw, within every rotor's limits.
+ * @param {number} thrust
+ * @param {number} mx
+ * @param {number} my
+ * @param {number} mz
+ * @param {number[][]} mixer
+ * @param {number} low
+ * @param {number} high
+ * @param {Float32Array} actions
+ */
 function allocate(thrust, mx, my, mz, mixer, low, high, actions) {
   const middle = (high + low) / 2, half = (high - low) / 2;
   const differences = mixer.map((m) => m[1] * mx + m[2] * my);

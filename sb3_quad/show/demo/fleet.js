@@ -49,7 +49,10 @@ function inWorld([w, x, y, z], [a, b, c]) {
   ];
 }
 
-/** Starts by name; s1 and s2 as the suite `thesis` has them, random as the task state_recovery. @type {Object<string, (uniform: () => number) => Start>} */
+/**
+ * Starts by name; s1 and s2 as the suite `thesis` has them, random as the task state_recovery.
+ * @type {Object<string, (uniform: () => number) => Start>}
+ */
 export const STARTS = {
   "upside down": () => ({ position: HOME, quaternion: [0, 1, 0, 0], velocity: [0, 0, 0], rates: [0, 0, 0], target: HOME }),
   s1: () => thesis([0, -1, 0, 0], [2, 2, 0]),

@@ -39,7 +39,8 @@ export function listen(canvas, camera, deeds) {
     let best = null, least = reach;
     for (const thing of deeds.things()) {
       const [x, y, depth] = camera.project(thing.position);
-      const away = Math.hypot(x - at.x, y - at.y) + (thing.kind === "target" ? 6 : 0); // a vehicle at its target is taken first
+      const behind = thing.kind === "target" ? 6 : 0; // a vehicle at its target is taken first
+      const away = Math.hypot(x - at.x, y - at.y) + behind;
       if (depth > 0.3 && away < least) [best, least] = [{ ...thing, depth }, away];
     }
     return best;
@@ -66,7 +67,8 @@ export function listen(canvas, camera, deeds) {
     const thing = find(at, event.pointerType === "mouse" ? REACH.mouse : REACH.touch);
     const pushes = deeds.tool === "push" || event.button === 2 || event.shiftKey;
     const kind = !thing ? "camera" : thing.kind === "target" ? "target" : pushes ? "push" : "throw";
-    held = { kind, index: thing?.index ?? 0, depth: thing?.depth ?? 1, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
+    const { index, depth } = thing ?? { index: 0, depth: 1 };
+    held = { kind, index, depth, ...at, samples: [[event.timeStamp / 1000, at.x, at.y]] };
     if (kind === "throw") deeds.grab(held.index);
     if (kind === "target") deeds.target(null);
     canvas.dataset.hand = kind;
@@ -80,7 +82,10 @@ export function listen(canvas, camera, deeds) {
       return;
     }
     if (pointers.size === 2) {
-      const spread = () => Math.hypot(...[...pointers.values()].reduce((sum, p, k) => [sum[0] + (k ? -p.x : p.x), sum[1] + (k ? -p.y : p.y)], [0, 0]));
+      const spread = () => {
+        const [a, b] = [...pointers.values()];
+        return Math.hypot(a.x - b.x, a.y - b.y);
+      };
       const apart = spread();
       pointers.set(event.pointerId, at);
       zoom(spread() / Math.max(apart, 1));

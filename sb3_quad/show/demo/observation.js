@@ -18,7 +18,12 @@ const third = Math.sqrt(3);
 /** σ of Eq. 3.16 (Table A.2). */
 export const DEFAULT_STD = [...Array(3).fill(10 / third), ...Array(9).fill(third), ...Array(6).fill(5)];
 
-/** The features of a state, without noise, in the axes of a layout, float32 (18,). @param {Float64Array} s @param {Turn} turn @param {Float32Array} out */
+/**
+ * The features of a state, without noise, in the axes of a layout, float32 (18,).
+ * @param {Float64Array} s
+ * @param {Turn} turn
+ * @param {Float32Array} out
+ */
 export function features(s, turn, out) {
   const r = rotation(s);
   const cosine = Math.cos(turn.angle), sine = Math.sin(turn.angle);
@@ -42,7 +47,11 @@ export class Observer {
   /**
    * @param {ObservationSettings} settings
    * @param {number} controlStep s
-   * @param {{mean?: number[], std?: number[], turn?: Turn, normal?: () => number}} how the scaling, the turn to the layout that the policy knows, and standard normals
+   * @param {object} how the scaling, the turn to the layout that the policy knows, and standard normals for the noise
+   * @param {number[]} [how.mean]
+   * @param {number[]} [how.std]
+   * @param {Turn} [how.turn]
+   * @param {() => number} [how.normal]
    */
   constructor(settings, controlStep, { mean = Array(18).fill(0), std = DEFAULT_STD, turn = NO_TURN, normal = () => 0 } = {}) {
     this.ages = settings.history ?? [0];
@@ -71,7 +80,11 @@ export class Observer {
     return this.#observe();
   }
 
-  /** The observation one control step later. @param {Float64Array} s @param {ArrayLike<number>} action that led there, in the layout's order */
+  /**
+   * The observation one control step later.
+   * @param {Float64Array} s
+   * @param {ArrayLike<number>} action that led there, in the layout's order
+   */
   next(s, action) {
     this.step += 1;
     const at = (this.step % this.depth) * this.size;

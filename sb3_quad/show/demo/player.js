@@ -145,6 +145,7 @@ export class Player {
   grab(index) {
     const { state } = this.fleet.flying[index].flight;
     this.grabbed = { position: [...state.subarray(0, 3)], quaternion: [...state.subarray(3, 7)] };
+    this.startName = "";
     this.fleet.hold(this.#inHand([0, 0, 0], [0, 0, 0]));
     for (const entry of this.fleet.entries) entry.trail = [];
     this.takeOver();
@@ -160,7 +161,6 @@ export class Player {
   /** @param {number[]} velocity m/s */
   release(velocity) {
     const { position } = this.fleet.start;
-    this.startName = "";
     this.#begin({ ...this.#inHand([0, 0, 0], velocity), position });
   }
 
@@ -234,6 +234,7 @@ export class Player {
     position[2] = Math.max(position[2], this.fleet.vehicle.collision_radius + 0.15);
     const share = Math.min(1, FASTEST / Math.max(Math.hypot(...velocity), 1e-9));
     const held = velocity.map((each) => each * share);
-    return { position, quaternion: this.grabbed.quaternion, velocity: held, rates: this.#spin(held), target: this.fleet.start.target };
+    const { quaternion } = this.grabbed, { target } = this.fleet.start;
+    return { position, quaternion, velocity: held, rates: this.#spin(held), target };
   }
 }

@@ -18,7 +18,12 @@ export class Plot {
     this.g = /** @type {CanvasRenderingContext2D} */ (canvas.getContext("2d"));
   }
 
-  /** @param {Curve[]} curves @param {number} seconds shown @param {Object<string, string>} palette @param {number[]} [limits] drawn as dashed lines */
+  /**
+   * @param {Curve[]} curves
+   * @param {number} seconds shown
+   * @param {Object<string, string>} palette
+   * @param {number[]} [limits] drawn as dashed lines
+   */
   draw(curves, seconds, palette, limits = []) {
     const { canvas, g, axis } = this;
     const [width, height] = [canvas.clientWidth, canvas.clientHeight];

@@ -19,17 +19,11 @@
  * @property {number[]} force N, in weights
  * @property {boolean} near whether it is within 0.1 m
  */
-import { armLength } from "./vehicle.js";
+import { Airframe, CIRCLE, faded, trace } from "./airframe.js";
 
-const CIRCLE = Array.from({ length: 25 }, (_, k) => [Math.cos((k * Math.PI) / 12), Math.sin((k * Math.PI) / 12)]);
-const SMALLEST = 52; // pixels from rotor to rotor, below which a vehicle is drawn larger than it is
 const GRID = 120; // m, how far the lines on the ground reach
 
-/** A colour with some opacity. @param {string} hex #rrggbb @param {number} alpha */
-export function faded(hex, alpha) {
-  const [r, g, b] = [1, 3, 5].map((k) => parseInt(hex.slice(k, k + 2), 16));
-  return `rgba(${r},${g},${b},${alpha})`;
-}
+const FORCE = 3; // m of an arrow, per weight
 
 export class Scene {
   /** @param {CanvasRenderingContext2D} context @param {Camera} camera */
@@ -49,7 +43,10 @@ export class Scene {
     for (const body of lanes.values()) this.#target(body);
     if (trails) for (const body of bodies) this.#trail(body);
     const far = (/** @type {Body} */ body) => this.camera.project(body.position)[2];
-    for (const body of [...bodies].sort((a, b) => far(b) - far(a))) this.#vehicle(body, vehicle);
+    for (const body of [...bodies].sort((a, b) => far(b) - far(a))) {
+      new Airframe(this.g, this.camera, this.palette, body, vehicle).draw();
+      this.#force(body);
+    }
     this.#labels(bodies, lanes.size === bodies.length);
   }
 
@@ -99,23 +96,12 @@ export class Scene {
     this.g.lineTo(to[0], to[1]);
   }
 
-  /** @param {number[][]} points */
-  #path(points) {
-    const { g, camera } = this;
-    g.beginPath();
-    points.forEach((p, k) => {
-      const [x, y] = camera.project(p);
-      if (k) g.lineTo(x, y);
-      else g.moveTo(x, y);
-    });
-  }
-
   /** @param {Body} body */
   #shadow({ position, lost }) {
     const { g, palette } = this;
     const size = 0.3 + 0.02 * position[2];
     if (this.camera.project([position[0], position[1], 0])[2] < 1) return;
-    this.#path(CIRCLE.map(([c, s]) => [position[0] + size * c, position[1] + size * s, 0]));
+    trace(this.g, this.camera, CIRCLE.map(([c, s]) => [position[0] + size * c, position[1] + size * s, 0]));
     g.globalAlpha = lost ? 0.5 : Math.max(0.12, 0.4 - 0.015 * position[2]);
     g.fillStyle = palette.shadow;
     g.fill();
@@ -128,7 +114,7 @@ export class Scene {
     const [x, y, depth] = camera.project(target);
     if (depth < 0.3) return;
     const size = Math.max(camera.pixels(depth) * 0.1, 5);
-    this.#path([target, [target[0], target[1], 0]]);
+    trace(this.g, this.camera, [target, [target[0], target[1], 0]]);
     g.strokeStyle = faded(palette.target, 0.28);
     g.lineWidth = 1;
     g.stroke();
@@ -157,121 +143,29 @@ export class Scene {
   #trail({ trail, colour, lane }) {
     const { g } = this;
     const stride = 3, parts = 12;
-    const points = trail.filter((_, k) => k % stride === 0 || k === trail.length - 1).map((p) => p.map((each, k) => each + lane[k]));
+    const kept = trail.filter((_, k) => k % stride === 0 || k === trail.length - 1);
+    const points = kept.map((p) => p.map((each, k) => each + lane[k]));
     g.lineWidth = 2.5;
     g.lineCap = "butt";
     g.lineJoin = "round";
     for (let part = 0; part < parts; part++) {
-      const from = Math.floor((part * (points.length - 1)) / parts), to = Math.floor(((part + 1) * (points.length - 1)) / parts);
+      const [from, to] = [part, part + 1].map((each) => Math.floor((each * (points.length - 1)) / parts));
       if (to <= from) continue;
-      this.#path(points.slice(from, to + 1));
+      trace(this.g, this.camera, points.slice(from, to + 1));
       g.strokeStyle = faded(colour, 0.06 + (0.6 * (part + 1)) / parts);
       g.stroke();
     }
   }
 
-  /** @param {Body} body @param {Vehicle} vehicle */
-  #vehicle(body, vehicle) {
-    const { g, camera, palette } = this;
-    const [hx, hy, depth] = camera.project(body.position);
-    if (depth < 0.3) return;
-    const arm = armLength(vehicle);
-    const grown = Math.max(1, SMALLEST / (2 * arm * camera.pixels(depth)));
-    const unit = arm * grown;
-    const r = body.rotation;
-    const at = (/** @type {number} */ x, /** @type {number} */ y, /** @type {number} */ z) =>
-      [0, 1, 2].map((k) => body.position[k] + grown * (r[3 * k] * x + r[3 * k + 1] * y + r[3 * k + 2] * z));
-    const pixel = camera.pixels(depth) * unit;
-    const { forward } = camera;
-    const above = r[2] * forward[0] + r[5] * forward[1] + r[8] * forward[2] < 0; // the camera sees its upper side
-    const alpha = body.lost ? 0.55 : 1;
-    const dark = body.lost ? palette.lost : palette.frame;
-    g.globalAlpha = alpha;
-    g.lineCap = "round";
-    const disc = 0.62 * arm;
-    const top = 0.16 * arm;
-    const rotors = vehicle.rotor_positions.map(([x, y], k) => ({ x, y, k, depth: camera.project(at(x, y, top))[2] }));
-    const hub = { depth };
-    const draw = (/** @type {{x: number, y: number, k: number, depth: number}} */ rotor) => {
-      const { x, y, k } = rotor;
-      const tip = camera.project(at(x, y, 0)), motor = camera.project(at(x, y, top));
-      const isFront = x > 0.2 * arm;
-      g.strokeStyle = dark;
-      g.lineWidth = Math.max(2, 0.13 * pixel);
-      g.beginPath();
-      g.moveTo(hx, hy);
-      g.lineTo(tip[0], tip[1]);
-      g.stroke();
-      if (isFront && !body.lost) {
-        const from = camera.project(at(0.45 * x, 0.45 * y, 0));
-        g.strokeStyle = body.colour;
-        g.lineWidth = Math.max(1.5, 0.09 * pixel);
-        g.beginPath();
-        g.moveTo(from[0], from[1]);
-        g.lineTo(tip[0], tip[1]);
-        g.stroke();
-      }
-      g.strokeStyle = dark;
-      g.lineWidth = Math.max(2, 0.16 * pixel);
-      g.beginPath();
-      g.moveTo(tip[0], tip[1]);
-      g.lineTo(motor[0], motor[1]);
-      g.stroke();
-      this.#path(CIRCLE.map(([c, s]) => at(x + disc * c, y + disc * s, top)));
-      const power = body.lost ? 0 : Math.min(body.thrusts[k] / 2, 1);
-      g.fillStyle = faded(body.colour, above ? 0.16 + 0.4 * power : 0.1 + 0.25 * power);
-      g.fill();
-      g.strokeStyle = faded(body.colour, 0.75);
-      g.lineWidth = 1;
-      g.stroke();
-      const spin = body.angles[k];
-      const [c, s] = [Math.cos(spin) * disc * 0.92, Math.sin(spin) * disc * 0.92];
-      this.#path([at(x - c, y - s, top), at(x + c, y + s, top)]);
-      g.strokeStyle = palette.blade;
-      g.lineWidth = Math.max(1, 0.04 * pixel);
-      g.stroke();
-    };
-    const below = (/** @type {number[][]} */ points) => {
-      this.#path(points);
-      g.strokeStyle = dark;
-      g.lineWidth = Math.max(1.5, 0.06 * pixel);
-      g.stroke();
-    };
-    const legs = () => {
-      const [w, l, h] = [0.34 * arm, 0.42 * arm, -0.36 * arm];
-      for (const side of [-1, 1]) {
-        below([at(-l, side * w, h), at(l, side * w, h)]);
-        for (const end of [-0.6, 0.6]) below([at(end * l, side * 0.5 * w, 0), at(end * l, side * w, h)]);
-      }
-    };
-    const body3d = () => {
-      const [w, h] = [0.3 * arm, 0.1 * arm];
-      const face = (/** @type {number} */ z) => [[w * 1.25, w * 0.7], [w * 1.25, -w * 0.7], [-w, -w], [-w, w]].map(([x, y]) => at(x, y, z));
-      this.#path([...face(above ? -h : h), face(above ? -h : h)[0]]);
-      g.lineJoin = "round";
-      g.lineWidth = Math.max(2, 0.1 * pixel);
-      g.fillStyle = g.strokeStyle = dark;
-      g.fill();
-      g.stroke();
-      this.#path(face(above ? h : -h));
-      g.closePath();
-      g.fillStyle = g.strokeStyle = above ? (body.lost ? palette.lost : body.colour) : dark;
-      g.lineWidth = Math.max(1, 0.07 * pixel);
-      g.fill();
-      g.stroke();
-    };
-    if (above) legs();
-    for (const rotor of rotors.filter((each) => each.depth >= hub.depth).sort((a, b) => b.depth - a.depth)) draw(rotor);
-    body3d();
-    for (const rotor of rotors.filter((each) => each.depth < hub.depth).sort((a, b) => b.depth - a.depth)) draw(rotor);
-    if (!above) legs();
-    g.globalAlpha = 1;
-    const size = Math.hypot(...body.force);
-    if (size > 0.02 && !body.lost) this.arrow([hx, hy], camera.project(body.position.map((each, k) => each + 3 * body.force[k])), palette.force);
+  /** @param {Body} body */
+  #force({ position, force, lost }) {
+    if (lost || Math.hypot(...force) < 0.02) return;
+    const tip = position.map((each, k) => each + FORCE * force[k]);
+    this.#arrow(this.camera.project(position), this.camera.project(tip), this.palette.force);
   }
 
   /** @param {number[]} from @param {number[]} to @param {string} colour */
-  arrow(from, to, colour) {
+  #arrow(from, to, colour) {
     const { g } = this;
     const [dx, dy] = [to[0] - from[0], to[1] - from[1]];
     const length = Math.hypot(dx, dy);

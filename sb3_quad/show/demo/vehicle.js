@@ -26,7 +26,7 @@
  * @property {number} delay control steps
  * @property {number} collision_radius m
  * @property {Object<string, any> | null} [geometric_gains]
- * @property {Object<string, number> | null} [time_optimal] least times to within 0.1 m of targets by their distance, m, where a file has them
+ * @property {Object<string, number> | null} [time_optimal] least times, s, to within 0.1 m of targets, by their distance, m
  *
  * @typedef {VehicleFields & Layout} Vehicle
  *
@@ -135,7 +135,12 @@ function permutations(items) {
 /** @param {number} angle */
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
-/** The smallest turn that brings the rotors to where a layout has them; null: there is none. @param {Layout} ours @param {Layout} theirs @returns {Turn | null} */
+/**
+ * The smallest turn that brings the rotors to where a layout has them; null: there is none.
+ * @param {Layout} ours
+ * @param {Layout} theirs
+ * @returns {Turn | null}
+ */
 export function findTurn(ours, theirs) {
   const [places, goals] = [ours, theirs].map((each) => each.rotor_positions.map(([x, y]) => Math.atan2(y, x)));
   const found = [];

@@ -14,7 +14,10 @@ async function inflate(bytes, format) {
   return new Uint8Array(await new Response(stream).arrayBuffer());
 }
 
-/** The layers of a packed agent: base64 of deflated planes, each of one byte of every number. @param {{shapes: Shape[], bits: number, weights: string}} packed */
+/**
+ * The layers of a packed agent: base64 of deflated planes, each of one byte of every number.
+ * @param {{shapes: Shape[], bits: number, weights: string}} packed
+ */
 export async function unpackLayers({ shapes, bits, weights }) {
   const planes = await inflate(Uint8Array.from(atob(weights), (letter) => letter.charCodeAt(0)), "deflate");
   const width = bits / 8, count = planes.length / width;
@@ -23,7 +26,11 @@ export async function unpackLayers({ shapes, bits, weights }) {
   return layersOf(bits === 16 ? fromHalf(new Uint16Array(bytes.buffer)) : new Float32Array(bytes.buffer), shapes);
 }
 
-/** The files of a zip, read when they are asked for. @param {Uint8Array} bytes @returns {Map<string, () => Promise<Uint8Array>>} */
+/**
+ * The files of a zip, read when they are asked for.
+ * @param {Uint8Array} bytes
+ * @returns {Map<string, () => Promise<Uint8Array>>}
+ */
 function readZip(bytes) {
   const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
   const files = new Map();
@@ -124,7 +131,9 @@ function readStateDict(bytes) {
 
 /** By the module of a policy's class: where the layers of its actor are, the last one's name, and what follows it. */
 const FAMILIES = {
-  "stable_baselines3.common.policies": { hidden: "mlp_extractor.policy_net", last: "action_net", end: "none", default: "tanh" },
+  "stable_baselines3.common.policies": {
+    ...{ hidden: "mlp_extractor.policy_net", last: "action_net", end: "none", default: "tanh" },
+  },
   "stable_baselines3.sac.policies": { hidden: "actor.latent_pi", last: "actor.mu", end: "tanh", default: "relu" },
   "stable_baselines3.td3.policies": { hidden: "actor.mu", last: "", end: "tanh", default: "relu" },
 };
@@ -148,7 +157,7 @@ export async function readAgent(label, content) {
   if (!family) throw new Error(`its policy is of ${module}; this page flies MlpPolicy of PPO, A2C, SAC and TD3`);
   const activation = /'torch\.nn\.modules\.activation\.(\w+)'/.exec(data.policy_kwargs?.activation_fn ?? "");
   const inner = activation ? activation[1].toLowerCase() : family.default;
-  if (inner !== "tanh" && inner !== "relu") throw new Error(`its layers are followed by ${inner}; this page knows tanh and ReLU`);
+  if (inner !== "tanh" && inner !== "relu") throw new Error(`its layers are followed by ${inner}, not tanh or ReLU`);
 
   const weights = readZip((await read(files, "policy.pth")).slice());
   const root = [...weights.keys()].find((name) => name.endsWith("data.pkl"))?.slice(0, -8) ?? "";
@@ -171,7 +180,8 @@ export async function readAgent(label, content) {
     if (weight.shape.length !== 2 || weight.values.length !== weight.shape[0] * weight.shape[1]) {
       throw new Error(`its ${name} is no linear layer`);
     }
-    if (![...weight.values, ...bias.values].every(Number.isFinite)) throw new Error(`its ${name} holds numbers that are not finite`);
+    const finite = [weight, bias].every(({ values }) => values.every(Number.isFinite));
+    if (!finite) throw new Error(`its ${name} holds numbers that are not finite`);
     const [outputs, inputs] = weight.shape;
     const last = name === names[names.length - 1];
     const after = last ? (data.use_sde && data.policy_kwargs?.squash_output ? "tanh" : family.end) : inner;
