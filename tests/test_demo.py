@@ -247,7 +247,7 @@ def default_page():
 
 @pytest.mark.slow
 def test_the_default_page_is_small():
-    page, rounded = default_page()
+    page, _, rounded = default_page()
     assert len(page.encode()) <= LIMIT
     assert set(rounded) <= {"itm-robust", "any-quadcopter"} and all(f"{label}" in page for label in rounded)
 
@@ -373,6 +373,11 @@ def test_a_throw_comes_back_and_a_push_is_felt(browser, page):
     browser.wait_for(f"{geometric}.distance > 0.2")
     browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
     browser.wait_for(f"{geometric}.distance < 0.05")
+
+    assert browser.value("document.getElementById('limit').hidden")
+    browser.value("demo.fleet.vehicle.time_optimal = { 10: 1.5 }")
+    browser.value("demo.player.start('10 m away')")
+    browser.wait_for("document.getElementById('limit').innerText.includes('1.50 s')")
     assert not browser.errors
 
 

@@ -30,11 +30,16 @@ def add_arguments(parser: Parser) -> None:
 
 def run(options: argparse.Namespace) -> int:
     """Pack, write. Returns the exit code."""
+    from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import parse_controllers
     from sb3_quad.show.demo.page import DEFAULT_AGENTS, make_page
+    from sb3_quad.vehicles.vehicle import load_vehicle
 
     refuse_existing(options.output, options.overwrite)
-    page, rounded = make_page(parse_controllers(options.agents or DEFAULT_AGENTS), options.vehicle)
+    specs = parse_controllers(options.agents or DEFAULT_AGENTS)
+    page, vehicle, rounded = make_page(specs, options.vehicle and load_vehicle(options.vehicle))
+    for spec in specs:
+        warn(spec.notice(vehicle))
     write_text(options.output, page)
     if rounded:
         print(f"weights of {' and '.join(rounded)} are rounded to half precision, to keep the page small")

@@ -33,40 +33,44 @@ VIEW = ("fleet", "camera", "airframe", "scene", "plots", "hand", "player", "boar
 EXPERTS = ("pid", "geometric")
 
 
-def make_page(specs: Sequence[ControllerSpec], vehicle: str | Vehicle | None = None) -> tuple[str, list[str]]:
-    """The page as text, and the labels of the agents whose weights are rounded to half precision to make it small.
+def make_page(specs: Sequence[ControllerSpec], vehicle: Vehicle | None = None) -> tuple[str, Vehicle, list[str]]:
+    """The page as text, the vehicle that all fly at first, and which agents' weights are rounded to make the page small.
 
     :param specs: who flies, from the first on as many as are shown.
     :param vehicle: that all fly at first; None: the first agent's own, else ``itm``.
-    :raises ConfigError: a controller that the page cannot fly, or a vehicle that cannot be loaded.
+    :raises ConfigError: a controller that the page cannot fly, or settings that cannot be read.
     """
-    colours = colours_of([spec.label for spec in specs])
     agents, networks = [], {}
-    for spec in specs:
-        agent, network = describe(spec)
-        agents.append({"label": spec.label, "colour": colours[spec.label], **agent})
-        if network is not None:
-            networks[spec.label] = network
-    owned = [first_vehicle(spec.own.vehicle) for spec in specs if spec.own is not None and spec.own.vehicles is None]
-    first = load_vehicle(vehicle or (owned[0] if owned else "itm"))
-    vehicles = {each.name: each for each in (*map(load_vehicle, VEHICLES.names()), *owned, first)}
-    rounded: list[str] = []
-    while True:
-        packed = [
-            agent | pack(networks[agent["label"]], agent["label"] in rounded) for agent in agents if agent["label"] in networks
-        ]
-        by_label = {each["label"]: each for each in packed}
-        data = {
-            "agents": [by_label.get(agent["label"], agent) for agent in agents],
-            "vehicles": [each.model_dump(mode="json") for each in vehicles.values()],
-            "vehicle": first.name,
-            "colours": COLOURS,
-        }
-        page = _render(data, rounded)
-        exact = [label for label in networks if label not in rounded]
-        if len(page.encode()) <= LIMIT or not exact:
-            return page, rounded
-        rounded.append(max(exact, key=lambda label: numbers(networks[label]).size))
+    for spec, colour in zip(specs, colours_of([spec.label for spec in specs]).values(), strict=True):
+        described, networks[spec.label] = describe(spec)
+        agents.append({"label": spec.label, "colour": colour, **described})
+    vehicles = {name: load_vehicle(name) for name in VEHICLES.names()}
+    own = [_add(vehicles, first_vehicle(spec.own.vehicle)) for spec in specs if spec.own and not spec.own.vehicles]
+    first = _add(vehicles, vehicle or [*own, vehicles["itm"]][0])
+    data = {
+        "vehicles": [each.model_dump(mode="json") for each in vehicles.values()],
+        "vehicle": first.name,
+        "colours": COLOURS,
+    }
+    sizes = {label: numbers(network).size for label, network in networks.items() if network is not None}
+    by_size = sorted(sizes, key=lambda label: -sizes[label])
+    for count in range(len(by_size) + 1):  # of the largest networks that are rounded
+        rounded = by_size[:count]
+        packed = {label: pack(network, label in rounded) for label, network in networks.items() if network is not None}
+        page = _render({**data, "agents": [agent | packed.get(agent["label"], {}) for agent in agents]}, rounded)
+        if len(page.encode()) <= LIMIT:
+            break
+    return page, first, rounded
+
+
+def _add(vehicles: dict[str, Vehicle], vehicle: Vehicle) -> Vehicle:
+    """Add a vehicle to others unless one of them flies the same; it is given another name if its own is taken."""
+    for known in vehicles.values():
+        if known.name == vehicle.name and known.flies_as(vehicle):
+            return known
+    while vehicle.name in vehicles:
+        vehicle = vehicle.model_copy(update={"name": f"{vehicle.name}′"})
+    return vehicles.setdefault(vehicle.name, vehicle)
 
 
 def describe(spec: ControllerSpec) -> tuple[dict[str, Any], Network | None]:
