@@ -190,7 +190,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
     return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}
 
 
-def _fly_jobs(jobs: Sequence[Job], executor: Executor | None) -> Iterator[tuple[Job, Any]]:
+def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tuple[Job, Any]]:
     """Fly jobs, and hand out each as it is done: one after another here, or side by side in an executor's workers.
 
     A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.

@@ -14,9 +14,8 @@ import yaml
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_text
-from sb3_quad.base.literals import ZooLoader
 from sb3_quad.base.version import __version__
-from sb3_quad.base.yaml_files import parse_mapping_file
+from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, TRIMMED, run_agent
 from sb3_quad.controllers.zips import saved_data
 
@@ -87,7 +86,7 @@ class RunFolder:
 
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
-        return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
+        return read_yaml(self.config), read_yaml(self.arguments)
 
 
 def made_with() -> dict[str, str]:

@@ -99,9 +99,14 @@ class SnapshotFile(LastGoodModel):
         """
         assert self.snapshot is not None
         timesteps, model = self.snapshot
-        rows = [_with_prefix(f"{name}.", _filled(store)) for name, store in _stores(self.model).items()]
-        state = {"timesteps": np.array(timesteps), "model": np.frombuffer(model, dtype=np.uint8), **self._state}
-        write_arrays(self._run.resume_state, **{name: array for each in (state, *rows) for name, array in each.items()})
+        arrays: dict[str, Any] = {
+            "timesteps": np.array(timesteps),
+            "model": np.frombuffer(model, dtype=np.uint8),
+            **self._state,
+        }
+        for name, store in _stores(self.model).items():
+            arrays |= _with_prefix(f"{name}.", _filled(store))
+        write_arrays(self._run.resume_state, **arrays)
 
 
 def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> BaseAlgorithm:
