@@ -12,7 +12,7 @@ from typing import Any
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
-from sb3_quad.base.files import locked, write_arrays, write_text
+from sb3_quad.base.files import locked, make_folder, write_arrays, write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
@@ -118,10 +118,7 @@ def evaluate(
 
     if not jobs:
         return results()
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: no path
-        raise ConfigError(f"{folder}: cannot be written ({getattr(error, 'strerror', None) or error})") from None
+    make_folder(place, "results folder", "-o")
     with locked(place, "folder"):
         done |= _begin(place, digest, jobs, overwrite)
         missing = [job for job in jobs if job.name not in done]
