@@ -3,6 +3,6 @@
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
+from sb3_quad.callbacks.interruption import LastGoodModel
 
-__all__ = ["BestModel", "Checkpoint", "EpisodeLog", "LastGoodModel", "StopOnSignal"]
+__all__ = ["BestModel", "Checkpoint", "EpisodeLog", "LastGoodModel"]

@@ -12,6 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.results_plotter import load_results
+from stop_on_signal import StopOnSignal
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_quad.base.errors import ConfigError, TrainingError
@@ -19,7 +20,7 @@ from sb3_quad.callbacks import best_model
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
+from sb3_quad.callbacks.interruption import LastGoodModel
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.training.snapshots import random_state, set_random_state

@@ -126,6 +126,13 @@ def test_own_callback(run):
     assert "episodes crashed, beta 0.80" in output
 
 
+def test_stop_on_signal(run):
+    """More of it: tests/test_callbacks.py."""
+    with pytest.raises(SystemExit) as left:
+        run("stop_on_signal.py", *SHORT)
+    assert left.value.code == 0
+
+
 def test_coefficient_schedule(run):
     assert "beta 1.00" in run("coefficient_schedule.py", "--timesteps", "12000")
 
