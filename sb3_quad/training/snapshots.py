@@ -7,21 +7,21 @@ import random
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
 from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import Arrays
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
-from sb3_quad.callbacks.interruption import LastGoodModel
+from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
@@ -32,23 +32,34 @@ LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])  # by name: val
 NO_BYTES = np.zeros(0, np.uint8)
 ANY_LENGTH = ("model", "best_model", "random", "log")
 SHARE = 0.03  # of the run's time that snapshots may take
+PAUSE = 1.0  # s between two snapshots of an off-policy algorithm, whose rollouts are short
 
 
-class SnapshotFile(LastGoodModel):
-    """Writes the snapshot of a rollout's start to the run folder: of the first rollout, then of one in so many seconds.
+class Snapshot(NamedTuple):
+    """A model between two rollouts."""
 
-    Where writing takes long, as it does for a large dataset on a slow disk, snapshots are rarer.
+    timesteps: int
+    model: bytes  # the zip
+
+
+class SnapshotFile(BaseCallback):
+    """Takes a :class:`Snapshot` whenever a rollout starts, and writes that of the first, then one in so many seconds.
+
+    Where writing takes long, as it does for a large dataset on a slow disk, fewer are written.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training goes on.
     :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
+    :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from before that update.
     """
+
+    snapshot: Snapshot | None = None
 
     def __init__(self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]) -> None:
         super().__init__()
         self._run, self._every, self._report, self._hurry = run, every, report, hurry
         self._state: Arrays = {}
-        self._next_write = -np.inf  # s
+        self._taken, self._next_write = -np.inf, -np.inf  # s
 
     @property
     def is_fresh(self) -> bool:
@@ -60,14 +71,17 @@ class SnapshotFile(LastGoodModel):
         if self._run.resume_state.is_file():  # the log of a resumed run says what it would have said
             set_log(self.logger, read_arrays(self._run.resume_state, "log").get("log"), self._run.resume_state)
 
-    def _is_due(self) -> bool:
-        return super()._is_due() or self._hurry()
+    def _on_step(self) -> bool:
+        return True
 
     def _on_rollout_start(self) -> None:
-        before = self.snapshot
-        super()._on_rollout_start()
-        if self.snapshot is before:
+        start = time.monotonic()
+        if isinstance(self.model, OffPolicyAlgorithm) and start < self._taken + PAUSE and not self._hurry():
             return
+        for name, parameter in self.model.policy.named_parameters():
+            if not th.isfinite(parameter).all():
+                raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")
+        self._taken, self.snapshot = start, Snapshot(self.model.num_timesteps, model_bytes(self.model))
         self._state = self._beside_the_model()
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
