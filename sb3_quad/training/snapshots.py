@@ -27,7 +27,7 @@ from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 ENVIRONMENT = "environment."  # before the names of its arrays
-COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}  # what a model may keep: which say how far it is filled
+COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}  # of what a model may keep: how far it is filled
 LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])  # by name: value, how many it is the mean of, not shown by
 NO_BYTES = np.zeros(0, np.uint8)
 ANY_LENGTH = ("model", "best_model", "random", "log")
