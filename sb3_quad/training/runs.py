@@ -5,7 +5,6 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import stable_baselines3
@@ -13,10 +12,9 @@ import torch
 import yaml
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_text
-from sb3_quad.base.literals import ZooLoader
+from sb3_quad.base.files import make_folder, write_text
 from sb3_quad.base.version import __version__
-from sb3_quad.base.yaml_files import parse_mapping_file
+from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, TRIMMED, run_agent
 from sb3_quad.controllers.zips import saved_data
 
@@ -24,7 +22,7 @@ MADE_WITH = ("commit", "versions")  # keys of args.yml
 
 
 class RunFolder:
-    """The files of one run. There are also ``rl_model_<N>_steps.zip``, its checkpoints.
+    """The files of one run.
 
     :param path: the folder.
     :param name: the environment id, as file names take it.
@@ -35,6 +33,7 @@ class RunFolder:
         self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
         self.best_model = path / BEST  # of the evaluations: by success, then by mean reward
         self.trimmed_model = path / TRIMMED  # the same after trimming, where a pipeline does that
+        self.checkpoint = path / "rl_model_{steps}_steps.zip"  # after so many timesteps
         self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
         self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run
@@ -58,21 +57,6 @@ class RunFolder:
         ended = self.model.is_file() and not self.resume_state.is_file()
         return int(saved_data(self.model)["num_timesteps"]) if ended else 0
 
-    def checkpoint(self, timesteps: int | str) -> Path:
-        """Where the model after ``timesteps`` goes."""
-        return self.path / f"rl_model_{timesteps}_steps.zip"
-
-    def latest_checkpoint(self) -> Path:
-        """The checkpoint after most timesteps.
-
-        :raises ConfigError: there is none.
-        """
-        names = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
-        steps = [int(name) for name in names if name.isdigit()]
-        if not steps:
-            raise ConfigError(f"{self.path}: holds no checkpoint; train with --save-freq to have some")
-        return self.checkpoint(max(steps))
-
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
         """Write config.yml and command.txt, then args.yml: a run that has it has begun."""
         self.config.parent.mkdir(exist_ok=True)
@@ -87,7 +71,7 @@ class RunFolder:
 
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
-        return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
+        return read_yaml(self.config), read_yaml(self.arguments)
 
 
 def made_with() -> dict[str, str]:
@@ -123,7 +107,8 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     :raises ConfigError: a folder that cannot be made.
     """
     make_folder(parent, "log folder", "-f")
-    number = max(_runs(parent, name), default=0) + 1
+    others = [entry.name.removeprefix(f"{name}_").split("_")[0] for entry in parent.glob(f"{name}_*")]
+    number = max((int(other) for other in others if other.isdigit()), default=0) + 1
     while True:
         path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
         try:
@@ -131,26 +116,6 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
             return path
         except FileExistsError:
             number += 1
-
-
-def make_folder(path: str | Path, what: str, flag: str) -> None:
-    """Make a folder that files are to be written to, unless it is there.
-
-    :param what: the folder in the message, which also names the flag that gives another.
-    :raises ConfigError: it cannot be written.
-    """
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=path).close()
-    except (OSError, ValueError) as error:  # ValueError: no path
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
-
-
-def _runs(parent: Path, name: str) -> dict[int, Path]:
-    """The folders ``<parent>/<name>_<number>…`` by their numbers."""
-    entries = {entry: entry.name.removeprefix(f"{name}_").split("_")[0] for entry in sorted(parent.glob(f"{name}_*"))}
-    return {int(number): entry for entry, number in entries.items() if number.isdigit()}
 
 
 def open_run(path: str | Path) -> RunFolder:
@@ -165,21 +130,3 @@ def open_run(path: str | Path) -> RunFolder:
     if len(configs) != 1:
         raise ConfigError(f"run folder {folder}: holds no run (<Env>/config.yml is missing)")
     return RunFolder(folder, configs[0].parent.name)
-
-
-def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
-    """A run by rl-zoo's ``--exp-id``.
-
-    :param exp_id: number of the run; 0: the latest that has an agent.
-    :raises ConfigError: there is no such run; the message names those there are.
-    """
-    parent, name = Path(log_folder) / algo, file_name(env_id)
-    runs = _runs(parent, name)
-    with_agent = [number for number, path in runs.items() if any(path.glob("*.zip"))]
-    number = exp_id if exp_id > 0 else max(with_agent or runs, default=0)
-    if number in runs:
-        return RunFolder(runs[number], name)
-    if not runs:
-        raise ConfigError(f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f")
-    there = ", ".join(entry.name for entry in runs.values())
-    raise ConfigError(f"{parent}: there is no run {name}_{number}; there is {there}; give another with --exp-id")
