@@ -12,11 +12,9 @@ from pydantic import BaseModel
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 
-_AGENT = "an agent is named by its zip or its run folder, such as logs/dagger/QuadTargetTracking-v0_1"
 _BRIDGE = "Weights & Biases needs rl_zoo3 itself and the bridge, docs/zoo.md"
 ELSEWHERE = {
     **dict.fromkeys(("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that"),
-    **dict.fromkeys(("--algo", "--env", "--exp-id", "--load-best", "--load-checkpoint", "--load-last-checkpoint"), _AGENT),
     **dict.fromkeys(("--track", *(f"--wandb-{name}" for name in ("project-name", "entity", "group", "tags"))), _BRIDGE),
 }
 """Flags of rl_zoo3 that no command has, and what has their part."""

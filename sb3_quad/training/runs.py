@@ -22,7 +22,7 @@ MADE_WITH = ("commit", "versions")  # keys of args.yml
 
 
 class RunFolder:
-    """The files of one run.
+    """The files of one run. There are also ``rl_model_<N>_steps.zip``, its checkpoints.
 
     :param path: the folder.
     :param name: the environment id, as file names take it.
@@ -33,7 +33,6 @@ class RunFolder:
         self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
         self.best_model = path / BEST  # of the evaluations: by success, then by mean reward
         self.trimmed_model = path / TRIMMED  # the same after trimming, where a pipeline does that
-        self.checkpoint = path / "rl_model_{steps}_steps.zip"  # after so many timesteps
         self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
         self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run
@@ -56,6 +55,10 @@ class RunFolder:
         """Timesteps of the model at the run's end; 0 before that."""
         ended = self.model.is_file() and not self.resume_state.is_file()
         return int(saved_data(self.model)["num_timesteps"]) if ended else 0
+
+    def checkpoint(self, timesteps: int | str) -> Path:
+        """Where the model after ``timesteps`` goes."""
+        return self.path / f"rl_model_{timesteps}_steps.zip"
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
         """Write config.yml and command.txt, then args.yml: a run that has it has begun."""

@@ -216,7 +216,7 @@ def _learn(
         )
         callbacks.append(best)
     if job.save_freq > 0:
-        callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint)))
+        callbacks.append(Checkpoint(job.save_freq, str(run.checkpoint("{steps}"))))
     callbacks += own_callbacks
     if job.progress:
         callbacks.append(ProgressBarCallback())
