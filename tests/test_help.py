@@ -97,6 +97,10 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
             "enjoy pid --task tracking --no-render",
             "did you mean 'far_tracking' or 'recovery_and_tracking' or 'target_tracking'?",
         ),
+        (
+            "enjoy --algo ppo -f nowhere --no-render",
+            "nowhere/ppo: there is no run of QuadTargetTracking-v0; give another place with --env",
+        ),
     ],
 )
 def test_what_is_unknown_is_answered_by_what_helps(arguments, message, tmp_path, monkeypatch, capsys):

@@ -272,17 +272,32 @@ def run_folder(tmp_path):
     return run
 
 
-def test_the_agent_of_a_run_flies_as_it_was_evaluated(run_folder, capsys):
-    assert main(["enjoy", str(run_folder.path), "--no-render"]) == 0
-    assert f"{run_folder.path.name}: " in (output := capsys.readouterr().out) and "0.30 s" in output
+def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
+    logs = str(run_folder.path.parent.parent)
+    asked = ["enjoy", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "--no-render"]
+    assert main(asked) == 0
+    output = capsys.readouterr().out
+    assert str(run_folder.best_model) in output and "0.30 s" in output  # the run's own episodes
+    assert main([*asked, "--exp-id", "1", "--load-best", "--stochastic"]) == 0
+    for wrong, message in (
+        (["--exp-id", "7"], "QuadStateRecovery-v0_1"),
+        (["--load-last-checkpoint"], "--save-freq"),
+        (["--load-checkpoint", "500"], "best_model.zip"),
+        (["--algo", "ppoo"], "did you mean 'ppo'"),
+    ):
+        capsys.readouterr()
+        assert main([*asked, *wrong]) == 2
+        error = capsys.readouterr().err
+        assert message in error and error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "CONTROLLER"),
+        ([], "nobody to fly"),
         (["pdi", "--no-render"], "did you mean 'pid'"),
         (["nowhere.zip", "--no-render"], "no such file"),
+        (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
         (["pid", "--task", "state-recovery", "--no-render"], "did you mean 'state_recovery'"),
         (["pid", "--task", "state_recovery", "--scenario", "thesis:side_hit", "--no-render"], "not allowed with"),
         (["pid", "--scenario", "thesis:side_hitt", "--no-render"], "did you mean 'side_hit'"),
@@ -331,16 +346,17 @@ def test_flights_are_shown_in_a_window():
 def test_the_agent_of_a_run_is_filmed_and_no_film_replaced(run_folder, tmp_path, capsys):
     import imageio.v2 as imageio
 
-    film, name = tmp_path / "one.mp4", run_folder.path.name
-    asked = ["enjoy", str(run_folder.path), "-n", "10", "--size", "64x64", "-o"]
+    logs, film = str(run_folder.path.parent.parent), tmp_path / "one.mp4"
+    asked = ["enjoy", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "-n", "10", "--size", "64x64", "-o"]
     assert main([*asked, str(film)]) == 0
-    assert f"saved {film}" in capsys.readouterr().out
+    output = capsys.readouterr().out
+    assert f"agent: {run_folder.best_model}" in output and f"saved {film}" in output
     before = film.read_bytes()
     assert main([*asked, str(film)]) == 2
     assert "--overwrite" in capsys.readouterr().err and film.read_bytes() == before
     assert main([*asked, str(tmp_path / "both.mp4"), "--n-envs", "2", "--seed", "4"]) == 0
     output = capsys.readouterr().out
-    assert f"seed 4, {name}" in output and f"seed 5, {name}" in output
+    assert "seed 4, ppo best_model" in output and "seed 5, ppo best_model" in output
     widths = [next(iter(imageio.get_reader(path))).shape[1] for path in (film, tmp_path / "both.mp4")]
     assert widths[1] >= 2 * widths[0]
 

@@ -20,8 +20,8 @@ EPILOG = """examples:
   sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          a single training
   sb3-quad tune --algo dagger -n 250000 --n-trials 30                     a search for its hyperparameters
   sb3-quad evaluate pid agent.zip --suite quick                           an agent and an expert in one table
-  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1                       its flights in a window
-  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1 -o film.mp4           or as a film
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flights in a window
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -o film.mp4     or as a film
   sb3-quad train --help                                                   all options of a command, with examples
 
 exit codes:

@@ -22,8 +22,8 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
     Beside it, ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the agent was judged with; without
     it, that is in its ``config.yml``. Where nothing says how it flies, that is as ``FlightSettings()``.
 
-    :raises ConfigError: a zip or settings that cannot be read or do not fit; several runs' settings lie there; settings
-        with rl_zoo3's wrappers, or statistics of VecNormalize, which are no part of a zip.
+    :raises ConfigError: a zip or settings that cannot be read or do not fit; several runs' settings lie there, or
+        statistics of VecNormalize, which are no part of a zip.
     """
     record = saved_data(zip_file).get(KEY)
     if isinstance(record, dict):
@@ -42,9 +42,6 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
     if len(files) > 1:
         raise ConfigError(f"{zip_file}: several config.yml files lie beside it ({', '.join(map(str, files))})")
     settings, where = read_yaml(files[0]), f"{files[0]}: env_kwargs"
-    for key in ("frame_stack", "normalize"):
-        if settings.get(key):
-            raise ConfigError(f"{files[0]}: was trained with {key}, which is not put around the environments here")
     file = files[0].with_name("args.yml")
     judged = read_yaml(file).get("env_kwargs") if file.is_file() else None
     parts = [judged] if judged is not None else [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]

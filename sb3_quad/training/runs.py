@@ -60,6 +60,17 @@ class RunFolder:
         """Where the model after ``timesteps`` goes."""
         return self.path / f"rl_model_{timesteps}_steps.zip"
 
+    def latest_checkpoint(self) -> Path:
+        """The checkpoint after most timesteps.
+
+        :raises ConfigError: there is none.
+        """
+        names = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
+        steps = [int(name) for name in names if name.isdigit()]
+        if not steps:
+            raise ConfigError(f"{self.path}: holds no checkpoint; train with --save-freq to have some")
+        return self.checkpoint(max(steps))
+
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
         """Write config.yml and command.txt, then args.yml: a run that has it has begun."""
         self.config.parent.mkdir(exist_ok=True)
@@ -110,8 +121,7 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
     :raises ConfigError: a folder that cannot be made.
     """
     make_folder(parent, "log folder", "-f")
-    others = [entry.name.removeprefix(f"{name}_").split("_")[0] for entry in parent.glob(f"{name}_*")]
-    number = max((int(other) for other in others if other.isdigit()), default=0) + 1
+    number = max(_runs(parent, name), default=0) + 1
     while True:
         path = parent / (f"{name}_{number}_{uuid.uuid4()}" if unique else f"{name}_{number}")
         try:
@@ -119,6 +129,12 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
             return path
         except FileExistsError:
             number += 1
+
+
+def _runs(parent: Path, name: str) -> dict[int, Path]:
+    """The folders ``<parent>/<name>_<number>…`` by their numbers."""
+    entries = {entry: entry.name.removeprefix(f"{name}_").split("_")[0] for entry in sorted(parent.glob(f"{name}_*"))}
+    return {int(number): entry for entry, number in entries.items() if number.isdigit()}
 
 
 def open_run(path: str | Path) -> RunFolder:
@@ -133,3 +149,21 @@ def open_run(path: str | Path) -> RunFolder:
     if len(configs) != 1:
         raise ConfigError(f"run folder {folder}: holds no run (<Env>/config.yml is missing)")
     return RunFolder(folder, configs[0].parent.name)
+
+
+def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) -> RunFolder:
+    """A run by rl-zoo's ``--exp-id``.
+
+    :param exp_id: number of the run; 0: the latest that has an agent.
+    :raises ConfigError: there is no such run; the message names those there are.
+    """
+    parent, name = Path(log_folder) / algo, file_name(env_id)
+    runs = _runs(parent, name)
+    with_agent = [number for number, path in runs.items() if any(path.glob("*.zip"))]
+    number = exp_id if exp_id > 0 else max(with_agent or runs, default=0)
+    if number in runs:
+        return RunFolder(runs[number], name)
+    if not runs:
+        raise ConfigError(f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f")
+    there = ", ".join(entry.name for entry in runs.values())
+    raise ConfigError(f"{parent}: there is no run {name}_{number}; there is {there}; give another with --exp-id")

@@ -1,16 +1,16 @@
 """Watch controllers fly: in PyBullet's window, as a film, or as poses in one picture; several side by side.
 
 examples:
-  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1                        a run's agent, in a window
-  sb3-quad enjoy logs/ppo_bc/QuadStateRecovery-v0_1/rl_model_80000_steps.zip
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs          the latest run's agent, in a window
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
   sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 -o recovery.mp4
   sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
   sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
   sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml -n 3000 --no-render
 
 A controller is pid, geometric, the path of an SB3 zip or a run folder, or package.module:factory; name=… labels it.
-The first agent says which vehicle, task and observation all fly with, unless --task, --scenario or --env-kwargs do.
-The agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
+The first agent says which vehicle, task and observation all fly with, unless --env, --task, --scenario or --env-kwargs do.
+Without --load-…, the agent of a run is trimmed_model.zip, else best_model.zip, else <Env>.zip.
 """
 
 import argparse
@@ -20,20 +20,32 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import refuse_existing, write_bytes
-from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, positive
+from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, positive, whole
+from sb3_quad.envs.registration import ENVIRONMENTS
 
+DEFAULT_ENV = "QuadTargetTracking-v0"
+LAST = "last checkpoint"
 SINGLE, PANEL = (640, 480), (480, 480)  # width and height of the only panel, and of one of several, pixels
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the flags of what is flown, with rl-zoo's meanings where its ``enjoy.py`` has them, and of how it is shown."""
+    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and how it is shown."""
     add = parser.add_argument
-    add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
+    add("controllers", nargs="*", metavar="CONTROLLER", help="who flies, besides the agent of --algo")
+    add("--algo", help="algorithm of a trained agent, looked up in the log folder")
     task = parser.add_mutually_exclusive_group()
-    task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery (the first agent's own)")
-    task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of a task")
+    task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
+    task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery, instead of --env")
+    task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of --env")
+    add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
+    add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")
+    which = parser.add_mutually_exclusive_group()
+    best: dict[str, Any] = {"dest": "which", "action": "store_const", "const": "best"}
+    which.add_argument("--load-best", help="the best agent of the evaluations", **best)
+    which.add_argument("--load-checkpoint", dest="which", type=whole, metavar="N", help="the checkpoint after N timesteps")
+    which.add_argument("--load-last-checkpoint", help=f"the {LAST}", **{**best, "const": LAST})
     add("-n", "--n-timesteps", type=positive, metavar="N", help="control steps, in as many episodes as needed (one episode)")
     add("--n-envs", type=positive, default=1, metavar="N", help="episodes side by side, with consecutive seeds (1)")
     add("--seed", type=natural, default=0, metavar="N", help="seed of the first episode (0); later ones count up")
@@ -88,12 +100,41 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
+def _agent_of_run(options: argparse.Namespace, env_id: str) -> tuple[str, str]:
+    """Name and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and ``--load-…`` name.
+
+    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that enjoy does not have.
+    """
+    from sb3_quad.training.algorithms import get_algorithm
+    from sb3_quad.training.runs import find_run
+
+    if not (Path(options.folder) / options.algo).is_dir():
+        get_algorithm(options.algo)  # raises if there is none of that name
+    run = find_run(options.folder, options.algo, env_id, options.exp_id)
+    if isinstance(options.which, int):
+        path = run.checkpoint(options.which)
+    elif options.which == LAST:
+        path = run.latest_checkpoint()
+    else:
+        path = run.best_model if options.which == "best" else run.result
+    if not path.is_file():
+        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
+        raise ConfigError(f"{path}: no such file; the run holds {zips}")
+    settings, _ = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(f"{run.path}: was trained with {key}, which enjoy does not put around the environment")
+    return f"{options.algo} {path.name}", str(path)
+
+
 def _check(options: argparse.Namespace, window: bool) -> None:
     """Refuse what can be refused before anything is flown."""
     from sb3_quad.envs.rendering.window import has_display
     from sb3_quad.show.film import check_film
     from sb3_quad.simulation.checks import check_size
 
+    if not (options.controllers or options.algo):
+        raise ConfigError("nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env")
     if options.size:
         check_size(*options.size)
     for file in options.output:
@@ -108,20 +149,25 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """What is flown, a :class:`~sb3_quad.show.episodes.Setting`, and who flies, by label."""
     from sb3_quad.cli.output import warn
     from sb3_quad.controllers.resolve import resolve_expert
-    from sb3_quad.evaluation.controllers import parse_controllers
+    from sb3_quad.evaluation.controllers import ControllerSpec, parse_controllers
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
     from sb3_quad.simulation.settings import FlightSettings
     from sb3_quad.vehicles.vehicle import first_vehicle
 
-    specs = parse_controllers(options.controllers)
+    env_id, specs = options.env or DEFAULT_ENV, parse_controllers(options.controllers)
+    if env_id not in ENVIRONMENTS:
+        raise ConfigError(unknown("environment", env_id, ENVIRONMENTS) + "; others are shown by rl_zoo3.enjoy")
+    if options.algo:
+        specs.insert(0, ControllerSpec(*_agent_of_run(options, env_id)))
+        print(f"agent: {specs[0].spec}")
     agents = [spec.own for spec in specs if spec.own is not None]  # the first says how all are flown
     if options.scenario is not None:
         if options.env_kwargs or options.target:
             raise ConfigError("--scenario says all about a flight; leave --env-kwargs and --target away")
         setting = scenario_setting(options.scenario, agents[0].vehicle if agents else None)
     else:
-        kept = agents[0] if agents else FlightSettings()
-        task = options.task or kept.task
+        kept = agents[0] if agents else FlightSettings(task=ENVIRONMENTS[env_id])
+        task = options.task or (ENVIRONMENTS[env_id] if options.env and not options.algo else kept.task)
         changes = {"task": task} | ({} if task == kept.task else {"task_kwargs": None}) | options.env_kwargs
         setting = fixed_setting(kept.with_changes(**changes), options.target)
     controllers, own = {}, {}
