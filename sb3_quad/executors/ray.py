@@ -1,9 +1,11 @@
-"""Calls on a Ray cluster: placement and retries are Ray's."""
+"""Calls on a Ray cluster: placement, retries and the package's code on its nodes are Ray's."""
 
 import os
 import platform
+import shutil
 import socket
 import sys
+import tempfile
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
@@ -21,9 +23,9 @@ RETRIES = 3  # of a call whose node or worker process dies
 class RayExecutor:
     """Calls on a cluster at an address, or on one that is started here for as long as this executor lives.
 
-    A call whose worker or node dies is begun again on another, by Ray, up to ``RETRIES`` times. Workers work in this process's
-    folder, so all machines need a disk that they share; they import what this process does, where it is on that disk, and
-    else what is installed there.
+    A call whose worker or node dies is begun again on another, by Ray, up to ``RETRIES`` times. Workers of a cluster at an
+    address get this package from here (``runtime_env``); what it depends on is installed there. They work in this process's
+    folder, so all machines need a disk that they share.
 
     :raises ConfigError: an address at which no cluster answers.
     """
@@ -33,7 +35,8 @@ class RayExecutor:
         self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references = list[Any]()
         variables = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)), **({VARIABLE: "1"} if trusted() else {})}
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "runtime_env": {"env_vars": variables}}
+        environment: dict[str, Any] = {"env_vars": variables}
+        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "runtime_env": environment}
         try:
             if address is None:
                 os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's warning about it is none of ours
@@ -41,7 +44,9 @@ class RayExecutor:
                 ray.init(address="local", num_cpus=workers * num_cpus, include_dashboard=False, **options)
             else:
                 _check_address(address)
-                ray.init(address=address, **options)
+                with tempfile.TemporaryDirectory() as folder:  # which Ray uploads
+                    environment["py_modules"] = [str(_copy_package(Path(folder)))]
+                    ray.init(address=address, **options)
             total = ray.cluster_resources()
         except ConfigError:
             raise
@@ -96,6 +101,17 @@ def _check_address(address: str) -> None:
     except (ValueError, OSError, OverflowError):
         way_out = "must be auto, host:port or ray://host:port; start one with: ray start --head --port 6379"
         raise ConfigError(f"address {address}: no Ray cluster answers; {way_out}") from None
+
+
+def _copy_package(folder: Path) -> Path:
+    """This package as a wheel lays it out, so that nodes find a checkout's ``envs/`` and its like inside of it."""
+    package, target = Path(__file__).resolve().parents[1], folder / "sb3_quad"
+    ignored = shutil.ignore_patterns("*.pyc")
+    shutil.copytree(package, target, ignore=ignored)
+    for name in ("envs", "callbacks", "zoo_configs"):
+        if not (target / name).exists():
+            shutil.copytree(package.parent / name, target / name, ignore=ignored)
+    return target
 
 
 def _call(argv: list[str], folder: str, function: Callable[..., Any], *arguments: Any) -> Any:
