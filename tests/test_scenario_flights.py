@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from adaptive_scaling import AdaptiveScaling, adaptive_factor, measure_mean
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_arrays
@@ -12,12 +13,12 @@ from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flightlog import episode_arrays, read_flights
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metrics import summarise
-from sb3_quad.evaluation.scaling import AdaptiveScaling, adaptive_factor, hover_offset, measure_mean
 from sb3_quad.evaluation.scenarios.load import load_suite, parse_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.statistics import mean, share
 from sb3_quad.experts.pid import PIDExpert
+from sb3_quad.training.trim import hover_offset
 
 
 def scenario(entry: str) -> Scenario:

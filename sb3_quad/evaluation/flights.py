@@ -155,7 +155,8 @@ def _fly_fleet(
     wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
-    stays, tightest = times.copy(), int(np.argmin(limits))
+    stays = times.copy()
+    first = times[int(np.argmin(limits))] if len(limits) else np.full(n, np.nan)  # touch of the tightest; a view
     flights = Flights(
         success=np.zeros(n, dtype=np.bool_),
         survival=np.ones(n, dtype=np.bool_),
@@ -165,7 +166,7 @@ def _fly_fleet(
         flown=np.zeros(n),
         time_to=dict(zip(tolerances, times, strict=True)),
         time_to_stay=dict(zip(tolerances, stays, strict=True)),
-        overshoot=np.where(np.isnan(times[tightest]), np.nan, error),
+        overshoot=np.where(np.isnan(first), np.nan, error),
         path_length=np.zeros(n),
         final_error=error.copy(),
         final_offset=np.full((n, 3), np.nan),
@@ -200,8 +201,8 @@ def _fly_fleet(
         times[np.isnan(times) & within & flying] = step * control_step
         stays[~within & flying] = np.nan
         stays[np.isnan(stays) & within & flying] = step * control_step
-        arrived_once = flying & ~np.isnan(times[tightest])
-        flights.overshoot[arrived_once] = np.fmax(flights.overshoot, error)[arrived_once]
+        after = flying & ~np.isnan(first)
+        flights.overshoot[after] = np.fmax(flights.overshoot, error)[after]
         flights.collision[flying & lost & collided] = True
         flying &= ~lost
         motion.see(step, state, flying)

@@ -1,6 +1,5 @@
 """Many flights in a few metrics."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,12 +7,9 @@ from pydantic import Field
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
-from sb3_quad.evaluation.flights import Flights, fly
+from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
-from sb3_quad.vehicles.vehicle import Vehicle
-
-NEAR = 0.1  # m
 
 
 class Moment(Frozen):
@@ -101,26 +97,3 @@ def _arrival(tolerance: float, times: FloatArray, stays: FloatArray) -> Arrival:
 
 def _moment(times: FloatArray) -> dict[str, Any]:
     return {"share": share(np.isfinite(times)), "time": mean(times)}
-
-
-def measure_expert(
-    expert: Any, vehicle: Vehicle, seeds: Sequence[int], episodes: int = 960, time_limit: int = 1500
-) -> dict[str, Any]:
-    """Fly ``episodes`` recoveries per seed, and as many targets 10 m away with the first seed.
-
-    A tracking flight that never comes within 0.1 m counts as ``time_limit`` control steps.
-    """
-    keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_steps": time_limit}
-    recovery = Flights.concatenate([fly(expert, "state_recovery", episodes, seed, **keywords) for seed in seeds])
-    tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
-    times = np.nan_to_num(tracking.time_to[NEAR], nan=time_limit * vehicle.control_step)
-    return {
-        "recovery_survival": round(float(recovery.survival.mean()), 5),
-        "recovery_episodes": recovery.n,
-        "tracking_survival": round(float(tracking.survival.mean()), 5),
-        "tracking_episodes": tracking.n,
-        "time_to_0_1_m": round(float(times.mean()), 3),  # mean time until 0.1 m from the target, s
-        "tracking_reward": round(float(tracking.reward.mean()), 3),  # mean (Eqs. 4.5-4.9)
-        "observation_noise": 0.0,
-        "seeds": [*seeds],
-    }
