@@ -174,8 +174,9 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_ru
 @pytest.mark.parametrize("name", pretrained_names())
 def test_each_says_how_it_flies(name):
     settings, source = agent_settings(sb3_quad.pretrained(name))
-    assert source == sb3_quad.pretrained(name) and settings.vehicle == load_vehicle(vehicle_of(name))
-    assert settings.task == ("target_tracking" if name == "thesis-imitation" else "state_recovery")
+    assert source == sb3_quad.pretrained(name) and settings.vehicle.flies_as(load_vehicle(vehicle_of(name)))
+    imitates_pid = name in ("thesis-imitation", "thesis-printed-imitation")
+    assert settings.task == ("target_tracking" if imitates_pid else "state_recovery")
 
 
 @pytest.mark.slow
