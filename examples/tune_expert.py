@@ -4,9 +4,10 @@
     python examples/tune_expert.py my.yaml -o tuned.yaml -n 300
     sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
-Gains are judged by recoveries first, then by the way to a target, then by the reward, on the same episodes each time. The file
-that is written is the vehicle with the gains found, or with those that it began with where these are as good on episodes that
-the search has not seen. Ctrl-C writes the best so far; the study is kept in OUTPUT.journal, and the same command continues it.
+Gains are judged by recoveries first, then by the time after which they stay at targets 7 to 20 m away, and by how many flights
+leave them again, on the same episodes each time. The file that is written is the vehicle with the gains found, or with those
+that it began with where these are as good on episodes that the search has not seen. Ctrl-C writes the best so far; the study
+is kept in OUTPUT.journal, and the same command continues it.
 """
 
 import argparse
@@ -20,32 +21,36 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.evaluation.flights import Hook, fly_settings
-from sb3_quad.evaluation.metrics import measure_expert
+from sb3_quad.evaluation.flights import fly_settings
+from sb3_quad.evaluation.metrics import NEAR, Settling, measure_expert
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
-NEAR = 0.1  # m
 CLOSE = 1.5  # m; the height above ground over which coming close to it loses its weight, by e
-# Weights, in seconds of the way to a target: per share lost, per share that comes close to the ground, per reward.
-LOST, TOO_LOW, TRACKING_REWARD, RECOVERY_REWARD = 1500.0, 1000.0, 0.25, 0.5
+# Weights, in seconds of the way to a target: per share lost, per share that comes close to the ground, per share that leaves
+# its target again, per reward of a recovery.
+LOST, TOO_LOW, LEFT, RECOVERY_REWARD = 1500.0, 1000.0, 0.5, 0.25
+WAYS = {"target_distance": 20.0, "nearest_target": 7.0}  # m
 DESCENT, WAY, RECOVERY = 400, 800, 1000  # control steps flown of each kind
 # Slow descents are for agents that imitate the expert imprecisely; the expert itself could do without, and is not asked.
 SEARCHED = tuple(name for name in GAIN_NAMES if name != "descent_deceleration")
 RANGE = 2.0  # each gain between its first value divided by this and multiplied by it
 
 
-class Way(Hook):
-    """The lowest height of each flight, m, and when it came to stay within 0.1 m of its target, s; the whole time if never."""
+class Way(Settling):
+    """Also the lowest height of each flight, m, and whether it left its target again after it had come within 0.1 m."""
 
     def on_start(self, state, vehicle) -> None:
-        self.lowest, self.settled, self.period = state.position[:, 2].copy(), np.zeros(state.n), vehicle.control_step
+        super().on_start(state, vehicle)
+        self.lowest, self.near, self.left = state.position[:, 2].copy(), np.zeros(state.n, bool), np.zeros(state.n, bool)
 
     def after_step(self, step, state, actions, flying) -> None:
+        super().after_step(step, state, actions, flying)
         self.lowest = np.minimum(self.lowest, np.where(flying, state.position[:, 2], 0.0))
-        self.settled[flying & (state.distance > NEAR)] = step * self.period
+        self.near |= state.distance <= NEAR
+        self.left |= self.near & (state.distance > NEAR)
 
 
 class Objective:
@@ -71,12 +76,13 @@ class Objective:
         lost = (~hard.survival).sum() / self.starts + (~recovery.survival).mean()
         low = np.exp(-np.maximum(descents.lowest, 0.0) / CLOSE).sum() / self.starts  # tells near losses apart
         settling = np.where(tracking.survival, ways.settled, 2 * WAY * self.vehicle.control_step).mean()
-        rewards = TRACKING_REWARD * tracking.reward.mean() + RECOVERY_REWARD * recovery.reward.mean()
-        return float(LOST * lost + TOO_LOW * low + settling - rewards)
+        left, reward = (ways.left & tracking.survival).mean(), recovery.reward.mean()
+        return float(LOST * lost + TOO_LOW * low + settling + LEFT * left - RECOVERY_REWARD * reward)
 
     def fly(self, expert, task, seeds, steps):
         """The first episode of each seed, on the true state."""
-        settings, way = FlightSettings(task=task, vehicle=self.vehicle, noise=0.0, max_episode_steps=steps), Way()
+        keywords = {"task": task, "task_kwargs": WAYS if task == "target_tracking" else None, "max_episode_steps": steps}
+        settings, way = FlightSettings(vehicle=self.vehicle, noise=0.0, **keywords), Way()
         return fly_settings(expert, settings, seeds, hooks=[way]), way
 
 
@@ -89,7 +95,7 @@ def with_values(gains: GeometricGains, values: dict[str, float]) -> GeometricGai
 def fresh_cost(metrics: dict[str, Any]) -> float:
     """What gains cost on fresh episodes, with the same weights, s."""
     lost = LOST * (1.0 - metrics["recovery_survival"])
-    return lost + metrics["time_to_0_1_m"] - TRACKING_REWARD * metrics["tracking_reward"]
+    return lost + metrics["time_to_stay"]
 
 
 def main() -> None:

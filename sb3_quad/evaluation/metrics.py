@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.validate import Frozen
-from sb3_quad.evaluation.flights import Flights, fly
+from sb3_quad.evaluation.flights import Flights, Hook, fly
 from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 NEAR = 0.1  # m
@@ -93,16 +94,28 @@ def _moment(times: FloatArray) -> dict[str, Any]:
     return {"share": share(np.isfinite(times)), "time": mean(times)}
 
 
+class Settling(Hook):
+    """When each flight came to stay within 0.1 m of its target, s; the whole time if it never did."""
+
+    def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
+        self.settled, self.period = np.zeros(state.n), vehicle.control_step
+
+    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+        self.settled[flying & (state.distance > NEAR)] = (step + 1) * self.period
+
+
 def measure_expert(
     expert: Any, vehicle: Vehicle, seeds: Sequence[int], episodes: int = 960, time_limit: int = 1500
 ) -> dict[str, Any]:
     """Fly ``episodes`` recoveries per seed, and as many targets 10 m away with the first seed.
 
-    A tracking flight that never comes within 0.1 m counts as ``time_limit`` control steps.
+    A tracking flight that never comes, or never stays, within 0.1 m counts as ``time_limit`` control steps.
     """
     keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_steps": time_limit}
     recovery = Flights.concatenate([fly(expert, "state_recovery", episodes, seed, **keywords) for seed in seeds])
-    tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
+    settling = Settling()
+    tracking = fly(expert, "target_tracking", episodes, seeds[0], hooks=[settling], **keywords)
+    stays = np.where(tracking.survival, settling.settled, time_limit * vehicle.control_step)
     times = np.nan_to_num(tracking.time_to[NEAR], nan=time_limit * vehicle.control_step)
     return {
         "recovery_survival": round(float(recovery.survival.mean()), 5),
@@ -110,6 +123,7 @@ def measure_expert(
         "tracking_survival": round(float(tracking.survival.mean()), 5),
         "tracking_episodes": tracking.n,
         "time_to_0_1_m": round(float(times.mean()), 3),  # mean time until 0.1 m from the target, s
+        "time_to_stay": round(float(stays.mean()), 3),  # until it stays there, s
         "tracking_reward": round(float(tracking.reward.mean()), 3),  # mean (Eqs. 4.5-4.9)
         "observation_noise": 0.0,
         "seeds": [*seeds],
