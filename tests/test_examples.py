@@ -168,6 +168,14 @@ def test_tune_expert(run, tmp_path):
     assert tuned.model_copy(update={"geometric_gains": poor}) == slow
 
 
+@pytest.mark.slow
+def test_time_optimal(run):
+    """The least time is below the expert's, and no less than that of a point that may accelerate in any direction at once."""
+    pytest.importorskip("casadi")
+    printed = run("time_optimal.py", "hummingbird", "--distances", "10", "--directions", "2")
+    assert 1.0 < float(re.search(r"hummingbird, 10 m: ([\d.]+) s .* 2 of 2 directions solved", printed)[1]) < 1.6
+
+
 def test_publish(run, tmp_path):
     """More of it: tests/test_pretrained.py."""
     with pytest.raises(SystemExit) as left:

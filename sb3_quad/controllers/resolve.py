@@ -14,6 +14,7 @@ EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
     "told_geometric": "sb3_quad.experts.geometric:told_geometric",
+    "told_derived": "sb3_quad.experts.geometric:told_derived",
     "told_cautious": "sb3_quad.experts.geometric:told_cautious",
 }
 DEFAULT_EXPERT = "pid"

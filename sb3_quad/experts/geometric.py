@@ -22,7 +22,7 @@ from sb3_quad.simulation.state import (
     row_slices,
 )
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
-from sb3_quad.vehicles.vehicle import Vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
@@ -32,8 +32,9 @@ _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a know
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
-    """Gains for a vehicle whose YAML has none: ITM's, found by search, scaled by the vehicle's control authority.
+    """Gains for a vehicle whose YAML has none, in proportion to its control authority, by search.
 
+    Found together for ITM, Crazyflie, Hummingbird, one with slow motors, and vehicles of the distribution ``raptor``, told.
     The scales are the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest
     angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
     upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
@@ -56,19 +57,19 @@ def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:
     sideways = np.sqrt(np.maximum(most, 1.01) ** 2 - 1.0)  # a tired vehicle may not even hover
     upwards = gravity * (np.maximum(most, 1.01) - 1.0)
     return {
-        "position": 0.271 * rate,
-        "velocity": 0.458 * rate,
-        "height_position": 0.446 * rate,
-        "height_velocity": 0.748 * rate,
-        "deceleration": 0.571 * gravity * sideways,
-        "height_deceleration": 0.822 * upwards,
+        "position": 0.285 * rate,
+        "velocity": 0.607 * rate,
+        "height_position": 0.407 * rate,
+        "height_velocity": 0.937 * rate,
+        "deceleration": 1.07 * gravity * sideways,
+        "height_deceleration": 1.63 * gravity * (1.0 - least),
         "descent": gravity * np.minimum(0.9, 1.56 * (1.0 - least)),
-        "tilt": 0.979 * sideways,
-        "attitude": 1.19 * rate,
-        "angular_deceleration": 1.81 * turn,
-        "body_rates": 0.685 / lag,
-        "yaw_rate": 0.110 / lag,
-        "descent_deceleration": 0.408 * upwards,
+        "tilt": 1.90 * sideways,
+        "attitude": 1.53 * rate,
+        "angular_deceleration": 1.17 * turn,
+        "body_rates": 0.587 / lag,
+        "yaw_rate": 0.132 / lag,
+        "descent_deceleration": 0.612 * upwards,
     }
 
 
@@ -118,8 +119,7 @@ class GeometricExpert(Expert):
         :func:`derived_gains` where it has none.
     :param told: whether it uses each vehicle's true parameters and compensates the external wrench, as far as a state holds
         them (``state.vehicles``, ``state.wrench``). Its gains then scale with the vehicle as :func:`derived_gains` do.
-    :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent; above 0 its plan also includes
-        the known external force.
+    :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent.
     :raises ConfigError: a negative reserve, or one without ``told``.
     """
 
@@ -162,6 +162,11 @@ def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     return GeometricExpert(vehicle, told=True)
 
 
+def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of vehicles unlike this one."""
+    return GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True)
+
+
 def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     """As :func:`told_geometric`, with gentle descents: half the acceleration, braked with 0.05 weights of thrust in reserve.
 
@@ -173,33 +178,40 @@ def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
 
 @compiled
-def _braking_profile(distance, gain, deceleration):  # type: ignore[no-untyped-def]
-    """Speed towards a target from which it can be braked: gain · distance near it, √(2 deceleration distance) far away."""
-    return deceleration / gain * (math.sqrt(1.0 + 2.0 * gain * gain * distance / deceleration) - 1.0)
+def _braking_profile(gain, distance_by_deceleration):  # type: ignore[no-untyped-def]
+    """Speed per distance from which one can brake: the gain near the target, that of √(2 deceleration distance) far away."""
+    return 2.0 * gain / (1.0 + math.sqrt(1.0 + 2.0 * gain * gain * distance_by_deceleration))
 
 
 @compiled
-def _brake_share(upwards, az, spare):  # type: ignore[no-untyped-def]
-    """Share of the rotors' greatest acceleration upwards that brakes a descent, with a push az and some to spare, m/s²."""
-    return min(1.0, max(0.05, (upwards + az - spare) / max(upwards, 0.1)))
-
-
-@compiled
-def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g):  # type: ignore[no-untyped-def]
+def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, spare):  # type: ignore[no-untyped-def]
     """Desired force of the rotors per mass in the world frame, m/s², where something else accelerates by (ax, ay, az)."""
     distance = math.sqrt(ex * ex + ey * ey)
-    speed = gains[G.position]  # per distance
-    if distance > 0.0:
-        speed = _braking_profile(distance, gains[G.position], gains[G.deceleration]) / distance
+    along = (ax * ex + ay * ey) / distance if distance > 0.0 else 0.0
+    brake = _left_to_brake(gains[G.deceleration], along)
+    if ez > 0.0:
+        height_brake = _left_to_brake(gains[G.height_deceleration], az)
+    else:
+        height_brake = _left_to_brake(gains[G.descent_deceleration], spare - az)
+    way = math.sqrt((distance / brake) ** 2 + (ez / height_brake) ** 2)  # both brake at once, on a straight line
+    speed = _braking_profile(gains[G.position], way)
     fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
-    deceleration = gains[G.height_deceleration] if ez > 0.0 else gains[G.descent_deceleration]
-    rise = math.copysign(_braking_profile(abs(ez), gains[G.height_position], deceleration), ez)
-    climb = max(-gains[G.descent], gains[G.height_velocity] * (rise - vz))
-    fx, fy = fx - ax, fy - ay
-    fz = max(0.1 * g, g + climb - az)  # upwards, so that the force has a tilt
-    horizontal, limit = math.sqrt(fx * fx + fy * fy), gains[G.tilt] * fz
-    scale = limit / horizontal if horizontal > limit else 1.0
-    return scale * fx, scale * fy, fz
+    rise = gains[G.height_velocity] * (_braking_profile(gains[G.height_position], way) * ez - vz)
+    climb = max(-gains[G.descent], rise)
+    # As much of this acceleration as leaves the force no greater than the one that holds the height at the greatest tilt.
+    weight = g - az
+    square, across = fx * fx + fy * fy + climb * climb, climb * weight - fx * ax - fy * ay
+    room = g * g * (1.0 + gains[G.tilt] * gains[G.tilt]) - (weight * weight + ax * ax + ay * ay)
+    scale = 1.0
+    if square + 2.0 * across > room:
+        scale = max(0.0, math.sqrt(max(0.0, across * across + square * max(0.0, room))) - across) / square
+    return scale * fx - ax, scale * fy - ay, max(0.1 * g, weight + scale * climb)  # upwards, so that the force has a tilt
+
+
+@compiled
+def _left_to_brake(deceleration, push):  # type: ignore[no-untyped-def]
+    """The deceleration to plan with where something pushes on along the way, m/s²."""
+    return max(0.1 * deceleration, deceleration - max(0.0, push))
 
 
 @compiled
@@ -230,7 +242,7 @@ def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-
     long = along + 2.0 * math.sqrt(0.5 * along * along + a_w * (2.0 * math.pi - angle))
     if long < short:
         nx, ny, angle = -nx, -ny, 2.0 * math.pi - angle
-    rate = _braking_profile(angle, k_a, a_w)
+    rate = angle * _braking_profile(k_a, angle / a_w)
     # The wanted rates stay in the world while the body yaws; then Euler's gyroscopic moments.
     _, _, ixx, iyy, izz, _ = body
     mx = ixx * (k_w * (rate * nx - p) + r * rate * ny) + (izz - iyy) * q * r
@@ -278,9 +290,8 @@ def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies,
         ay = (wrench[W.force_world + 1, pushed] + r21 * ux + r22 * uy + r23 * uz) / mass
         az = (wrench[W.force_world + 2, pushed] + r31 * ux + r32 * uy + r33 * uz) / mass
         tx, ty, tz = wrench[W.torque_world, pushed], wrench[W.torque_world + 1, pushed], wrench[W.torque_world + 2, pushed]
-        if reserve > 0.0:
-            gains[G.descent_deceleration] *= _brake_share(4.0 * high / mass - g, az, reserve * g)
-        fx, fy, fz = _desired_force(ex, ey, ez, velocity[0, i], velocity[1, i], velocity[2, i], ax, ay, az, gains, g)
+        vx, vy, vz = velocity[0, i], velocity[1, i], velocity[2, i]
+        fx, fy, fz = _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, reserve * g)
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
         b1 = (r11 * fx + r21 * fy + r31 * fz) / size
         b2 = (r12 * fx + r22 * fy + r32 * fz) / size

@@ -19,7 +19,7 @@ class GeometricGains(Frozen):
     deceleration: PositiveFloat = Field(description="horizontal deceleration that the approach plans with, m/s²")
     height_deceleration: PositiveFloat = Field(description="vertical deceleration planned from below, m/s²")
     descent: PositiveFloat = Field(description="greatest desired acceleration downwards, below g, m/s²")
-    tilt: PositiveFloat = Field(description="tangent of the greatest desired tilt")
+    tilt: PositiveFloat = Field(description="tangent of the tilt at which the greatest desired force holds the height")
     attitude: PositiveFloat = Field(description="desired body rate per small angle of thrust direction error, 1/s")
     angular_deceleration: PositiveFloat = Field(description="angular deceleration that a turn plans with, rad/s²")
     body_rates: PositiveFloat = Field(description="angular acceleration per error of roll and pitch rate, 1/s")

@@ -32,6 +32,7 @@ PARAMETER_NAMES = (
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 Limits = tuple[NonNegativeFloat, PositiveFloat]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
+_FOUND = ("geometric_gains", "time_optimal")  # for a vehicle
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 
 
@@ -80,6 +81,10 @@ class Vehicle(Frozen):
     collision_radius: PositiveFloat = Field(description="radius of the collision sphere at the centre of mass, m")
     geometric_gains: GeometricGains | None = Field(
         default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
+    )
+    time_optimal: dict[PositiveFloat, PositiveFloat] | None = Field(
+        default=None,
+        description="by distance, m: least time from hover to rest within 0.1 m of a target, s (examples/time_optimal.py)",
     )
 
     @model_validator(mode="before")
@@ -141,12 +146,12 @@ class Vehicle(Frozen):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> "Vehicle":
         """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated.
 
-        ``geometric_gains`` were found for this vehicle: one that differs in more than its name has none, unless ``update``
-        brings some.
+        ``geometric_gains`` and ``time_optimal`` were found for this vehicle: one that differs in more than its name and its
+        gains has none, unless ``update`` brings some.
         """
         changes = dict(update or {})
-        if changes.keys() - {"name"}:
-            changes = {"geometric_gains": None, **changes}
+        if changes.keys() - {"name", "geometric_gains"}:
+            changes = {**dict.fromkeys(_FOUND), **changes}
         replaced = {*MOTOR_GAINS} if "motor_gain" in changes else set()
         own = self.model_dump(exclude=replaced | {"thrust_limits"} if changes.keys() & {*LIMITS} else replaced)
         return Vehicle.model_validate({**own, **changes})
@@ -189,13 +194,13 @@ class Vehicle(Frozen):
             },
             "rotor_positions": tuple(map(tuple, positions.tolist())),
             "rotor_directions": other.rotor_directions,
-            "geometric_gains": self.geometric_gains,
+            **{name: getattr(self, name) for name in _FOUND},
         }
         return self.model_copy(update=changes)
 
     def flies_as(self, other: "Vehicle") -> bool:
         """Whether both have the same parameters; names and an expert's gains do not matter."""
-        ours, theirs = (each.model_dump(exclude={"name", "geometric_gains"}) for each in (self, other))
+        ours, theirs = (each.model_dump(exclude={"name", *_FOUND}) for each in (self, other))
         return ours == theirs
 
     @property
