@@ -1,0 +1,103 @@
+"""Fly exported agents in RotorPy (University of Pennsylvania), as they are, with its SE3 controller and RAPTOR's policy.
+
+    sb3-quad export any-quadcopter --format onnx --vehicle rotorpy_crazyflie -o any-quadcopter@rotorpy_crazyflie.onnx
+    python examples/other_simulators/in_rotorpy.py any-quadcopter@rotorpy_crazyflie.onnx --cells crazyflie crazyflie_wind
+
+RotorPy: rotors front left, front right, back right, back left; quaternions x, y, z, w. Its drag of rotors and body and its
+translational lift are on. SE3 sees the true state, the others observations with noise.
+"""
+
+import importlib
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+import torch
+from flights import CONTROL_STEP, Array, Cell, Raptor, State, main
+from rotorpy.controllers.quadrotor_control import BatchedSE3Control
+from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
+from rotorpy.wind.default_winds import BatchedConstantWind, BatchedNoWind, BatchedSinusoidWind
+from scipy.spatial.transform import Rotation
+
+DEVICE = torch.device("cpu")
+torch.set_default_dtype(torch.float64)
+torch.set_num_threads(1)
+
+
+class RotorPy:
+    """n vehicles of ``rotorpy.vehicles`` in a wind.
+
+    :param wind: of the number of vehicles, one of its wind profiles.
+    """
+
+    def __init__(self, vehicle: str, wind: Callable[[int], object], n: int) -> None:
+        parameters = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params").quad_params
+        self._substeps = max(2, round(2 * CONTROL_STEP / parameters["tau_m"]))  # Runge-Kutta steps in a control step
+        self.n, self._rows, self._wind, self._k_eta = n, torch.arange(n), wind(n), parameters["k_eta"]
+        self._speeds = parameters["rotor_speed_min"], parameters["rotor_speed_max"]
+        self.hover = parameters["mass"] * 9.81 / 4.0
+        self.ground = {"crazyflie": 0.0145, "hummingbird": 0.06}[vehicle]  # m, as in our vehicle files
+        positions = np.stack([*parameters["rotor_pos"].values()])
+        self.rotors = np.column_stack([positions[:, :2], parameters["rotor_directions"]])
+        self.parameters = BatchedMultirotorParams([parameters] * n, n, DEVICE)
+
+    def reset(self, start: State) -> None:
+        self._time = 0.0
+        speeds = np.full((self.n, 4), np.sqrt(self.hover / self._k_eta))
+        quaternions = Rotation.from_matrix(start.rotation).as_quat()
+        fields = {"x": start.position, "v": start.velocity, "q": quaternions, "w": start.body_rates, "rotor_speeds": speeds}
+        self.fields = {name: torch.tensor(values) for name, values in fields.items()}
+        self.fields["wind"] = torch.zeros(self.n, 3)
+        kind = {"control_abstraction": "cmd_motor_thrusts", "integrator": "rk4"}
+        self._vehicles = BatchedMultirotor(self.parameters, self.n, self.fields, DEVICE, **kind)
+
+    def step(self, thrusts: Array) -> None:
+        command = {"cmd_motor_thrusts": torch.tensor(thrusts)}
+        duration = CONTROL_STEP / self._substeps
+        for _ in range(self._substeps):
+            self.fields["wind"] = self._wind.update(self._time, self.fields["x"]).double()
+            self.fields = self._vehicles.step(self.fields, command, duration, self._rows)
+            self._time += duration
+
+    def state(self) -> State:
+        position, quaternion, velocity, rates = (self.fields[name].numpy() for name in ("x", "q", "v", "w"))
+        return State(position, Rotation.from_quat(quaternion).as_matrix(), velocity, rates)
+
+    def thrusts(self, speeds: Array) -> Array:
+        low, high = self._speeds
+        return self._k_eta * (low + (high - low) * speeds) ** 2
+
+
+class SE3:
+    """RotorPy's own geometric controller, with the gains of its vehicle file; it sees the true state."""
+
+    def __init__(self, simulator: RotorPy) -> None:
+        self._simulator = simulator
+        self._control = BatchedSE3Control(simulator.parameters, simulator.n, DEVICE)
+
+    def reset(self, n: int) -> None:
+        self._rest = {name: torch.zeros(n, 3) for name in ("x_dot", "x_ddot")} | {name: torch.zeros(n) for name in ("yaw", "yaw_dot")}
+
+    def __call__(self, observation: Array, state: State, target: Array) -> Array:
+        wanted = {"x": torch.tensor(target), **self._rest}
+        return np.asarray(self._control.update(0.0, self._simulator.fields, wanted)["cmd_motor_thrusts"].numpy())
+
+
+def gusts(n: int) -> BatchedSinusoidWind:
+    """Sines of 2 m/s and 1 Hz along all axes."""
+    return BatchedSinusoidWind(torch.full((n, 3), 2.0), torch.ones(n, 3), torch.zeros(n, 3))
+
+
+WINDS = {
+    "": ("drag", BatchedNoWind),
+    "_wind": ("drag, wind 4 m/s", partial(BatchedConstantWind, wx=4.0, wy=0.0, wz=0.0)),
+    "_gusts": ("drag, sine gusts 2 m/s", gusts),
+}
+CELLS = {
+    vehicle + suffix: Cell(f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, wind))
+    for vehicle in ("crazyflie", "hummingbird")
+    for suffix, (conditions, wind) in WINDS.items()
+}
+
+if __name__ == "__main__":
+    main(__doc__ or "", CELLS, {"RAPTOR": Raptor, "SE3 (true state)": SE3})
