@@ -65,6 +65,7 @@ class BatchEnv:
     true_state = _of_batch(QuadcopterBatch.true_state)
     set_target = _of_batch(QuadcopterBatch.set_target)
     set_wrench = _of_batch(QuadcopterBatch.set_wrench)
+    set_wind = _of_batch(QuadcopterBatch.set_wind)
     set_noise = _of_batch(QuadcopterBatch.set_noise)
 
     @property
@@ -81,6 +82,11 @@ class BatchEnv:
     def wrench(self) -> FloatArray:
         """What :meth:`set_wrench` has set, (n, 12): force world, force body, torque world, torque body; N, N m."""
         return self._by_row(self.batch.wrench)
+
+    @property
+    def wind(self) -> FloatArray:
+        """The velocity of the air without gusts, (n, 3), world frame, m/s."""
+        return self._by_row(self.batch.wind)
 
     @property
     def task(self) -> TaskSpec:

@@ -68,10 +68,12 @@ class BulletBody:
         p.resetBasePositionAndOrientation(self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
         p.resetBaseVelocity(self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
 
-    def fly(self, wrenches: FloatArray, wrench: FloatArray) -> None:
+    def fly(self, wrenches: FloatArray, wrench: FloatArray, drag: FloatArray | None, wind: FloatArray) -> None:
         """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame.
 
         :param wrench: (WRENCH_SIZE,), of which the world-frame parts act besides.
+        :param drag: (3,), d of the vehicle, N s/m; None: there is none.
+        :param wind: (3,), velocity of the air, world frame, m/s.
         """
         client, body = self.client, self.body
         push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
@@ -83,9 +85,18 @@ class BulletBody:
                 position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
                 push(body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client)
                 twist(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+            if drag is not None:
+                force = np.add(force, self._drag(drag, wind))
             push(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
             twist(body, -1, torque, p.LINK_FRAME, physicsClientId=client)
             step(physicsClientId=client)
+
+    def _drag(self, drag: FloatArray, wind: FloatArray) -> FloatArray:
+        """The drag at the present velocity, (3,), body frame, N."""
+        _, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
+        velocity, _ = p.getBaseVelocity(self.body, physicsClientId=self.client)
+        rotation = np.array(p.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
+        return np.asarray(-drag * (rotation.T @ (velocity - wind)))
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""

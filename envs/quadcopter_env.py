@@ -14,7 +14,7 @@ from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
 from sb3_quad.envs.bullet import RENDER_MODES, BulletBody, Renderer
 from sb3_quad.simulation.checks import check_size, per_row
 from sb3_quad.simulation.settings import ENDLESS
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, VELOCITY, P
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -142,10 +142,11 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `set_target(position)` | r_T, (3,), world frame, m |
     | `set_wrench(force, torque, force_frame, torque_frame)` | an external force (N) and torque (N m) at the centre of mass; |
     | | where `randomize` has some, the next episode brings its own |
+    | `set_wind(velocity)` | the velocity of the air, (3,), world frame, m/s; it acts on vehicles with `drag` |
     | `set_noise(level)` | the relative standard deviation of the observation noise |
 
-    `true_state()`, `target`, `wrench`, `noise`, `observation_mean`, `observation_std`, `task`, `task_kwargs` and `vehicle`
-    tell what holds.
+    `true_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`, `task`, `task_kwargs` and
+    `vehicle` tell what holds.
 
     ## Version History
 
@@ -225,7 +226,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         if not math.isfinite(sum(array.tolist())):
             raise ValueError(f"action {array.tolist()}: every number must be finite")
         batch = self.batch
-        self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0])
+        drag = batch.vehicles[P.drag_x : P.drag_z + 1, 0] if batch.has_drag else None
+        self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0], drag, batch.total_wind()[:, 0])
         self._body.read(batch.state)
         observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":

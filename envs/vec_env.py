@@ -17,8 +17,8 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.batch_env import BatchEnv, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
-_OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench")
-_METHODS = ("set_target", "set_wrench", "set_noise")
+_OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
+_METHODS = ("set_target", "set_wrench", "set_wind", "set_noise")
 
 
 class RowSeeds(VecEnv):

@@ -38,16 +38,18 @@ class BulletReference:
     def rotation(quaternion):
         return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
 
-    def fly(self, action, wrench):
+    def fly(self, action, wrench, wind):
         vehicle, body, client = self.vehicle, self.body, self.client
         thrust = vehicle.action_to_thrust(action.astype(np.float64))
         self.waiting.append(np.sqrt(thrust / vehicle.thrust_coefficient))
         wanted = self.waiting.pop(0)
         for _ in range(vehicle.substeps):
-            self.speeds = self.speeds + vehicle.motor_gain * (wanted - self.speeds) * vehicle.physics_step
+            gain = np.where(wanted > self.speeds, vehicle.motor_gain_up, vehicle.motor_gain_down)
+            self.speeds = self.speeds + gain * (wanted - self.speeds) * vehicle.physics_step
             lift, *moments = vehicle.mixer @ (vehicle.thrust_coefficient * self.speeds**2)
-            force = wrench[3:6] + np.array([0.0, 0.0, lift])
-            centre, _ = pybullet.getBasePositionAndOrientation(body, **client)
+            centre, attitude = pybullet.getBasePositionAndOrientation(body, **client)
+            airspeed = self.rotation(attitude).T @ (np.array(pybullet.getBaseVelocity(body, **client)[0]) - wind)
+            force = wrench[3:6] + np.array([0.0, 0.0, lift]) - np.array(vehicle.drag) * airspeed
             pybullet.applyExternalForce(body, -1, wrench[:3], centre, pybullet.WORLD_FRAME, **client)
             pybullet.applyExternalForce(body, -1, force, (0, 0, 0), pybullet.LINK_FRAME, **client)
             pybullet.applyExternalTorque(body, -1, wrench[6:9], pybullet.WORLD_FRAME, **client)
@@ -78,7 +80,7 @@ def random_actions(rng, steps):
     return (held + 0.5 * rng.normal(size=(steps, 4))).astype(np.float32)
 
 
-def batch_of(vehicles, states, wrenches):
+def batch_of(vehicles, states, wrenches, wind=(0.0, 0.0, 0.0)):
     """Rows in these states, that fly on wherever they are."""
     batch = QuadcopterBatch(
         states.shape[1],
@@ -88,12 +90,13 @@ def batch_of(vehicles, states, wrenches):
     )
     batch.reset()
     batch.state[:], batch.wrench[:] = states, wrenches
+    batch.set_wind(wind)
     return batch
 
 
-def fly(vehicle, states, actions, wrenches):
+def fly(vehicle, states, actions, wrenches, *wind):
     """The states after each control step, (steps, STATE_SIZE, n), of n vehicles of one kind."""
-    batch = batch_of(vehicle, states, wrenches)
+    batch = batch_of(vehicle, states, wrenches, *wind)
     history = []
     for action in actions:
         batch.step(action)
@@ -101,12 +104,12 @@ def fly(vehicle, states, actions, wrenches):
     return np.array(history)
 
 
-def worst_difference(vehicle, folder, state, actions, wrench):
+def worst_difference(vehicle, folder, state, actions, wrench, wind=(0.0, 0.0, 0.0)):
     """Greatest distance to PyBullet in each number, over all control steps."""
     reference = BulletReference(vehicle, folder, state)
     try:
-        flown = fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, :17, 0]
-        expected = np.array([reference.fly(action, wrench) for action in actions])
+        flown = fly(vehicle, state[:, None], actions[:, None], wrench[:, None], wind)[:, :17, 0]
+        expected = np.array([reference.fly(action, wrench, wind) for action in actions])
     finally:
         reference.close()
     sign = np.sign(np.einsum("ti,ti->t", flown[:, QUATERNION], expected[:, QUATERNION]))
@@ -128,7 +131,9 @@ def vehicles(draw):
         rotor_directions=(1, -1, 1, -1),
         moment_thrust_ratio=draw(st.floats(0.005, 0.05)),
         thrust_coefficient=draw(st.floats(1e-7, 1e-4)),
-        motor_gain=draw(st.floats(5.0, 60.0)),
+        motor_gain_up=draw(st.floats(5.0, 60.0)),
+        motor_gain_down=draw(st.floats(5.0, 60.0)),
+        drag=draw(st.just((0.0, 0.0, 0.0)) | st.tuples(*[st.floats(0.0, 1.0)] * 3)),
         gravity=draw(st.floats(1.6, 12.0)),
         thrust_limits=(least, draw(st.floats(1.2, 1.5))),
         delay=draw(st.integers(0, 3)),
@@ -143,11 +148,11 @@ def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
     state, actions = random_state(rng, vehicle), random_actions(rng, 400)
     size = vehicle.mass * vehicle.gravity
     scale = np.repeat([0.2 * size, 0.2 * size, 1e-3 * size, 1e-3 * size], 3)
-    wrench = pushed * scale * rng.normal(size=12)
+    wrench, wind = pushed * scale * rng.normal(size=12), pushed * 5.0 * rng.normal(size=3)
     folder = tmp_path_factory.mktemp("bullet")
     # Where PyBullet cuts velocities at 100 rad/s rounding grows fast; another test is about that.
-    assume(np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, BODY_RATES]).max() <= 60.0)
-    assert worst_difference(vehicle, folder, state, actions, wrench).max() < 1e-9
+    assume(np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None], wind)[:, BODY_RATES]).max() <= 60.0)
+    assert worst_difference(vehicle, folder, state, actions, wrench, wind).max() < 1e-9
 
 
 @pytest.mark.parametrize("name", VEHICLES.names())
@@ -195,7 +200,7 @@ def test_rows_do_not_depend_on_the_batch():
 
 
 def test_vehicles_may_differ_by_row():
-    heavy = ITM.model_copy(update={"mass": 3.0, "motor_gain": 40.0})
+    heavy = ITM.model_copy(update={"mass": 3.0, "motor_gain": 40.0, "drag": (0.3, 0.4, 0.5)})
     rng = np.random.default_rng(6)
     states = np.stack([random_state(rng, ITM), random_state(rng, heavy)], axis=1)
     actions = np.stack([random_actions(rng, 50) for _ in range(2)], axis=1)

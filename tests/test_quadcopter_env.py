@@ -59,7 +59,7 @@ class Reference:
         self.queue.append(np.sqrt(thrust / vehicle.thrust_coefficient))
         wanted = self.queue.pop(0)
         for _ in range(4):
-            self.rotor = self.rotor + vehicle.motor_gain * (wanted - self.rotor) * dt
+            self.rotor = self.rotor + vehicle.motor_gain_up * (wanted - self.rotor) * dt
             total, *moment = vehicle.mixer @ (vehicle.thrust_coefficient * self.rotor**2)
             rotation = _rotation(self.q)
             force = rotation @ (np.array([0, 0, total]) + self.force_body) + self.force_world

@@ -22,6 +22,9 @@ RANDOMIZE = {
     "mass": [0.8, 1.25],
     "inertia": [0.7, 1.4],
     "motor_gain": [0.6, 1.6],
+    "motor_gain_up": [0.5, 1.0],
+    "motor_gain_down": [0.8, 1.0],
+    "drag": [0, 0.5],
     "thrust": [0.9, 1.0],
     "arm": [0.9, 1.1],
     "center_of_mass": [-0.01, 0.01],
@@ -29,6 +32,8 @@ RANDOMIZE = {
     "force": {"magnitude": [0, 5]},
     "torque": {"magnitude": [0, 0.1], "axes": [1, 1, 0.33]},
     "gusts": {"std": [0, 1], "time_constant": 0.5},
+    "wind": [0, 5],
+    "wind_gusts": {"std": [0, 2], "time_constant": 0.5},
 }
 IN_WEIGHTS = {
     "mass": [0.8, 1.2],
@@ -95,20 +100,27 @@ def test_an_episode_is_random_within_the_ranges():
     base, first = load_vehicle("itm").parameters(), batch.vehicles.copy()
     batch.reset()
     assert (batch.vehicles[P.mass] != first[P.mass]).mean() > 0.8
-    factors = batch.vehicles / base[:, None]
+    factors = batch.vehicles / np.where(base == 0.0, np.nan, base)[:, None]
     changed = factors[P.mass] != 1.0
     assert changed.mean() == pytest.approx(0.7, abs=0.05)
     assert (batch.vehicles[:, ~changed] == base[:, None]).all()
-    for row, (low, high) in {P.mass: (0.8, 1.25), P.motor_gain: (0.6, 1.6), P.thrust_middle: (0.9, 1.0)}.items():
+    for row, (low, high) in {P.mass: (0.8, 1.25), P.thrust_middle: (0.9, 1.0)}.items():
         values = factors[row, changed]
         assert values.min() >= low and values.max() <= high
         assert np.median(np.log(values)) == pytest.approx(np.log(low * high) / 2, abs=0.05 * np.log(high / low))
+    ratio = batch.vehicles[P.motor_gain_up, changed] / batch.vehicles[P.motor_gain_down, changed]
+    assert ratio.min() < 0.6 and ratio.max() > 1.1  # each of its own, besides what they share
+    drag = batch.vehicles[P.drag_x : P.drag_z + 1, changed] / base[P.mass]
+    assert (drag == drag[0]).all() and np.quantile(drag, [0.0, 0.5, 1.0]) == pytest.approx([0.0, 0.25, 0.5], abs=0.02)
     inertia = batch.vehicles[[P.ixx, P.iyy, P.izz]]
     assert (2 * inertia.max(axis=0) <= inertia.sum(axis=0) * (1 + 1e-12)).all()
     assert [*np.unique(batch.vehicles[P.delay, changed])] == [0, 1, 2, 3]
     force = np.linalg.norm(batch.wrench[W.force_world : W.force_world + 3], axis=0)
     assert (force > 0).mean() == pytest.approx(0.6, abs=0.05)
     assert force.max() <= 5 and np.median(force[force > 0]) == pytest.approx(2.5, abs=0.3)
+    wind = np.linalg.norm(batch.wind, axis=0)
+    assert (wind > 0).mean() == pytest.approx(0.6, abs=0.05) and wind.max() <= 5 and not batch.wind[2].any()
+    assert np.std(batch.wind_gust[:3, wind > 0], axis=1) == pytest.approx(2 / np.sqrt(3), abs=0.1)
     torque = np.abs(batch.wrench[W.torque_body : W.torque_body + 3]).max(axis=1)
     assert torque[:2] == pytest.approx(0.1, abs=0.01) and torque[2] == pytest.approx(0.033, abs=0.003)
 
@@ -125,16 +137,22 @@ def test_a_share_of_zero_changes_no_flight():
             np.testing.assert_array_equal(ours, theirs)
 
 
-@pytest.mark.parametrize(("std", "unit", "newtons"), [(2.0, "SI", 2.0), (0.1, "weight", 0.1 * 1.727 * 9.81)])
-def test_gusts_have_their_spread_and_time_constant(std, unit, newtons):
-    batch = batch_of(4000, randomize={"gusts": {"std": std, "unit": unit, "time_constant": 0.2}}, max_episode_steps=10**6)
-    gusts = [batch.gust[:3].copy()]
+@pytest.mark.parametrize(
+    ("kind", "std", "unit", "size"),
+    [("gusts", 2.0, "SI", 2.0), ("gusts", 0.1, "weight", 0.1 * 1.727 * 9.81), ("wind_gusts", 2.0, "SI", 2.0)],
+)
+def test_gusts_have_their_spread_and_time_constant(kind, std, unit, size):
+    randomize = {kind: {"std": std, "unit": unit, "time_constant": 0.2}}
+    batch = batch_of(4000, randomize=randomize, max_episode_steps=10**6)
+    present = batch.wind_gust if kind == "wind_gusts" else batch.gust
+    gusts = [present[:3].copy()]
     for _ in range(40):
         batch.step(np.zeros((4000, 4), np.float32))
-        gusts.append(batch.gust[:3].copy())
-    assert np.std(gusts[0], axis=1) == pytest.approx(newtons, rel=0.05)
-    assert np.std(gusts[-1], axis=1) == pytest.approx(newtons, rel=0.05)
-    assert np.mean((gusts[-1] / newtons) ** 4) == pytest.approx(3.0, abs=0.25)  # as of a normal distribution
+        gusts.append(present[:3].copy())
+    assert np.std(gusts[0], axis=1) == pytest.approx(size, rel=0.05)
+    assert np.std(gusts[-1], axis=1) == pytest.approx(size, rel=0.05)
+    assert np.mean((gusts[-1] / size) ** 4) == pytest.approx(3.0, abs=0.25)  # as of a normal distribution
+    assert abs(np.corrcoef(gusts[-1])[0, 1]) < 0.06
     for steps in (10, 20):
         kept = [np.corrcoef(gusts[0][axis], gusts[steps][axis])[0, 1] for axis in range(3)]
         assert kept == pytest.approx([np.exp(-steps * 0.01 / 0.2)] * 3, abs=0.05)
@@ -168,7 +186,7 @@ def test_sampled_vehicles_are_valid_and_fill_the_ranges():
         "size": (np.cbrt([each.mass for each in vehicles]), np.cbrt([0.02, 5.0])),
         "thrust_to_weight": ([each.thrust_limits[1] for each in vehicles], (1.5, 5.0)),
         "torque_to_inertia": ([each.arm_length * each.thrust_range[1] / each.inertia[0] for each in vehicles], (40, 1200)),
-        "motor_time_constant": ([1.0 / each.motor_gain for each in vehicles], (0.03, 0.1)),
+        "motor_time_constant": ([1.0 / each.motor_gain_up for each in vehicles], (0.03, 0.1)),
         "moment_thrust_ratio": ([each.moment_thrust_ratio for each in vehicles], (0.005, 0.05)),
     }
     for name, (values, (low, high)) in metrics.items():
@@ -217,6 +235,17 @@ def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():
 
 
 # --- experts that know the vehicle and what pushes it
+
+
+def test_wind_carries_away_what_has_drag_and_the_told_expert_holds_against_it():
+    windy = {"drag": 0.4, "wind": 4.0}
+    for randomize, expert, least, most in (
+        ({"wind": 4.0}, GeometricExpert(), 0.0, 1e-3),
+        (windy, GeometricExpert(), 0.1, 2.0),
+        (windy, told_geometric(), 0.0, 1e-3),
+    ):
+        errors = fly(expert, "target_tracking", 48, seed=3, max_steps=900, randomize=randomize).final_error
+        assert least <= errors.min() and errors.max() < most
 
 
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
@@ -276,6 +305,8 @@ def test_a_reserve_is_for_a_told_expert_and_not_negative(told, reserve):
         ({"delay": [0, 0.5]}, "whole control steps"),
         ({"force": {"magnitude": [-1, 1]}}, "greater than or equal to 0"),
         ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "must not be zero"),
+        ({"wind": {"magnitude": 1, "frame": "body"}}, "leave out unit and frame"),
+        ({"wind_gusts": {"std": 1, "unit": "weight"}}, "leave out unit and frame"),
         ({"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}}, "greater than 0"),
         ("mass", "randomize"),
         ({"vehicles": {"distribution": "rapter"}}, "vehicle distribution 'rapter'"),

@@ -52,7 +52,7 @@ def write(path: Path, **changes: Any) -> Path:
 def test_default_vehicle_is_the_specified_one() -> None:
     assert VEHICLES.names() == ["crazyflie", "hummingbird", "itm"]
     assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (1.727, (0.006687, 0.0101, 0.00996), 0.016)
-    assert (ITM.thrust_coefficient, ITM.motor_gain, ITM.gravity) == (8.54858e-6, 20.0, 9.81)
+    assert (ITM.thrust_coefficient, ITM.motor_gain_up, ITM.motor_gain_down, ITM.gravity) == (8.54858e-6, 20.0, 20.0, 9.81)
     assert (ITM.physics_step, ITM.control_step, ITM.substeps, ITM.delay) == (0.0025, 0.01, 4, 1)
     d, c = 0.17104913036744201, 0.016
     mixer = [[1, 1, 1, 1], [d, -d, -d, d], [-d, -d, d, d], [c, -c, c, -c]]
@@ -174,7 +174,9 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
         ({"rotor_directions": [1, 1, 1, -1]}, "rotor_directions .*two of 1"),
         ({"thrust_limits": [1.1, 1.5]}, "thrust_limits .*hover"),
         ({"control_step": 0.011}, "control_step .*whole multiple"),
-        ({"motor_gain": 500}, "motor_gain"),
+        ({"motor_gain_down": 500}, "motor_gain"),
+        ({"motor_gain": 20}, "motor_gain: give it, or"),
+        ({"drag": [0, 0, -1]}, "drag.2: .*greater than or equal to 0.*N s/m"),
         ({"delay": 1.5}, "delay"),
         ({"name": ""}, "name"),
         ({"geometric_gains": {**GAINS, "velocity": -1}}, "geometric_gains.velocity: .*greater than 0.*1/s"),

@@ -33,7 +33,7 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
 
 
 def _command_lag(v: FloatArray, control_step: float) -> FloatArray:
-    return np.asarray((v[P.delay] + 0.5) * control_step + 1.0 / v[P.motor_gain])
+    return np.asarray((v[P.delay] + 0.5) * control_step + 0.5 / v[P.motor_gain_up] + 0.5 / v[P.motor_gain_down])
 
 
 def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:

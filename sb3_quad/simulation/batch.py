@@ -18,9 +18,18 @@ from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchAr
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import Randomization
-from sb3_quad.simulation.sampling import GUST_FORCE, GUST_SIZE
+from sb3_quad.simulation.sampling import GUST_SIZE, GUST_VALUE
 from sb3_quad.simulation.settings import FlightSettings, levels
-from sb3_quad.simulation.state import FORCE_WORLD, STATE_SIZE, TARGET, WRENCH_SIZE, P, QuadcopterState, make_wrench
+from sb3_quad.simulation.state import (
+    FORCE_WORLD,
+    STATE_SIZE,
+    TARGET,
+    WRENCH_SIZE,
+    P,
+    QuadcopterState,
+    drag_forces,
+    make_wrench,
+)
 from sb3_quad.simulation.tasks import TaskSpec, resolve_tasks
 from sb3_quad.simulation.threads import share_out
 from sb3_quad.simulation.vehicle_distribution import NO_DISTRIBUTION
@@ -31,7 +40,7 @@ MAX_ROWS, MAX_THREADS = 2**20, 2**16
 _NO_ACTIONS, _NO_REWARDS = np.zeros((0, 4), np.float32), np.zeros(0, np.float32)  # of a look
 _KEPT = (  # all that future flight depends on
     *("state", "queue", "wrench", "streams", "task_index", "returns", "limits"),
-    *("vehicles", "gust", "frames", "integral"),
+    *("vehicles", "gust", "wind", "wind_gust", "frames", "integral"),
 )
 
 
@@ -73,7 +82,11 @@ class QuadcopterBatch:
         self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.base_vehicles), own)).copy()
         self.distribution_numbers = NO_DISTRIBUTION if self.distribution is None else self.distribution.numbers()
         self.randomize_numbers = self.randomize.numbers(vehicles[0].control_step)
-        self.gust = np.zeros((GUST_SIZE, 0 if self.randomize.gusts is None else n))
+        kinds = self.randomize.gusts, self.randomize.wind_gusts
+        self.gust, self.wind_gust = (np.zeros((GUST_SIZE, 0 if each is None else n)) for each in kinds)
+        self.wind = np.zeros((3, n))
+        drags = (self.randomize.drag, self.distribution and self.distribution.drag)
+        self.has_drag = bool(self.base_vehicles[P.drag_x : P.drag_z + 1].any()) or any(drags)
 
         integral = self.observation.position_integral
         depth = self.observation.ages[-1] + 1 if self.observation.is_extended else 0
@@ -173,7 +186,7 @@ class QuadcopterBatch:
         """
         wrenches = np.empty((self.substeps, 2, 3))
         a = self._arrays
-        rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, a.gust, self.physics_step, self.own_delays)
+        rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, self.physics_step, self.own_delays)
         return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
@@ -194,17 +207,25 @@ class QuadcopterBatch:
             raise ConfigError(f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}") from None
 
     def true_state(self) -> QuadcopterState:
-        """The true state of all rows, a live view but for the gusts."""
+        """The true state of all rows, a live view but for gusts and drag, which is a part of its wrench."""
         vehicles = np.broadcast_to(self.vehicles, (len(self.vehicles), self.n))
-        return QuadcopterState(self.state, vehicles, self.total_wrench())
+        wrench = self.total_wrench()
+        if self.has_drag:
+            wrench = wrench.copy()
+            wrench[FORCE_WORLD] += drag_forces(self.state, vehicles, self.total_wind())
+        return QuadcopterState(self.state, vehicles, wrench)
 
     def total_wrench(self) -> FloatArray:
-        """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and gusts."""
+        """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and gusts; without drag."""
         if self.randomize.gusts is None:
             return self.wrench
         total = self.wrench.copy()
-        total[FORCE_WORLD] += self.gust[GUST_FORCE]
+        total[FORCE_WORLD] += self.gust[GUST_VALUE]
         return total
+
+    def total_wind(self) -> FloatArray:
+        """The velocity of the air in this control step, (3, n), world frame, m/s: what was set or sampled, and gusts."""
+        return self.wind if self.randomize.wind_gusts is None else self.wind + self.wind_gust[GUST_VALUE]
 
     def snapshot(self) -> Arrays:
         """Copies of all that future flight depends on, by name."""
@@ -249,6 +270,11 @@ class QuadcopterBatch:
         chosen = self.rows(indices)
         vectors = [per_row(name, each, chosen.size, 3).T for name, each in (("force", force), ("torque", torque))]
         self.wrench[:, chosen] = make_wrench(vectors[0], vectors[1], force_frame, torque_frame)
+
+    def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
+        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s; until set anew. It acts on vehicles with drag."""
+        chosen = self.rows(indices)
+        self.wind[:, chosen] = per_row("wind", velocity, chosen.size, 3)
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
         """Set the relative standard deviation of the observation noise, () or (rows,), or a ``Noise``; 0: none."""

@@ -13,9 +13,9 @@ import numpy as np
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
-from sb3_quad.simulation.observation import NORMALS, OBSERVATION_SIZE, WORDS, observe
+from sb3_quad.simulation.observation import GUST_WORDS, NORMALS, OBSERVATION_SIZE, WORDS, observe
 from sb3_quad.simulation.physics import command_rotors, fly, moment, rotation_rows, turn_rotors
-from sb3_quad.simulation.random import STEP
+from sb3_quad.simulation.random import STEP, gust_words
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.sampling import add_gusts, advance_gusts, count_episode, sample_episode, start_episode
 from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE, P, W, X
@@ -50,7 +50,9 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "command": ("f8", 4),  # action, then the rotor speed it commands
     "wanted_speeds": ("f8", 4),  # rotor speeds to be reached in this control step
     "wrench": ("f8", WRENCH_SIZE),
-    "motor": ("f8", ()),  # km dt
+    "wind": ("f8", 3),  # velocity of the air
+    "drag": ("f8", 3),
+    "motor": ("f8", 2),  # km dt of a rotor that speeds up, and of one that slows down
     "lift": ("f8", ()),  # kF
     "fall": ("f8", ()),  # g dt
     "push": ("f8", ()),  # dt / m
@@ -95,7 +97,9 @@ class BatchArrays(NamedTuple):
     base_vehicles: FloatArray  # (parameters, 1 or n), before anything is random
     distribution_numbers: FloatArray  # VehicleDistribution.numbers()
     randomize_numbers: FloatArray  # Randomization.numbers()
-    gust: FloatArray  # (GUST_SIZE, 0 or n)
+    gust: FloatArray  # (GUST_SIZE, 0 or n), of force
+    wind: FloatArray  # (3, n), velocity of the air without gusts, world frame, m/s
+    wind_gust: FloatArray  # (GUST_SIZE, 0 or n)
     frames: Float32Array  # (n, depth, frame size), depth 0 where an observation is the present features
     ages: IntArray  # (ages,), of the frames in an observation, control steps
     integral: FloatArray  # (0 or 3, n), of the position
@@ -117,7 +121,7 @@ class BatchArrays(NamedTuple):
 @compiled
 def step(
     control, leads, mode, actions, observations, rewards, dones,
-    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers, gust,
+    state, queue, wrench, vehicles, base_vehicles, distribution_numbers, randomize_numbers, gust, wind, wind_gust,
     frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps, outcome, last_observations, constants,
 ):  # fmt: skip
@@ -166,8 +170,11 @@ def step(
             _load_rows(state, first, count, b.state)
             if mode == FLY:
                 _load_rows(wrench, first, count, b.wrench)
+                _load_rows(wind, first, count, b.wind)
                 if gust.shape[1] > 0:
-                    add_gusts(b, gust, first, count)
+                    add_gusts(b.force_world, gust, first, count)
+                if wind_gust.shape[1] > 0:
+                    add_gusts(b.wind, wind_gust, first, count)
                 _load_commands(actions, queue, own_delays, b, first, count)
                 fly(b, physics_step, substeps)
                 for k in range(X.target):
@@ -180,6 +187,9 @@ def step(
             observe(b)
             if gust.shape[1] > 0:
                 advance_gusts(b, gust, first, count)
+            if wind_gust.shape[1] > 0:
+                gust_words(b.word[GUST_WORDS:], b.stream)
+                advance_gusts(b, wind_gust, first, count)
             if frames.shape[1] > 0:
                 for lane in range(count):
                     i = first + lane
@@ -227,7 +237,9 @@ def step(
                 continue
             returns[i], limits[i] = 0.0, max_steps[i]
             count_episode(i, streams)
-            sample_episode(i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles, wrench, gust)
+            sample_episode(
+                i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles, wrench, gust, wind, wind_gust
+            )
             start_episode(i, state, queue, streams, task_index, vehicles, task_parameters, task_weights)
             if frames.shape[1] > 0:
                 clear_frames(i, frames, integral)
@@ -252,7 +264,7 @@ def step(
 
 
 @compiled
-def rotor_wrenches(actions, out, state, queue, wrench, vehicles, gust, physics_step, own_delays):
+def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, own_delays):
     """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body itself.
 
     Motors do not feel the body, so that all physics steps of a control step can be worked out before it moves.
@@ -267,8 +279,6 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, gust, physics_s
             b.row[:] = 0
             _load_rows(state, 0, 1, b.state)
             _load_rows(wrench, 0, 1, b.wrench)
-            if gust.shape[1] > 0:
-                add_gusts(b, gust, 0, 1)
             _load_vehicles(b, vehicles, 0, 1, physics_step, True)
             _load_commands(actions, queue, own_delays, b, 0, 1)
         f0, f1, f2, f3 = turn_rotors(b, 0)
@@ -354,7 +364,9 @@ def _divide(b, v, first, dt):
     for lane in range(LANES):
         i = first + lane
         ixx, iyy, izz, lift = v[P.ixx, i], v[P.iyy, i], v[P.izz, i], v[P.thrust_coefficient, i]
-        b.motor[lane], b.push[lane] = v[P.motor_gain, i] * dt, dt / v[P.mass, i]
+        b.motor[0, lane], b.motor[1, lane] = v[P.motor_gain_up, i] * dt, v[P.motor_gain_down, i] * dt
+        b.push[lane] = dt / v[P.mass, i]
+        b.drag[0, lane], b.drag[1, lane], b.drag[2, lane] = v[P.drag_x, i], v[P.drag_y, i], v[P.drag_z, i]
         b.fall[lane], b.lift[lane] = v[P.gravity, i] * dt, lift
         b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
         b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx

@@ -38,11 +38,13 @@ def command_rotors(b):
 @compiled(inline="always")
 def turn_rotors(b, lane):
     """The rotor speeds of a lane one physics step later (Eq. 4.1), in place; their thrusts, N (Eq. 2.4)."""
-    s, wanted, motor = b.rotor_speeds, b.wanted_speeds, b.motor[lane]
-    s0 = s[0, lane] + motor * (wanted[0, lane] - s[0, lane])
-    s1 = s[1, lane] + motor * (wanted[1, lane] - s[1, lane])
-    s2 = s[2, lane] + motor * (wanted[2, lane] - s[2, lane])
-    s3 = s[3, lane] + motor * (wanted[3, lane] - s[3, lane])
+    s, wanted, up, down = b.rotor_speeds, b.wanted_speeds, b.motor[0, lane], b.motor[1, lane]
+    missing0, missing1 = wanted[0, lane] - s[0, lane], wanted[1, lane] - s[1, lane]
+    missing2, missing3 = wanted[2, lane] - s[2, lane], wanted[3, lane] - s[3, lane]
+    s0 = s[0, lane] + missing0 * (up if missing0 > 0.0 else down)
+    s1 = s[1, lane] + missing1 * (up if missing1 > 0.0 else down)
+    s2 = s[2, lane] + missing2 * (up if missing2 > 0.0 else down)
+    s3 = s[3, lane] + missing3 * (up if missing3 > 0.0 else down)
     s[0, lane], s[1, lane], s[2, lane], s[3, lane] = s0, s1, s2, s3
     lift = b.lift[lane]
     return lift * s0 * s0, lift * s1 * s1, lift * s2 * s2, lift * s3 * s3
@@ -59,11 +61,15 @@ def moment(b, axis, lane, f0, f1, f2, f3):
 def accelerate(b):
     """Rotor speeds, velocities and body rates after one physics step; whether some may exceed PyBullet's cut."""
     q, v, w, gyro, twist, largest = b.quaternion, b.velocity, b.body_rates, b.gyro, b.twist, b.work[0]
+    drag, wind = b.drag, b.wind
     force_world, force_body, torque_world, torque_body = b.force_world, b.force_body, b.torque_world, b.torque_body
     for lane in range(LANES):
         f0, f1, f2, f3 = turn_rotors(b, lane)
         (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(q[0, lane], q[1, lane], q[2, lane], q[3, lane])
-        fx, fy, fz = force_body[0, lane], force_body[1, lane], force_body[2, lane] + ((f0 + f1) + (f2 + f3))
+        ux, uy, uz = v[0, lane] - wind[0, lane], v[1, lane] - wind[1, lane], v[2, lane] - wind[2, lane]
+        fx = force_body[0, lane] - drag[0, lane] * (r00 * ux + r10 * uy + r20 * uz)
+        fy = force_body[1, lane] - drag[1, lane] * (r01 * ux + r11 * uy + r21 * uz)
+        fz = force_body[2, lane] - drag[2, lane] * (r02 * ux + r12 * uy + r22 * uz) + ((f0 + f1) + (f2 + f3))
         push = b.push[lane]
         vx = v[0, lane] + push * (force_world[0, lane] + r00 * fx + r01 * fy + r02 * fz)
         vy = v[1, lane] + push * (force_world[1, lane] + r10 * fx + r11 * fy + r12 * fz)

@@ -22,7 +22,7 @@ from numba import float32, int32, uint32, uint64
 from sb3_quad.simulation.compiled import LANES, compiled
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DISTRIBUTION = range(6)  # purposes: the last word of the counter
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DISTRIBUTION, WIND = range(7)  # purposes: the last word of the counter
 ROUNDS = 10
 _MASK, _SHIFT = uint64(0xFFFFFFFF), uint64(32)
 _SQRT_HALF_BITS = 0x3F3504F3  # of sqrt(1/2)
@@ -89,6 +89,13 @@ def random_words(b):
             w0, w1, w2, w3 = _words(stream, lane, block, OBSERVATION_NOISE)
             word[4 * block, lane], word[4 * block + 1, lane] = w0, w1
             word[4 * block + 2, lane], word[4 * block + 3, lane] = w2, w3
+
+
+@compiled
+def gust_words(word, stream):
+    """Two random words of every lane to ``word``, (2, LANES), for the gusts of the wind."""
+    for lane in range(LANES):
+        word[0, lane], word[1, lane], _, _ = _words(stream, lane, 0, WIND)
 
 
 @compiled

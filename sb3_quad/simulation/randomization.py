@@ -31,11 +31,14 @@ V = first_rows(VECTOR)
 RANDOMIZATION = {
     "share": 1,
     "wrench_share": 1,
-    **dict.fromkeys(("mass", "inertia", "motor_gain", "thrust", "arm", "center_of_mass", "delay"), _RANGE),
-    **dict.fromkeys(("force", "torque"), sum(VECTOR.values())),
+    **dict.fromkeys(("mass", "inertia", "motor_gain", "motor_gain_up", "motor_gain_down", "thrust", "arm"), _RANGE),
+    **dict.fromkeys(("center_of_mass", "delay", "drag"), _RANGE),
+    **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
     "gust_std": _RANGE,
-    "gust_by_weight": 1,
     "gust_keeps": 1,
+    "gust_by_weight": 1,
+    "wind_std": _RANGE,
+    "wind_keeps": 1,
 }
 """Numbers of :meth:`Randomization.numbers`."""
 R = first_rows(RANDOMIZATION)
@@ -143,16 +146,18 @@ class RandomVector(Frozen):
 
 
 class Gusts(Frozen):
-    """A force in the world frame that wanders: of each component the Ornstein-Uhlenbeck process, whatever the control step.
+    """A force, or velocity of the air, that wanders: an Ornstein-Uhlenbeck process of each component in the world frame.
 
     Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930); the update of D. T. Gillespie,
     "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E 54, 1996), but that what comes to a gust in a
     control step is no normal number, only as wide as one: their sums are normal, over a time constant of many steps. The first
-    gust of an episode is normal, too; deviation and time constant are exact. It is what MIL-F-8785C's Dryden model has along
-    the flight path, with the time constant L / V.
+    gust of an episode is normal, too; deviation and time constant are exact, whatever the control step. It is what
+    MIL-F-8785C's Dryden model has along the flight path, with the time constant L / V.
     """
 
-    std: NonNegativeRange = Field(description="standard deviation of each component, N or as unit says; sampled per episode")
+    std: NonNegativeRange = Field(
+        description="standard deviation of each component, N or as unit says, of wind m/s; sampled per episode"
+    )
     unit: Literal["SI", "weight"] = Field(default="SI", description="weight: in weights m g of the vehicle")
     time_constant: PositiveFloat = Field(default=1.0, le=1e6, description="after which a gust has faded to 1/e, s")
 
@@ -175,6 +180,8 @@ class Randomization(Frozen):
         default=None, description="factor, of Ixx, Iyy and Izz each; none exceeds the sum of the other two"
     )
     motor_gain: Factor | None = Field(default=None, description="factor of k_m (Eq. 4.1)")
+    motor_gain_up: Factor | None = Field(default=None, description="another, of rotors that speed up")
+    motor_gain_down: Factor | None = Field(default=None, description="another, of rotors that slow down")
     thrust: Factor | None = Field(default=None, description="factor of the thrust of a command, as a tired battery has it")
     arm: Factor | None = Field(default=None, description="factor of the rotors' distances from the centre of mass")
     center_of_mass: Offset | None = Field(default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]")
@@ -182,22 +189,33 @@ class Randomization(Frozen):
         default=None,
         description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
     )
-    wrench_share: Share = Field(default=1.0, description="share of the episodes with force, torque and gusts")
+    drag: NonNegativeRange | None = Field(
+        default=None, description="added to the drag along each body axis, in 1/s times the nominal mass, such as [0, 0.5]"
+    )
+    wrench_share: Share = Field(default=1.0, description="share of the episodes with force, torque, gusts and wind")
     force: RandomVector | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, N")
     torque: RandomVector | None = Field(default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, N m")
     gusts: Gusts | None = Field(default=None, description="a force that wanders, such as {std: [0, 1], time_constant: 1}")
+    wind: RandomVector | None = Field(
+        default=None, description="a constant velocity of the air, m/s, level unless direction says otherwise; needs drag"
+    )
+    wind_gusts: Gusts | None = Field(default=None, description="what comes to it and wanders, such as {std: [0, 1]}, m/s")
 
     @model_validator(mode="after")
     def _possible(self) -> "Randomization":
         limits = self.delay
         if limits and (limits.low < 0 or limits.high > MAX_DELAY or limits.low % 1 or limits.high % 1):
             raise ValueError(f"delay [{limits.low:g}, {limits.high:g}]: must be whole control steps of 0 to {MAX_DELAY}")
+        marks = [each.unit for each in (self.wind, self.wind_gusts) if each] + [self.wind and self.wind.frame]
+        if any(mark not in ("SI", None) for mark in marks):
+            raise ValueError("wind and wind_gusts: leave out unit and frame; they are velocities, m/s, in the world frame")
         return self
 
     @property
     def sets_vehicle(self) -> bool:
         """Whether an episode begins with a vehicle of its own."""
-        changes = (self.mass, self.inertia, self.motor_gain, self.thrust, self.delay)
+        motors = (self.motor_gain, self.motor_gain_up, self.motor_gain_down)
+        changes = (self.mass, self.inertia, *motors, self.thrust, self.delay, self.drag)
         return self.sets_arms or any(each is not None for each in changes)
 
     @property
@@ -221,7 +239,8 @@ class Randomization(Frozen):
                 f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
                 f" its rotors lift {vehicle.thrust_limits[1]:g} times its weight"
             )
-        gain = vehicle.motor_gain * (self.motor_gain.high if self.motor_gain else 1.0)
+        both, up, down = ((each and each.high) or 1.0 for each in (self.motor_gain, self.motor_gain_up, self.motor_gain_down))
+        gain = both * max(vehicle.motor_gain_up * up, vehicle.motor_gain_down * down)
         if gain * vehicle.physics_step > 1.0:
             raise ConfigError(
                 f"randomize: motor_gain of {vehicle.name} may reach {gain:g}; times physics_step it may not exceed 1"
@@ -230,16 +249,20 @@ class Randomization(Frozen):
     def numbers(self, control_step: float) -> FloatArray:
         """What :mod:`.sampling` reads, in the order of ``RANDOMIZATION``; a share of 0 where no vehicle is randomised."""
         delay = self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})  # its whole part is the delay
-        ranges = (self.mass, self.inertia, self.motor_gain, self.thrust, self.arm, self.center_of_mass, delay)
+        motors = (self.motor_gain, self.motor_gain_up, self.motor_gain_down)
+        ranges = (self.mass, self.inertia, *motors, self.thrust, self.arm, self.center_of_mass, delay, self.drag)
         numbers = [self.share if self.sets_vehicle else 0.0, self.wrench_share]
         for each in ranges:
             numbers += FIXED_NUMBERS if each is None else each.numbers()
-        for vector, frame in ((self.force, "world"), (self.torque, "body")):
+        for vector, frame in ((self.force, "world"), (self.torque, "body"), (self.wind, "world")):
             numbers += [*FIXED_NUMBERS, *[0.0] * 8] if vector is None else vector.numbers(frame)
-        if self.gusts is None:
-            return np.array([*numbers, *FIXED_NUMBERS, 0.0, 0.0])
-        keeps = math.exp(-control_step / self.gusts.time_constant)
-        return np.array([*numbers, *self.gusts.std.numbers(), float(self.gusts.unit == "weight"), keeps])
+        by_weight = float(self.gusts is not None and self.gusts.unit == "weight")
+        gusts, wind_gusts = (_gust_numbers(each, control_step) for each in (self.gusts, self.wind_gusts))
+        return np.array([*numbers, *gusts, by_weight, *wind_gusts])
+
+
+def _gust_numbers(gusts: Gusts | None, control_step: float) -> list[float]:
+    return [*FIXED_NUMBERS, 0.0] if gusts is None else [*gusts.std.numbers(), math.exp(-control_step / gusts.time_constant)]
 
 
 def _check_push(numbers: Range, unit: str) -> None:

@@ -32,7 +32,9 @@ def sample_vehicles(vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle
             "rotor_positions": tuple(zip(-pitch, roll, strict=True)),
             "moment_thrust_ratio": abs(column[P.yaw_arm_0]),
             "thrust_coefficient": column[P.thrust_coefficient],
-            "motor_gain": column[P.motor_gain],
+            "motor_gain_up": column[P.motor_gain_up],
+            "motor_gain_down": column[P.motor_gain_down],
+            "drag": tuple(column[P.drag_x : P.drag_z + 1]),
             "thrust_limits": ((middle - half) / hover, (middle + half) / hover),
             "collision_radius": column[P.collision_radius],
         }

@@ -6,16 +6,16 @@ import numpy as np
 
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.observation import GUST_WORDS
-from sb3_quad.simulation.random import EPISODE, EPISODE_START, GUST, PUSH, STEP, VEHICLE, uniforms
-from sb3_quad.simulation.randomization import FIXED, R, V, between
+from sb3_quad.simulation.random import EPISODE, EPISODE_START, GUST, PUSH, STEP, VEHICLE, WIND, uniforms
+from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, R, V, between
 from sb3_quad.simulation.state import P, W, X, first_rows, row_slices
 from sb3_quad.simulation.tasks import T
 from sb3_quad.simulation.vehicle_distribution import arm_length, sample_from_distribution
 
-GUSTS = {"force": 3, "keeps": 1, "adds": 1}
-"""Of each row: the present gust, world frame, N; the share of it left after a control step; the spread of what is added."""
+GUSTS = {"value": 3, "keeps": 1, "adds": 1}
+"""Of each row: the present gust, world frame, N or m/s; the share left after a control step; the spread of what is added."""
 GUST_SIZE = sum(GUSTS.values())
-GUST_FORCE = row_slices(GUSTS)["force"]
+GUST_VALUE = row_slices(GUSTS)["value"]
 G = first_rows(GUSTS)
 TURN = 2.0 * math.pi
 _SEVEN = np.uint64(127)
@@ -84,15 +84,16 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
 
 
 @compiled
-def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust):
-    """The vehicle, the constant wrench and the first gust of row i's episode, in place; what is not random stays as it is.
+def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust, wind, wind_gust):
+    """The vehicle, the constant wrench and wind, and the first gusts of row i's episode, in place; the rest stays as it is.
 
     :param base: float64 (len(PARAMETER_NAMES), n or 1), the vehicles before anything is random.
     :param distribution: :meth:`.VehicleDistribution.numbers`.
     :param table: :meth:`.Randomization.numbers`.
     :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) if one serves all rows.
     :param wrench: float64 (WRENCH_SIZE, n).
-    :param gust: float64 (GUST_SIZE, n), or (GUST_SIZE, 0) without gusts.
+    :param gust: float64 (GUST_SIZE, n), or (GUST_SIZE, 0) without gusts; ``wind_gust`` likewise.
+    :param wind: float64 (3, n).
     """
     has_own_vehicle = vehicles.shape[1] == wrench.shape[1]
     if has_own_vehicle:
@@ -110,14 +111,23 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
             _push(table, R.force, u[1], u[2], u[3], weight, wrench, W.force_world, W.force_body, i)
             _push(table, R.torque, u[4], u[5], u[6], moment, wrench, W.torque_world, W.torque_body, i)
     if gust.shape[1] > 0:
-        _begin_gusts(i, streams, table, is_pushed, weight, gust)
+        unit = weight if table[R.gust_by_weight] != 0.0 else 1.0
+        _begin_gusts(i, table, R.gust_std, unit * is_pushed, uniforms(streams, i, 4, GUST), gust)
+    u = uniforms(streams, i, 5, WIND)
+    if table[R.wind + 2] != FIXED:
+        for axis in range(3):
+            wind[axis, i] = 0.0
+        if is_pushed:  # level, unless its direction is given
+            _push(table, R.wind, u[8], 0.5, u[9], 1.0, wind, 0, 0, i)
+    if wind_gust.shape[1] > 0:
+        _begin_gusts(i, table, R.wind_std, 1.0 * is_pushed, u, wind_gust)
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
 
 @compiled
 def _push(table, k, length, height, azimuth, unit, wrench, world, body, i):
-    """Write a constant force or torque, whose numbers begin at ``k``, to its rows of a wrench; ``unit``: in N or N m."""
+    """Write a constant vector, whose numbers begin at ``k``, to its rows of a wrench or wind; ``unit``: of a weight, SI."""
     size = between(table, k, length, 0.0)
     if table[k + V.by_weight] != 0.0:
         size *= unit
@@ -136,7 +146,7 @@ def _push(table, k, length, height, azimuth, unit, wrench, world, body, i):
 @compiled
 def _randomize_vehicle(i, streams, table, vehicles):
     """Multiply the parameters of vehicle i by the factors of the row's episode, in place."""
-    u = uniforms(streams, i, 6, VEHICLE)
+    u, nominal_mass = uniforms(streams, i, 7, VEHICLE), vehicles[P.mass, i]
     if u[0] >= table[R.share]:
         return
     mass = between(table, R.mass, u[1], 1.0)
@@ -147,7 +157,11 @@ def _randomize_vehicle(i, streams, table, vehicles):
     for axis in range(3):  # no body has one moment larger than the other two together
         others = vehicles[P.ixx + (axis + 1) % 3, i] + vehicles[P.ixx + (axis + 2) % 3, i]
         vehicles[P.ixx + axis, i] = min(vehicles[P.ixx + axis, i], others)
-    vehicles[P.motor_gain, i] *= between(table, R.motor_gain, u[5], 1.0)
+    motor_gain = between(table, R.motor_gain, u[5], 1.0)
+    vehicles[P.motor_gain_up, i] *= motor_gain * between(table, R.motor_gain_up, u[11], 1.0)
+    vehicles[P.motor_gain_down, i] *= motor_gain * between(table, R.motor_gain_down, u[12], 1.0)
+    for axis in range(3):
+        vehicles[P.drag_x + axis, i] += nominal_mass * between(table, R.drag, u[13], 0.0)
     thrust = between(table, R.thrust, u[6], 1.0)
     vehicles[P.thrust_middle, i] *= thrust
     vehicles[P.thrust_half_range, i] *= thrust
@@ -161,30 +175,21 @@ def _randomize_vehicle(i, streams, table, vehicles):
 
 
 @compiled
-def _begin_gusts(i, streams, table, is_pushed, weight, gust):
-    """How row i's gusts are in its episode, and the first, in place."""
-    for k in range(gust.shape[0]):
-        gust[k, i] = 0.0
-    if not is_pushed:
-        return
-    u = uniforms(streams, i, 4, GUST)
-    std = between(table, R.gust_std, u[0], 0.0)
-    if table[R.gust_by_weight] != 0.0:
-        std *= weight
-    keeps = table[R.gust_keeps]
+def _begin_gusts(i, table, k, unit, u, gust):
+    """How row i's gusts are in its episode, and the first, in place; their numbers begin at ``k``, ``u`` is eight uniforms."""
+    std, keeps = unit * between(table, k, u[0], 0.0), table[k + len(FIXED_NUMBERS)]
     gust[G.keeps, i], gust[G.adds, i] = keeps, std * math.sqrt(1.0 - keeps * keeps)
     for axis in range(3):  # stationary from the start; two normals from two uniforms (Box-Muller)
         radius = math.sqrt(-2.0 * math.log(u[2 + 2 * axis]))
-        gust[G.force + axis, i] = std * radius * math.cos(2.0 * math.pi * u[3 + 2 * axis])
+        gust[G.value + axis, i] = std * radius * math.cos(2.0 * math.pi * u[3 + 2 * axis])
 
 
 @compiled
-def add_gusts(b, gust, first, count):
-    """Add the present gusts of a block to its wrench."""
-    wrench = b.wrench
+def add_gusts(to, gust, first, count):
+    """Add the present gusts of a block to its force or wind, (3, LANES)."""
     for axis in range(3):
         for lane in range(count):
-            wrench[W.force_world + axis, lane] += gust[G.force + axis, first + lane]
+            to[axis, lane] += gust[G.value + axis, first + lane]
 
 
 @compiled
@@ -201,5 +206,5 @@ def advance_gusts(b, gust, first, count):
         for axis in range(3):
             part = bits >> np.uint64(21 * axis)
             added = np.float64(np.int64((part & _SEVEN) + (part >> np.uint64(7) & _SEVEN) + (part >> np.uint64(14) & _SEVEN)))
-            kept = gust[G.keeps, i] * gust[G.force + axis, i]
-            gust[G.force + axis, i] = kept + gust[G.adds, i] * ((added - _SUM_MEAN) / _SUM_STD)
+            kept = gust[G.keeps, i] * gust[G.value + axis, i]
+            gust[G.value + axis, i] = kept + gust[G.adds, i] * ((added - _SUM_MEAN) / _SUM_STD)

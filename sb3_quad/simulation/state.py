@@ -144,6 +144,18 @@ def rotation_matrices(quaternions: FloatArray) -> FloatArray:
     return np.moveaxis(np.array(rotation_rows.py_func(*quaternions.T)), -1, 0)
 
 
+def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> FloatArray:
+    """Drag of n vehicles, (3, n), world frame, N: -R diag(d) Rᵀ (v - wind) (Faessler, Franchi and Scaramuzza, RA-L 2018).
+
+    :param state: (STATE_SIZE, n).
+    :param vehicles: parameters, (len(PARAMETER_NAMES), n).
+    :param wind: velocity of the air, (3, n), world frame, m/s.
+    """
+    rotation, airspeed = rotation_matrices(state[QUATERNION].T), state[VELOCITY] - wind
+    in_body = vehicles[P.drag_x : P.drag_z + 1] * np.einsum("nji,jn->in", rotation, airspeed)
+    return np.asarray(-np.einsum("nij,jn->in", rotation, in_body))
+
+
 def make_wrench(force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body") -> FloatArray:
     """The wrench of n vehicles, (WRENCH_SIZE, n).
 

@@ -24,12 +24,14 @@ PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], 
 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
 PARAMETER_NAMES = (
-    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain", "gravity"),
+    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain_up", "motor_gain_down", "gravity"),
+    *("drag_x", "drag_y", "drag_z"),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
 )
 NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
 Limits = tuple[NonNegativeFloat, PositiveFloat]
+MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 
 
@@ -38,7 +40,7 @@ class Vehicle(Frozen):
 
     The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover thrusts,
     ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. These become ``thrust_limits``, which a copy with another
-    mass keeps, and are None.
+    mass keeps, and are None. ``motor_gain`` stands for ``motor_gain_up`` and ``motor_gain_down`` where both are the same.
 
     Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises :class:`ConfigError`
     through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
@@ -57,7 +59,11 @@ class Vehicle(Frozen):
     )
     moment_thrust_ratio: PositiveFloat = Field(description="kM / kF, m")
     thrust_coefficient: PositiveFloat = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
-    motor_gain: PositiveFloat = Field(description="k_m, 1/s (Eq. 4.1)")
+    motor_gain_up: PositiveFloat = Field(description="k_m of a rotor that speeds up, 1/s (Eq. 4.1)")
+    motor_gain_down: PositiveFloat = Field(description="k_m of a rotor that slows down, 1/s")
+    drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
+        default=(0.0, 0.0, 0.0), description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"
+    )
     gravity: PositiveFloat = Field(default=9.81, description="g, m/s^2")
     thrust_limits: Limits = Field(
         default=(0.0, 0.0), description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
@@ -71,6 +77,17 @@ class Vehicle(Frozen):
     geometric_gains: GeometricGains | None = Field(
         default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _same_motor_gains(cls, data: Any) -> Any:
+        """``motor_gain`` as ``motor_gain_up`` and ``motor_gain_down``."""
+        if not isinstance(data, Mapping) or "motor_gain" not in data:
+            return data
+        if data.keys() & MOTOR_GAINS:
+            raise ValueError("motor_gain: give it, or motor_gain_up and motor_gain_down")
+        others = {key: value for key, value in data.items() if key != "motor_gain"}
+        return {**others, **dict.fromkeys(MOTOR_GAINS, data["motor_gain"])}
 
     @model_validator(mode="after")
     def _limits_as_published(self) -> "Vehicle":
@@ -105,8 +122,9 @@ class Vehicle(Frozen):
                 f"control_step {self.control_step}: must be a whole multiple of physics_step {self.physics_step},"
                 f" at most {MAX_SUBSTEPS} times"
             )
-        if self.motor_gain * self.physics_step > 1.0:
-            raise ValueError(f"motor_gain {self.motor_gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
+        gain = max(self.motor_gain_up, self.motor_gain_down)
+        if gain * self.physics_step > 1.0:
+            raise ValueError(f"motor_gain {gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
         mixer = self.mixer
         if abs(np.linalg.det(mixer)) < 1e-12:
             raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently")
@@ -125,7 +143,8 @@ class Vehicle(Frozen):
         changes = dict(update or {})
         if changes.keys() - {"name"}:
             changes = {"geometric_gains": None, **changes}
-        own = self.model_dump(exclude={"thrust_limits"} if changes.keys() & {*LIMITS} else None)
+        replaced = {*MOTOR_GAINS} if "motor_gain" in changes else set()
+        own = self.model_dump(exclude=replaced | {"thrust_limits"} if changes.keys() & {*LIMITS} else replaced)
         return Vehicle.model_validate({**own, **changes})
 
     def turn_to(self, other: "Vehicle") -> Turn:
@@ -153,13 +172,17 @@ class Vehicle(Frozen):
         turn = self.turn_to(other)
         if turn == Turn():
             return self
-        cosine, sine, (ixx, iyy, izz) = math.cos(turn.angle), math.sin(turn.angle), self.inertia
-        if abs((ixx - iyy) * sine * cosine) > 0.02 * min(ixx, iyy):
-            turned = f"{self.name} has to be turned by {math.degrees(turn.angle):.0f}° to the layout of {other.name}"
-            raise ConfigError(f"rotor_layout: {turned}, but its Ixx and Iyy differ")
+        cosine, sine = math.cos(turn.angle), math.sin(turn.angle)
+        for name, (x, y, _) in (("Ixx and Iyy", self.inertia), ("drag in x and in y", self.drag)):
+            if abs((x - y) * sine * cosine) > 0.02 * min(x, y):
+                turned = f"{self.name} has to be turned by {math.degrees(turn.angle):.0f}° to the layout of {other.name}"
+                raise ConfigError(f"rotor_layout: {turned}, but its {name} differ")
         positions = (np.array(self.rotor_positions) @ turn.axes[:2, :2].T)[[*turn.order]]
         changes = {
-            "inertia": (ixx * cosine**2 + iyy * sine**2, ixx * sine**2 + iyy * cosine**2, izz),
+            **{
+                name: (x * cosine**2 + y * sine**2, x * sine**2 + y * cosine**2, z)
+                for name, (x, y, z) in (("inertia", self.inertia), ("drag", self.drag))
+            },
             "rotor_positions": tuple(map(tuple, positions.tolist())),
             "rotor_directions": other.rotor_directions,
             "geometric_gains": self.geometric_gains,
@@ -208,8 +231,13 @@ class Vehicle(Frozen):
 
     @property
     def command_lag(self) -> float:
-        """τ, from a command to its thrust, s: delay, half the control step it is held for, and the motors' 1/k_m."""
-        return (self.delay + 0.5) * self.control_step + 1.0 / self.motor_gain
+        """τ, from a command to its thrust, s: delay, half the control step it is held for, and the motors' time constant."""
+        return (self.delay + 0.5) * self.control_step + self.motor_time_constant
+
+    @property
+    def motor_time_constant(self) -> float:
+        """1/k_m, the mean of a rotor that speeds up and one that slows down, s."""
+        return (1.0 / self.motor_gain_up + 1.0 / self.motor_gain_down) / 2.0
 
     @property
     def greatest_moments(self) -> FloatArray:
@@ -262,7 +290,8 @@ class Vehicle(Frozen):
     def parameters(self) -> FloatArray:
         """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of ``PARAMETER_NAMES``."""
         low, high = self.thrust_range
-        head = (self.mass, *self.inertia, self.thrust_coefficient, self.motor_gain, self.gravity)
+        motors = self.motor_gain_up, self.motor_gain_down
+        head = (self.mass, *self.inertia, self.thrust_coefficient, *motors, self.gravity, *self.drag)
         tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius, self.delay)
         return np.array([*head, *tail, *self.mixer[1:].ravel()], dtype=np.float64)
 

@@ -91,9 +91,14 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
         ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
         (
             "motors",
-            f"time constant {1000 / vehicle.motor_gain:.1f} ms; from command to thrust {1000 * vehicle.command_lag:.1f} ms",
+            f"{_time_constants(vehicle)}; from command to thrust {1000 * vehicle.command_lag:.1f} ms",
         ),
     ]
+
+
+def _time_constants(vehicle: "Vehicle") -> str:
+    up, down = 1000.0 / vehicle.motor_gain_up, 1000.0 / vehicle.motor_gain_down
+    return f"time constant {up:.1f} ms" + (f" up, {down:.1f} ms down" if up != down else "")
 
 
 def _check_rotor_speed(vehicle: "Vehicle", where: str) -> None:

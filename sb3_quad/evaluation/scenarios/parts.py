@@ -173,7 +173,8 @@ class VehicleChanges(Frozen):
                 "mass": vehicle.mass * self.mass,
                 "inertia": tuple(own * factor for own, factor in zip(vehicle.inertia, factors, strict=True)),
                 "thrust_limits": (low / self.mass, high / self.mass),
-                "motor_gain": vehicle.motor_gain * self.motor_gain,
+                "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
+                "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,
                 "delay": vehicle.delay if self.delay is None else self.delay,
             }
         )
