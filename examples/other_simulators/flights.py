@@ -22,12 +22,23 @@ MAX_DISTANCE, ARRIVED = 30.0, 0.1  # m: farther from the target is lost; within 
 
 @dataclass
 class State:
-    """Of n vehicles: position and velocity (n, 3) in the world frame, rotation (n, 3, 3) body to world, body rates (n, 3)."""
+    """Of n vehicles: position and velocity (n, 3), world frame; quaternion (n, 4), w first, body to world; body rates (n, 3)."""
 
     position: Array
-    rotation: Array
+    quaternion: Array
     velocity: Array
     body_rates: Array
+
+    @property
+    def rotation(self) -> Array:
+        """Rotation matrices, body to world, (n, 3, 3)."""
+        w, x, y, z = self.quaternion.T
+        rows = [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+        return np.moveaxis(np.array(rows), -1, 0)
 
 
 class Simulator(Protocol):
@@ -115,20 +126,15 @@ class Raptor:
 def sample_starts(task: str, n: int, seed: int) -> tuple[State, Array]:
     """Starts and targets (n, 3), 15 m above the ground, sampled as the tasks target_tracking and state_recovery do."""
     rng = np.random.default_rng(seed)
-    position, zeros = np.tile([0.0, 0.0, 15.0], (n, 1)), np.zeros((n, 3))
+    position, zeros, level = np.tile([0.0, 0.0, 15.0], (n, 1)), np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
     if task == "targets":
-        direction = rng.standard_normal((n, 3))
-        target = position + 10.0 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
-        return State(position, np.tile(np.eye(3), (n, 1, 1)), zeros, zeros), target
-    w, x, y, z = (q := rng.standard_normal((n, 4))).T / np.linalg.norm(q, axis=1)
-    rotation = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
-    return State(position, rotation, 2.0 * rng.standard_normal((n, 3)), 4.0 * rng.standard_normal((n, 3))), position.copy()
+        return State(position, level, zeros, zeros), position + 10.0 * _unit(rng.standard_normal((n, 3)))
+    quaternion, (v, w) = _unit(rng.standard_normal((n, 4))), rng.standard_normal((2, n, 3))
+    return State(position, quaternion, 2.0 * v, 4.0 * w), position.copy()
+
+
+def _unit(vectors: Array) -> Array:
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
 def observe(state: State, target: Array) -> Array:
@@ -149,7 +155,9 @@ def check_rotors(make: Callable[[int], Simulator]) -> None:
         simulator.step(simulator.hover * (1.0 + 0.2 * np.eye(4)))
     state, (x, y, yaw) = simulator.state(), simulator.rotors.T
     if not np.array_equal(np.sign(state.body_rates), np.sign(np.stack([y, -x, yaw], axis=1))):
-        raise SystemExit(f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {state.body_rates.tolist()} rad/s")
+        raise SystemExit(
+            f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {state.body_rates.tolist()} rad/s"
+        )
     if not (state.velocity[:, 2] > 0.0).all():
         raise SystemExit(f"{simulator}: 5 % more thrust than in hover, and it climbs by {state.velocity[:, 2].tolist()} m/s")
 
@@ -200,7 +208,9 @@ HEADER = (
 def table_row(labels: Iterable[str], targets: Flights, recoveries: Flights) -> str:
     """A line of the table. Times are medians over all flights (a lost one never arrives), errors are of who survived."""
     both = (targets, recoveries)
-    rates = [" / ".join(f"{100 * getattr(each, name).mean():.1f}" for each in both) + " %" for name in ("survived", "succeeded")]
+    rates = [
+        " / ".join(f"{100 * getattr(each, name).mean():.1f}" for each in both) + " %" for name in ("survived", "succeeded")
+    ]
     stayed = " / ".join(_seconds(each.stayed) for each in both)
     error = targets.error[targets.survived]
     median, high = np.quantile(error, [0.5, 0.95]) if error.size else (np.nan, np.nan)

@@ -17,7 +17,6 @@ from crazyflow.dynamics import Dynamics, load_params
 from crazyflow.sim import Sim
 from crazyflow.sim.integration import Integrator
 from flights import CONTROL_STEP, Array, Cell, Raptor, State, main
-from scipy.spatial.transform import Rotation
 
 FREQUENCY = 500  # Hz, of its physics
 
@@ -43,7 +42,7 @@ class Crazyflow:
         hover = np.full((self.n, 4), self._speeds(np.array(self.hover)))
         fields = {
             "pos": start.position,
-            "quat": Rotation.from_matrix(start.rotation).as_quat(),
+            "quat": np.roll(start.quaternion, -1, axis=1),
             "vel": start.velocity,
             "ang_vel": start.body_rates,
             "rotor_vel": hover,
@@ -57,8 +56,10 @@ class Crazyflow:
 
     def state(self) -> State:
         now = self._sim.data.states
-        position, quaternion, velocity, rates = (np.asarray(x[:, 0], np.float64) for x in (now.pos, now.quat, now.vel, now.ang_vel))
-        return State(position, Rotation.from_quat(quaternion).as_matrix(), velocity, rates)
+        position, quaternion, velocity, rates = (
+            np.asarray(x[:, 0], np.float64) for x in (now.pos, now.quat, now.vel, now.ang_vel)
+        )
+        return State(position, np.roll(quaternion, 1, axis=1), velocity, rates)
 
     def thrusts(self, speeds: Array) -> Array:
         low, high = self._speeds(np.array(self._limits))

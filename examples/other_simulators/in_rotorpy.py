@@ -17,7 +17,6 @@ from flights import CONTROL_STEP, Array, Cell, Raptor, State, main
 from rotorpy.controllers.quadrotor_control import BatchedSE3Control
 from rotorpy.vehicles.multirotor import BatchedMultirotor, BatchedMultirotorParams
 from rotorpy.wind.default_winds import BatchedConstantWind, BatchedNoWind, BatchedSinusoidWind
-from scipy.spatial.transform import Rotation
 
 DEVICE = torch.device("cpu")
 torch.set_default_dtype(torch.float64)
@@ -44,7 +43,7 @@ class RotorPy:
     def reset(self, start: State) -> None:
         self._time = 0.0
         speeds = np.full((self.n, 4), np.sqrt(self.hover / self._k_eta))
-        quaternions = Rotation.from_matrix(start.rotation).as_quat()
+        quaternions = np.roll(start.quaternion, -1, axis=1)
         fields = {"x": start.position, "v": start.velocity, "q": quaternions, "w": start.body_rates, "rotor_speeds": speeds}
         self.fields = {name: torch.tensor(values) for name, values in fields.items()}
         self.fields["wind"] = torch.zeros(self.n, 3)
@@ -61,7 +60,7 @@ class RotorPy:
 
     def state(self) -> State:
         position, quaternion, velocity, rates = (self.fields[name].numpy() for name in ("x", "q", "v", "w"))
-        return State(position, Rotation.from_quat(quaternion).as_matrix(), velocity, rates)
+        return State(position, np.roll(quaternion, 1, axis=1), velocity, rates)
 
     def thrusts(self, speeds: Array) -> Array:
         low, high = self._speeds
@@ -76,7 +75,9 @@ class SE3:
         self._control = BatchedSE3Control(simulator.parameters, simulator.n, DEVICE)
 
     def reset(self, n: int) -> None:
-        self._rest = {name: torch.zeros(n, 3) for name in ("x_dot", "x_ddot")} | {name: torch.zeros(n) for name in ("yaw", "yaw_dot")}
+        self._rest = {name: torch.zeros(n, 3) for name in ("x_dot", "x_ddot")} | {
+            name: torch.zeros(n) for name in ("yaw", "yaw_dot")
+        }
 
     def __call__(self, observation: Array, state: State, target: Array) -> Array:
         wanted = {"x": torch.tensor(target), **self._rest}
