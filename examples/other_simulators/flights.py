@@ -22,7 +22,7 @@ MAX_DISTANCE, ARRIVED = 30.0, 0.1  # m: farther from the target is lost; within 
 
 @dataclass
 class State:
-    """Of n vehicles: position and velocity (n, 3), world frame; quaternion (n, 4), w first, body to world; body rates (n, 3)."""
+    """Of n vehicles: position, velocity (n, 3), world frame; quaternion (n, 4), w first, body to world; body rates (n, 3)."""
 
     position: Array
     quaternion: Array
@@ -250,7 +250,7 @@ def main(description: str, cells: Mapping[str, Cell], others: Mapping[str, Calla
     for cell in (cells[name] for name in options.cells):
         check_rotors(cell.make)
         simulator = cell.make(options.n)
-        agents = [Path(file).stem.partition("@") + (file,) for file in options.files]
+        agents = [(*Path(file).stem.partition("@"), file) for file in options.files]
         policies = {name: ExportedAgent(file, simulator) for name, _, of, file in agents if of in ("", cell.vehicle)}
         policies |= {name: others[name](simulator) for name in options.others}
         for delay in options.delay:
