@@ -3,6 +3,5 @@
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import LastGoodModel, StopOnSignal
 
-__all__ = ["BestModel", "Checkpoint", "EpisodeLog", "LastGoodModel", "StopOnSignal"]
+__all__ = ["BestModel", "Checkpoint", "EpisodeLog"]

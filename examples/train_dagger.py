@@ -6,9 +6,9 @@ python examples/train_dagger.py
 import argparse
 
 from stable_baselines3.common.utils import LinearSchedule
+from stop_on_signal import StopOnSignal
 
 from sb3_quad import DAgger, PIDExpert
-from sb3_quad.callbacks import StopOnSignal
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings

@@ -10,9 +10,10 @@ one hovers beside its target by an offset, which trimming takes away.
 import argparse
 
 from stable_baselines3.common.utils import LinearSchedule
+from stop_on_signal import StopOnSignal
 
 from sb3_quad import PPOBC, PIDExpert
-from sb3_quad.callbacks import BestModel, StopOnSignal
+from sb3_quad.callbacks import BestModel
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings

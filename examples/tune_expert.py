@@ -10,6 +10,7 @@ the search has not seen. Ctrl-C writes the best so far; the study is kept in OUT
 """
 
 import argparse
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,7 @@ from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.evaluation.flights import Hook, fly_settings
-from sb3_quad.evaluation.metrics import measure_expert
+from sb3_quad.evaluation.flights import Flights, Hook, fly, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
@@ -84,6 +84,29 @@ def with_values(gains: GeometricGains, values: dict[str, float]) -> GeometricGai
     """The gains with some replaced, of four digits."""
     rounded = {name: float(f"{value:.4g}") for name, value in values.items()}
     return GeometricGains.model_validate({**gains.model_dump(exclude={"measured"}), **rounded})
+
+
+def measure_expert(
+    expert: Any, vehicle: Vehicle, seeds: Sequence[int], episodes: int = 960, time_limit: int = 1500
+) -> dict[str, Any]:
+    """Fly ``episodes`` recoveries per seed, and as many targets 10 m away with the first seed.
+
+    A tracking flight that never comes within 0.1 m counts as ``time_limit`` control steps.
+    """
+    keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_steps": time_limit}
+    recovery = Flights.concatenate([fly(expert, "state_recovery", episodes, seed, **keywords) for seed in seeds])
+    tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
+    times = np.nan_to_num(tracking.time_to[NEAR], nan=time_limit * vehicle.control_step)
+    return {
+        "recovery_survival": round(float(recovery.survival.mean()), 5),
+        "recovery_episodes": recovery.n,
+        "tracking_survival": round(float(tracking.survival.mean()), 5),
+        "tracking_episodes": tracking.n,
+        "time_to_0_1_m": round(float(times.mean()), 3),  # mean time until 0.1 m from the target, s
+        "tracking_reward": round(float(tracking.reward.mean()), 3),  # mean (Eqs. 4.5-4.9)
+        "observation_noise": 0.0,
+        "seeds": [*seeds],
+    }
 
 
 def fresh_cost(metrics: dict[str, Any]) -> float:

@@ -13,7 +13,6 @@ from sb3_quad.base.errors import ConfigError, ExpertError
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.scaling import AdaptiveScaling
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.state import STATE_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import load_vehicle
@@ -178,11 +177,3 @@ def test_the_state_of_an_expert_goes_on_in_its_environment():
     Controller.for_env(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)
     assert counter.given == [None, 1, None]
     np.testing.assert_array_equal(counter.starts[1], starts)
-
-
-def test_scaled_observations_leave_the_state_to_the_controller():
-    counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
-    labeller = Controller.for_env(AdaptiveScaling(counter), env)
-    for _ in range(2):
-        labeller.labels(env.reset())
-    assert counter.given == [None, 1]

@@ -1,7 +1,6 @@
 """``evaluate``: every controller on the same episodes, nothing flown twice or lost, failures in one line."""
 
 import csv
-import functools
 import importlib
 import shutil
 import sys
@@ -23,7 +22,6 @@ from sb3_quad.evaluation.controllers import parse_controllers
 from sb3_quad.evaluation.flightlog import read_flights
 from sb3_quad.evaluation.flights import fly_settings
 from sb3_quad.evaluation.results import load_results
-from sb3_quad.evaluation.scaling import measure_mean
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.simulation.settings import FlightSettings
@@ -205,9 +203,6 @@ def test_labels():
     assert [spec.label for spec in specs] == ["pid", "other", "z", "me"]
     with pytest.raises(ConfigError, match="two are called so"):
         parse_controllers(["a/best.zip", "b/best.zip"])
-    adaptive, both = (parse_controllers(["pid", "q.zip"], scaling) for scaling in ("adaptive", "both"))
-    assert [(spec.label, spec.scaling) for spec in adaptive] == [("pid", "none"), ("q (adaptive)", "adaptive")]
-    assert [spec.label for spec in both] == ["pid", "q", "q (adaptive)"]
 
 
 SMALL_OFF_POLICY = {"buffer_size": 200, "learning_starts": 8, "batch_size": 8}
@@ -240,23 +235,6 @@ def test_zips_of_stock_algorithms_fly(here, capsys, backend):
     results = load_results("out")
     assert [(record.label, record.algorithm) for record in results.controllers] == [(label, label) for label in labels]
     assert len(results.entries) == len(labels)
-
-
-def test_adaptive_scaling_is_measured_and_another_controller(here, capsys, monkeypatch):
-    monkeypatch.setattr("sb3_quad.evaluation.controllers.measure_mean", functools.partial(measure_mean, n_flights=4))
-    monkeypatch.setattr("sb3_quad.evaluation.scaling.ROUNDS", 1)
-    (here / "observing.py").write_text(
-        "import numpy as np\n"
-        "from sb3_quad import PIDExpert\n"
-        "def make(vehicle):\n"
-        "    mean = np.zeros(18); mean[0] = -0.3\n"
-        "    expert = PIDExpert(vehicle, observation_mean=mean)\n"
-        "    return lambda observation: expert.predict(observation)[0]\n"
-    )
-    assert evaluate("agent=observing:make", "pid", "--scenario", "tracking", "--scaling", "adaptive") == 0
-    expert, adaptive = load_results("out").controllers
-    assert (adaptive.label, expert.label) == ("agent (adaptive)", "pid") and expert.offset is None
-    assert adaptive.offset == pytest.approx((-0.15, 0.0, 0.0), abs=0.01)  # α is 0.5 at the target
 
 
 RECOVERY = """

@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
+from sb3_quad import env_kwargs, load_pretrained
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
-from sb3_quad.evaluation.flights import TOLERANCES, Flights, fly, fly_settings
+from sb3_quad.evaluation.flights import TOLERANCES, Flights, Hook, fly, fly_settings
 from sb3_quad.evaluation.metric_tables import SUCCESS, metric_cells, metric_rows
 from sb3_quad.evaluation.metrics import summarise
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -53,8 +54,11 @@ def test_rows_do_not_depend_on_their_number(seed, n):
     recovery = FlightSettings(task="state_recovery", max_episode_steps=150)
     alone = fly_settings(PIDExpert(), recovery, row_seeds(seed, n)[-1:])
     among = fly(PIDExpert(), "state_recovery", n, seed, max_steps=150)
-    last = {name: values[-1:] for name, values in vars(among).items() if name != "time_to"}
-    same(alone, Flights(**last, time_to={tolerance: times[-1:] for tolerance, times in among.time_to.items()}))
+    last = {
+        name: {key: times[-1:] for key, times in values.items()} if isinstance(values, dict) else values[-1:]
+        for name, values in vars(among).items()
+    }
+    same(alone, Flights(**last))
 
 
 def test_metrics_are_those_of_the_environment():
@@ -107,6 +111,28 @@ def text_of(table) -> str:
     return console.file.getvalue()
 
 
+def test_times_to_stay_and_overshoot_are_those_of_the_distances():
+    class Distances(Hook):
+        def on_start(self, state, vehicle):
+            self.seen = [state.distance.copy()]
+
+        def after_step(self, step, state, actions, flying):
+            self.seen.append(state.distance.copy())
+
+    distances = Distances()
+    flights = fly(load_pretrained("itm-robust"), n_episodes=24, max_steps=700, hooks=[distances], **env_kwargs("itm-robust"))
+    leaves = []
+    for row, seen in enumerate(np.array(distances.seen).T):
+        within = seen <= 0.1
+        first, last = int(np.argmax(within)), len(seen) - int(np.argmin(within[::-1]))
+        assert flights.time_to[0.1][row] == pytest.approx(first * 0.01)
+        assert flights.time_to_stay[0.1][row] == pytest.approx(last * 0.01)
+        assert flights.overshoot[row] == pytest.approx(seen[first:].max())
+        leaves.append(first != last)
+    assert 0 < sum(leaves) < 24 or all(flights.overshoot <= 0.1)
+    assert summarise(flights).arrivals[0].leaves.value == np.mean(leaves)
+
+
 def table_of(metrics, name, beside):
     scenario = load_suite("thesis").scenario(name)
     rows = metric_rows(scenario, [metric_cells(metrics)], [scenario.reference[each] for each in beside])
@@ -123,6 +149,8 @@ def test_tables_say_how_many_arrived():
         length=np.full(n, 1500),
         flown=np.full(n, 15.0),
         time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},
+        time_to_stay={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 6.0, np.nan, np.nan])},
+        overshoot=np.full(n, np.nan),
         path_length=np.full(n, 10.0),
         final_error=np.array([0.1, 0.2, 9.0, 0.3]),
         final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
@@ -136,6 +164,8 @@ def test_tables_say_how_many_arrived():
     assert (metrics.success.value, metrics.survival.value) == (0.25, 0.75)
     assert (metrics.collisions, metrics.out_of_range) == (1, 0)
     assert metrics.arrivals[-1].time.value == 5.0 and metrics.arrivals[-1].share.value == 0.75
+    assert metrics.arrivals[-1].stays.time.value == 5.0 and metrics.arrivals[-1].stays.share.value == 0.5
+    assert metrics.arrivals[-1].leaves.value == pytest.approx(2 / 3) and metrics.arrivals[0].leaves is None
     assert metrics.stabilised.time.value == 2.0 and metrics.stabilised.share.value == 0.75
     assert metrics.sideways.value == pytest.approx(0.4)
     assert metrics.final_error_95.value == pytest.approx(0.29) and metrics.final_error_95.high <= 0.3

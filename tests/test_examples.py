@@ -99,6 +99,23 @@ def test_cloning_plot(run, tmp_path):
     assert Image.open(tmp_path / "cloning.png").size[0] > 500
 
 
+def test_adaptive_scaling(run, tmp_path):
+    """A PID that takes its target to lie 0.3 m off, as a policy: μ is what α, 0.5 at the target, leaves of that."""
+    (tmp_path / "observing.py").write_text(
+        "import numpy as np\n"
+        "from sb3_quad import PIDExpert\n"
+        "def make(vehicle):\n"
+        "    mean = np.zeros(18); mean[0] = -0.3\n"
+        "    expert = PIDExpert(vehicle, observation_mean=mean)\n"
+        "    return lambda observation: expert.predict(observation)[0]\n"
+    )
+    printed = run("adaptive_scaling.py", "pid", "agent=observing:make", "--episodes", "2", "-o", "times.png")
+    found = [float(x) for x in re.search(r"agent: offset μ = \((.+)\) m", printed)[1].split(",")]
+    assert found == pytest.approx((-0.15, 0.0, 0.0), abs=0.01)
+    assert "agent (adaptive)" in printed and "pid (adaptive)" not in printed
+    assert Image.open(tmp_path / "times.png").size[0] > 500
+
+
 @pytest.mark.slow
 def test_thesis_readings(run):
     assert run("thesis_readings.py").count("of 240 recoveries survive") == 6
@@ -107,6 +124,13 @@ def test_thesis_readings(run):
 def test_own_callback(run):
     output = run("own_callback.py", "--timesteps", "100000")  # the first episodes end in the third rollout
     assert "episodes crashed, beta 0.80" in output
+
+
+def test_stop_on_signal(run):
+    """More of it: tests/test_callbacks.py."""
+    with pytest.raises(SystemExit) as left:
+        run("stop_on_signal.py", *SHORT)
+    assert left.value.code == 0
 
 
 def test_coefficient_schedule(run):

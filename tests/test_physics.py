@@ -44,9 +44,12 @@ class BulletReference:
         self.waiting.append(np.sqrt(thrust / vehicle.thrust_coefficient))
         wanted = self.waiting.pop(0)
         for _ in range(vehicle.substeps):
-            gain = np.where(wanted > self.speeds, vehicle.motor_gain_up, vehicle.motor_gain_down)
-            self.speeds = self.speeds + gain * (wanted - self.speeds) * vehicle.physics_step
-            lift, *moments = vehicle.mixer @ (vehicle.thrust_coefficient * self.speeds**2)
+            share = np.where(wanted > self.speeds, vehicle.motor_gain_up, vehicle.motor_gain_down) * vehicle.physics_step
+            before, exact = self.speeds, vehicle.motor_integration == "exact"
+            share = share / (1 + share / 2 + share**2 / 12) if exact else share
+            self.speeds = before + (wanted - before) * share
+            thrust = vehicle.thrust_coefficient * self.speeds * (before if exact else self.speeds)
+            lift, *moments = vehicle.mixer @ thrust
             centre, attitude = pybullet.getBasePositionAndOrientation(body, **client)
             airspeed = self.rotation(attitude).T @ (np.array(pybullet.getBaseVelocity(body, **client)[0]) - wind)
             force = wrench[3:6] + np.array([0.0, 0.0, lift]) - np.array(vehicle.drag) * airspeed
@@ -133,6 +136,7 @@ def vehicles(draw):
         thrust_coefficient=draw(st.floats(1e-7, 1e-4)),
         motor_gain_up=draw(st.floats(5.0, 60.0)),
         motor_gain_down=draw(st.floats(5.0, 60.0)),
+        motor_integration=draw(st.sampled_from(["euler", "exact"])),
         drag=draw(st.just((0.0, 0.0, 0.0)) | st.tuples(*[st.floats(0.0, 1.0)] * 3)),
         gravity=draw(st.floats(1.6, 12.0)),
         thrust_limits=(least, draw(st.floats(1.2, 1.5))),

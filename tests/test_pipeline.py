@@ -16,11 +16,10 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs, with_settings
 from sb3_quad.training.trainer import train
-from sb3_quad.training.trim import Trim, scale_position, shift_position, trim
+from sb3_quad.training.trim import Trim, hover_offset, scale_position, shift_position, trim
 
 TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
 TINY["policy_kwargs"] = {"net_arch": [8, 8]}
@@ -114,7 +113,7 @@ def test_an_agent_that_crashes_cannot_be_trimmed():
 
 @pytest.mark.slow
 def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
-    monkeypatch.setattr("sb3_quad.evaluation.scaling.fly", partial(fly, max_steps=700))  # 7 s are enough to arrive
+    monkeypatch.setattr("sb3_quad.training.trim.fly", partial(fly, max_steps=700))  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4

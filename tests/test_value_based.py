@@ -14,7 +14,6 @@ from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.zips import load_model, load_zip, saved_algorithm
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.evaluation.scaling import hover_offset
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training import transfer
 from sb3_quad.training.config import build_config, load_config
@@ -22,7 +21,7 @@ from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import resume, train
 from sb3_quad.training.transfer import transfer_policy
-from sb3_quad.training.trim import trim
+from sb3_quad.training.trim import hover_offset, trim
 from sb3_quad.tuning.space import load_space
 
 ENV = "QuadStateRecovery-v0"

@@ -7,7 +7,6 @@ import yaml
 from stable_baselines3 import SAC
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.literals import ZooLoader
 from sb3_quad.base.yaml_files import parse_yaml
 from sb3_quad.cli import main
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
@@ -23,12 +22,10 @@ TAGGED = """!!python/object/apply:collections.OrderedDict
 
 
 def test_yaml_of_rl_zoo3_is_read_without_running_it():
-    assert parse_yaml(TAGGED, "config.yml", ZooLoader) == {
+    assert parse_yaml(TAGGED, "config.yml") == {
         "env_kwargs": {"task": "state_recovery"},
         "policy_kwargs": {"activation_fn": "nn.Tanh", "net_arch": [64, 64]},
     }
-    with pytest.raises(ConfigError):
-        parse_yaml(TAGGED, "my.yml")  # settings files of users stay plain
 
 
 @pytest.mark.parametrize(
@@ -44,7 +41,7 @@ def test_yaml_of_rl_zoo3_is_read_without_running_it():
 )
 def test_other_tags_are_refused(text):
     with pytest.raises(ConfigError, match=r"config\.yml: not valid YAML"):
-        parse_yaml(text, "config.yml", ZooLoader)
+        parse_yaml(text, "config.yml")
 
 
 @pytest.fixture

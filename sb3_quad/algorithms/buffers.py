@@ -148,37 +148,17 @@ class AggregatedDataset:
         :raises ConfigError: a file that is missing, damaged, or of other observations or actions
         """
         arrays = read_arrays(path)
-        self._check(arrays, len(arrays.get("actions", ())), path)
-        self.clear()
-        self.add(**arrays)
-
-    def snapshot(self, added: int) -> Arrays:
-        """The dataset as it was when ``added`` pairs had been added: now, or before the latest :meth:`add`.
-
-        Pairs that :meth:`add` has replaced since then are lost: after :meth:`restore` as many must be added again before the
-        next mini-batch. The arrays are views.
-        """
-        n = min(added, self.capacity)
-        return {"added": np.array(added), **{name: array[:n] for name, array in self._arrays.items()}}
-
-    def restore(self, snapshot: Arrays, path: str | Path) -> None:
-        """Go back to a :meth:`snapshot`.
-
-        :param path: the file that it comes from, for the message.
-        :raises ConfigError: it is of another capacity, or of other observations or actions
-        """
-        added = int(snapshot.get("added", 0))
-        n = min(added, self.capacity)
-        self._check(snapshot, n, path)
-        for name, array in self._arrays.items():
-            array[:n] = snapshot[name]
-        self.added = added
-
-    def _check(self, arrays: Arrays, n: int, path: str | Path) -> None:
-        given = {name: arrays[name].shape for name in self._arrays if name in arrays}
+        n, given = len(arrays.get("actions", ())), {name: array.shape for name, array in arrays.items()}
         needed = {name: (n, *array.shape[1:]) for name, array in self._arrays.items()}
         if given != needed:
             raise ConfigError(f"dataset {path}: holds arrays of shape {given}, this model needs {needed}")
+        self.clear()
+        self.add(**arrays)
+
+    @property
+    def filled(self) -> Arrays:
+        """Views of the rows that are in use, in the order of memory."""
+        return {name: array[: len(self)] for name, array in self._arrays.items()}
 
 
 def sample_rows(n_rows: int, count: int, rng: np.random.Generator, shuffle: bool = True) -> IntArray:

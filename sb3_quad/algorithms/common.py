@@ -1,9 +1,12 @@
 """What all algorithms that learn from an expert share."""
 
+import inspect
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 from stable_baselines3.common.type_aliases import MaybeCallback, Schedule
 from typing_extensions import Self
@@ -55,6 +58,12 @@ class ExpertMixin:
     def _excluded_save_params(self) -> list[str]:
         # Nothing of this package may be pickled: PPO.load must work where it is not installed.
         return [*super()._excluded_save_params(), "expert", "_labeller"]  # type: ignore[misc]
+
+
+def arguments_of(algorithm: type[BaseAlgorithm], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of some arguments that the constructor of SB3's ``algorithm`` takes, but for ``_init_setup_model``."""
+    names = inspect.signature(algorithm.__init__).parameters.keys() - {"self", "_init_setup_model"}
+    return {name: value for name, value in given.items() if name in names}
 
 
 def parameters_of_both(policy: Any) -> tuple[list[Any], list[Any]]:

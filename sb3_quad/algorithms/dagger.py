@@ -18,7 +18,7 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
-from sb3_quad.algorithms.common import ExpertMixin, parameters_of_both
+from sb3_quad.algorithms.common import ExpertMixin, arguments_of, parameters_of_both
 from sb3_quad.algorithms.networks.gradients import Batch, gradients, mean_actions, network_of, state_values
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES, CloningLoss, Loss
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
@@ -115,27 +115,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            n_steps=n_steps,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            ent_coef=ent_coef,
-            vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,  # type: ignore[arg-type]
-            use_sde=False,
-            sde_sample_freq=-1,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs={"log_std_init": -2.0, **(policy_kwargs or {})},
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            supported_action_spaces=(spaces.Box,),
-            _init_setup_model=False,
-        )
+        given = {**locals(), "policy_kwargs": {"log_std_init": -2.0, **(policy_kwargs or {})}}
+        fixed: dict[str, Any] = {"use_sde": False, "sde_sample_freq": -1, "supported_action_spaces": (spaces.Box,)}
+        super().__init__(**arguments_of(OnPolicyAlgorithm, given), **fixed, _init_setup_model=False)
         self.batch_size = batch_size
         self.n_epochs = n_epochs
         self.gradient_steps = gradient_steps

@@ -15,7 +15,7 @@ from stable_baselines3.common.utils import FloatSchedule, explained_variance, ob
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.algorithms.buffers import ExpertRolloutBuffer
-from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero, parameters_of_both
+from sb3_quad.algorithms.common import ExpertMixin, arguments_of, is_ever_nonzero, parameters_of_both
 from sb3_quad.algorithms.networks.gradients import act, gradients, network_of
 from sb3_quad.algorithms.networks.losses import BC_FILTERS, CLONING_LOSSES, CloningLoss, Loss
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
@@ -98,34 +98,8 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
         shuffle: bool = True,
         _init_setup_model: bool = True,
     ):
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            n_steps=n_steps,
-            batch_size=batch_size,
-            n_epochs=n_epochs,
-            gamma=gamma,
-            gae_lambda=gae_lambda,
-            clip_range=clip_range,
-            clip_range_vf=clip_range_vf,
-            normalize_advantage=normalize_advantage,
-            ent_coef=ent_coef,
-            vf_coef=vf_coef,
-            max_grad_norm=max_grad_norm,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            rollout_buffer_class=rollout_buffer_class or ExpertRolloutBuffer,
-            rollout_buffer_kwargs=rollout_buffer_kwargs,
-            target_kl=target_kl,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=False,
-        )
+        stock = {**locals(), "rollout_buffer_class": rollout_buffer_class or ExpertRolloutBuffer}
+        super().__init__(**arguments_of(PPO, stock), _init_setup_model=False)
         if bc_loss not in CLONING_LOSSES:
             raise ConfigError(unknown("bc_loss", bc_loss, CLONING_LOSSES))
         if bc_filter not in BC_FILTERS:

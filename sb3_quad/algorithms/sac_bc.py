@@ -22,7 +22,7 @@ from sb3_quad.algorithms.buffers import (
     ExpertReplayBuffer,
     ExpertReplaySamples,
 )
-from sb3_quad.algorithms.common import ExpertMixin, is_ever_nonzero
+from sb3_quad.algorithms.common import ExpertMixin, arguments_of, is_ever_nonzero
 from sb3_quad.algorithms.networks.losses import CloningLoss, agree, cloning_errors
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError, unknown
@@ -105,36 +105,7 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         critic_layer_norm: bool = False,
         _init_setup_model: bool = True,
     ):
-        super().__init__(
-            policy,
-            env,
-            learning_rate=learning_rate,
-            buffer_size=buffer_size,
-            learning_starts=learning_starts,
-            batch_size=batch_size,
-            tau=tau,
-            gamma=gamma,
-            train_freq=train_freq,
-            gradient_steps=gradient_steps,
-            action_noise=action_noise,
-            replay_buffer_class=replay_buffer_class,
-            replay_buffer_kwargs=replay_buffer_kwargs,
-            optimize_memory_usage=optimize_memory_usage,
-            n_steps=n_steps,
-            ent_coef=ent_coef,
-            target_update_interval=target_update_interval,
-            target_entropy=target_entropy,
-            use_sde=use_sde,
-            sde_sample_freq=sde_sample_freq,
-            use_sde_at_warmup=use_sde_at_warmup,
-            stats_window_size=stats_window_size,
-            tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
-            verbose=verbose,
-            seed=seed,
-            device=device,
-            _init_setup_model=False,
-        )
+        super().__init__(**arguments_of(SAC, locals()), _init_setup_model=False)
         for name, value, valid in (("bc_loss", bc_loss, BC_LOSSES), ("bc_filter", bc_filter, BC_FILTERS)):
             if value not in valid:
                 raise ConfigError(unknown(name, value, valid))

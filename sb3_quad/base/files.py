@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -122,6 +123,20 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
         raise ConfigError(f"{path}: is a folder; name a file")
     if Path(path).exists() and not overwrite:
         raise ConfigError(f"{path}: exists already; name another file, or add --overwrite")
+
+
+def make_folder(path: str | Path, what: str, flag: str) -> None:
+    """Make a folder that files are to be written to, unless it is there.
+
+    :param what: the folder in the message, which also names the flag that gives another.
+    :raises ConfigError: it cannot be written.
+    """
+    try:
+        Path(path).mkdir(parents=True, exist_ok=True)
+        TemporaryFile(dir=path).close()
+    except (OSError, ValueError) as error:  # ValueError: no path
+        reason = getattr(error, "strerror", None) or error
+        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
 
 
 def model_bytes(model: Any) -> bytes:

@@ -8,7 +8,6 @@ from typing import Any
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
-from sb3_quad.base.yaml_files import UniqueKeyLoader
 
 _ACTIVATIONS = ("ELU", "GELU", "Hardtanh", "LeakyReLU", "Mish", "ReLU", "ReLU6", "SELU", "Sigmoid", "SiLU", "Softplus", "Tanh")
 _OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
@@ -83,21 +82,3 @@ class _AsLiterals(ast.NodeTransformer):
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         text = ast.unparse(node)
         return ast.Constant(text) if _CLASS_NAME.match(text) else node
-
-
-class ZooLoader(UniqueKeyLoader):
-    """Reads the YAML that rl_zoo3 writes: also ordered mappings, tuples and names of classes, none of which is imported."""
-
-    def construct_python(self, tag: str, node: Any) -> Any:
-        match tag.split(":"):
-            case ["tuple"]:
-                return self.construct_sequence(node, deep=True)
-            case ["object/apply", "collections.OrderedDict"]:
-                (pairs,) = self.construct_sequence(node, deep=True)
-                return dict(pairs)
-            case ["name", name] if name.startswith("torch."):  # torch.nn.modules.activation.Tanh: nn.Tanh
-                return ".".join([name.split(".")[1], name.split(".")[-1]])
-        raise ValueError(f"{tag}: no such value in settings")
-
-
-ZooLoader.add_multi_constructor("tag:yaml.org,2002:python/", ZooLoader.construct_python)

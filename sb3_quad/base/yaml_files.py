@@ -12,8 +12,11 @@ from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line, read_text
 
 
-class UniqueKeyLoader(yaml.SafeLoader):
-    """PyYAML's SafeLoader silently keeps the last of two equal keys; this one refuses them."""
+class Loader(yaml.SafeLoader):
+    """PyYAML's SafeLoader, which refuses two equal keys, and reads what rl_zoo3 writes.
+
+    That is ordered mappings, tuples and names of classes, none of which is imported.
+    """
 
     def compose_mapping_node(self, anchor: Any) -> Any:
         node = super().compose_mapping_node(anchor)
@@ -22,29 +25,40 @@ class UniqueKeyLoader(yaml.SafeLoader):
             raise yaml.YAMLError(f"{', '.join(twice)}: given twice{node.start_mark}")
         return node
 
+    def construct_python(self, tag: str, node: Any) -> Any:
+        match tag.split(":"):
+            case ["tuple"]:
+                return self.construct_sequence(node, deep=True)
+            case ["object/apply", "collections.OrderedDict"]:
+                (pairs,) = self.construct_sequence(node, deep=True)
+                return dict(pairs)
+            case ["name", name] if name.startswith("torch."):  # torch.nn.modules.activation.Tanh: nn.Tanh
+                return ".".join([name.split(".")[1], name.split(".")[-1]])
+        raise ValueError(f"{tag}: no such value in settings")
 
-def parse_yaml(text: str, where: str, loader: type[yaml.SafeLoader] = UniqueKeyLoader) -> Any:
+
+Loader.add_multi_constructor("tag:yaml.org,2002:python/", Loader.construct_python)
+
+
+def parse_yaml(text: str, where: str) -> Any:
     """:raises ConfigError: text that is not YAML, in one line."""
     try:
-        return yaml.load(text, Loader=loader)
+        return yaml.load(text, Loader=Loader)
     except Exception as error:  # a value may raise anything when it does not fit its tag
         raise ConfigError(f"{where}: not valid YAML ({one_line(error)})") from None
 
 
-def parse_mapping_text(text: str, where: str, loader: type[yaml.SafeLoader] = UniqueKeyLoader) -> dict[Any, Any]:
+def parse_keys(text: str, where: str) -> dict[Any, Any]:
     """:raises ConfigError: text that is not YAML, or holds no keys and values."""
-    content = parse_yaml(text, where, loader)
+    content = parse_yaml(text, where)
     if not isinstance(content, dict):
         raise ConfigError(f"{where}: must hold keys and values")
     return content
 
 
-def parse_mapping_file(path: Path, loader: type[yaml.SafeLoader]) -> dict[str, Any]:
-    """The keys and values of a YAML file.
-
-    :raises ConfigError: it is missing, unreadable or holds something else.
-    """
-    return parse_mapping_text(read_text(path), str(path), loader)
+def read_yaml(path: Path) -> dict[Any, Any]:
+    """As :func:`parse_keys`, of a file."""
+    return parse_keys(read_text(path), str(path))
 
 
 @dataclass(frozen=True)
@@ -93,7 +107,7 @@ class YamlFolder:
         :raises ConfigError: as :meth:`text`; or it holds something else.
         """
         text, where = self.text(source)
-        return parse_mapping_text(text, where), where
+        return parse_keys(text, where), where
 
     def _files(self) -> dict[str, Any]:
         package = resources.files(self.package)

@@ -4,9 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.literals import ZooLoader, parse_mapping
+from sb3_quad.base.literals import parse_mapping
 from sb3_quad.base.validate import validate
-from sb3_quad.base.yaml_files import parse_mapping_file
+from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
@@ -41,9 +41,9 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
         return FlightSettings(), None
     if len(files) > 1:
         raise ConfigError(f"{zip_file}: several config.yml files lie beside it ({', '.join(map(str, files))})")
-    settings, where = parse_mapping_file(files[0], ZooLoader), f"{files[0]}: env_kwargs"
+    settings, where = read_yaml(files[0]), f"{files[0]}: env_kwargs"
     file = files[0].with_name("args.yml")
-    judged = parse_mapping_file(file, ZooLoader).get("env_kwargs") if file.is_file() else None
+    judged = read_yaml(file).get("env_kwargs") if file.is_file() else None
     parts = [judged] if judged is not None else [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
     name = files[0].parent.name
     given: dict[str, Any] = {"task": ENVIRONMENTS[name]} if name in ENVIRONMENTS else {}

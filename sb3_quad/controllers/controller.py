@@ -126,16 +126,6 @@ class Controller:
         np.clip(actions, self._low, self._high, out=actions)
         return actions
 
-    def predict(
-        self,
-        observation: npt.NDArray[Any],
-        state: None = None,
-        episode_start: BoolArray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[Float32Array, None]:
-        """SB3's ``predict``, for ``evaluate_policy``; the labels."""
-        return self.labels(observation, episode_start), None
-
     def _answer(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
         if self.needs_state and self._true_state is not None:
             return self.source.actions(self._true_state())

@@ -1,4 +1,4 @@
-"""The controllers of an evaluation, from what a command line names: labels, records, and what is ready to fly."""
+"""The controllers of an evaluation, from what a command line names: labels, records, and how the agents among them fly."""
 
 import hashlib
 from collections.abc import Sequence
@@ -7,17 +7,14 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.errors import ConfigError, unknown
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
-from sb3_quad.controllers.resolve import EXPERTS, import_factory, resolve_expert
+from sb3_quad.controllers.resolve import EXPERTS, import_factory
 from sb3_quad.controllers.zips import saved_algorithm
-from sb3_quad.evaluation.results import ControllerRecord, Scaling, file_name
-from sb3_quad.evaluation.scaling import AdaptiveScaling, measure_mean
+from sb3_quad.evaluation.results import ControllerRecord, file_name
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle, load_vehicle
-
-SCALINGS = ("none", "adaptive", "both")
 
 
 @dataclass(frozen=True)
@@ -26,12 +23,10 @@ class ControllerSpec:
 
     :param label: heads its column.
     :param spec: ``pid``, ``geometric``, the path of an SB3 zip, or ``package.module:factory``.
-    :param scaling: ``adaptive``: a policy sees its observation through the thesis's scaling (4.3.1); experts see none.
     """
 
     label: str
     spec: str
-    scaling: Scaling = "none"
 
     @property
     def is_zip(self) -> bool:
@@ -69,18 +64,12 @@ class ControllerSpec:
         return f"{self.label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"
 
 
-def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[ControllerSpec]:
+def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
     """Controllers from ``spec`` or ``label=spec``; a label left out is the spec, of a zip the file's name.
 
-    :param scaling: of all but the experts, ``none`` or ``adaptive``; ``both``: each of them once plain and once adaptive.
-    :raises ConfigError: an unknown scaling, or two controllers of the same label.
+    :raises ConfigError: two controllers of the same label.
     """
-    if scaling not in SCALINGS:
-        raise ConfigError(unknown("scaling", scaling, SCALINGS))
-    named = [_label_and_spec(text) for text in texts]
-    plain = [ControllerSpec(label, spec) for label, spec in named if scaling != "adaptive" or spec in EXPERTS]
-    adapted = [(f"{label} (adaptive)", spec) for label, spec in named if scaling != "none" and spec not in EXPERTS]
-    found = plain + [ControllerSpec(*each, "adaptive") for each in adapted]
+    found = [ControllerSpec(*_label_and_spec(text)) for text in texts]
     files = [file_name(entry.label) for entry in found]
     for file, entry in zip(files, found, strict=True):
         if not entry.label.isprintable():
@@ -90,42 +79,17 @@ def parse_controllers(texts: Sequence[str], scaling: str = "none") -> list[Contr
     return found
 
 
-def describe(spec: ControllerSpec, vehicle: str | Vehicle) -> ControllerRecord:
-    """Who a controller is; with adaptive scaling also the offset that it needs, measured by flying to targets.
+def describe(spec: ControllerSpec) -> ControllerRecord:
+    """Who a controller is.
 
-    :param vehicle: what it is measured with.
-    :raises ConfigError: an unknown name, a missing file, a module that cannot be imported, a policy whose offset cannot be
-        measured since it crashes on the way in more than half of the flights.
+    :raises ConfigError: an unknown name, a missing file, a module that cannot be imported.
     """
     path = Path(spec.spec)
     if spec.is_zip:
         algorithm, content = saved_algorithm(path), hashlib.sha256(path.read_bytes()).hexdigest()
-        record = ControllerRecord(label=spec.label, spec=path.name, kind="model", algorithm=algorithm, content=content)
-    else:
-        import_factory(spec.spec, "controller")  # says what is wrong
-        record = ControllerRecord(label=spec.label, spec=spec.spec, kind="expert" if spec.spec in EXPERTS else "factory")
-    if spec.scaling == "adaptive":
-        controller = build(spec, vehicle)
-        if isinstance(controller, AdaptiveScaling):
-            mean = measure_mean(controller.policy, settings=FlightSettings(vehicle=vehicle, **spec.observed))
-            record = record.model_copy(update={"scaling": "adaptive", "offset": tuple(mean.tolist())})
-    return record
-
-
-def build(spec: ControllerSpec, vehicle: str | Vehicle, mean: Sequence[float] | None = None) -> Any:
-    """A controller, ready to fly.
-
-    :param vehicle: what experts and factories are made for.
-    :param mean: with adaptive scaling: the position components of μ, (3,), m; None: zero.
-    :raises ConfigError: it cannot be loaded.
-    :raises ExpertError: a factory that fails.
-    """
-    controller = resolve_expert(spec.spec, vehicle, "controller")
-    if spec.scaling == "none" or hasattr(controller, "actions"):
-        return controller
-    if spec.own is not None and spec.own.is_extended:
-        raise ConfigError(f"{spec.label}: adaptive scaling is for agents that see the 18 features alone; this one sees more")
-    return AdaptiveScaling(controller, mean or (0.0, 0.0, 0.0), spec.observed["observation_std"])
+        return ControllerRecord(label=spec.label, spec=path.name, kind="model", algorithm=algorithm, content=content)
+    import_factory(spec.spec, "controller")  # says what is wrong
+    return ControllerRecord(label=spec.label, spec=spec.spec, kind="expert" if spec.spec in EXPERTS else "factory")
 
 
 def _label_and_spec(text: str) -> tuple[str, str]:

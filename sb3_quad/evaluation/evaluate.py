@@ -12,10 +12,11 @@ from typing import Any
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
-from sb3_quad.base.files import locked, write_arrays, write_text
+from sb3_quad.base.files import locked, make_folder, write_arrays, write_text
 from sb3_quad.base.version import __version__
+from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
-from sb3_quad.evaluation.controllers import ControllerSpec, build, describe
+from sb3_quad.evaluation.controllers import ControllerSpec, describe
 from sb3_quad.evaluation.fleets import FLEETS
 from sb3_quad.evaluation.flightlog import Recorder, episode_arrays
 from sb3_quad.evaluation.flights import Flights, fly_settings
@@ -91,7 +92,7 @@ def evaluate(
     for spec in controllers:
         try:
             vehicles = [_vehicle(spec, each) for each in suite.scenarios]
-            record, notices = describe(spec, vehicles[0]), dict.fromkeys(map(spec.notice, vehicles))
+            record, notices = describe(spec), dict.fromkeys(map(spec.notice, vehicles))
             for line in filter(None, notices):
                 report(line)
             records[spec] = record
@@ -117,10 +118,7 @@ def evaluate(
 
     if not jobs:
         return results()
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: no path
-        raise ConfigError(f"{folder}: cannot be written ({getattr(error, 'strerror', None) or error})") from None
+    make_folder(place, "results folder", "-o")
     with locked(place, "folder"):
         done |= _begin(place, digest, jobs, overwrite)
         missing = [job for job in jobs if job.name not in done]
@@ -172,7 +170,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
     start = time.perf_counter()
     try:
         scenario, seen = job.scenario.flown_by(job.spec.own and job.spec.own.vehicle), job.spec.observed
-        controller = build(job.spec, scenario.nominal_vehicle(), job.record.offset)
+        controller = resolve_expert(job.spec.spec, scenario.nominal_vehicle(), "controller")
         flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None, own=seen)
     except SB3QuadError as error:
         return _failure(job.record.label, job.scenario.name, error)
@@ -189,7 +187,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
     return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}
 
 
-def _fly_jobs(jobs: Sequence[Job], executor: Executor | None) -> Iterator[tuple[Job, Any]]:
+def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tuple[Job, Any]]:
     """Fly jobs, and hand out each as it is done: one after another here, or side by side in an executor's workers.
 
     A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.

@@ -1,34 +1,6 @@
 """Sampled trajectories of flights, and the ``.npz`` file that holds them beside the metrics of every flight.
 
-====================  =================  ============================================================================
-array                 shape              meaning; m flights, k samples (50 Hz), n episodes, T tolerances, W waypoints
-====================  =================  ============================================================================
-time                  (k,)               s, of the samples; sample 0 is the start
-position              (m, k, 3)          r, world frame, m; NaN after the end of a flight, as in all of these
-quaternion            (m, k, 4)          body to world, (w, x, y, z)
-velocity              (m, k, 3)          v, world frame, m/s
-body_rates            (m, k, 3)          body frame, rad/s
-action                (m, k, 4)          the last action given before the sample; NaN at the start
-target                (m, k, 3)          r_T, world frame, m
-wrench                (m, k, 6)          mean since the sample before: force, world frame, N; torque, body frame, N m
-samples               (m,)               how many samples each flight has
-episode_seed          (n,)
-episode_outcome       (n,) text          success, missed, collision or out_of_range
-episode_start         (n, 13)            position, quaternion, velocity, body rates, in the units above
-episode_target        (n, 3)             first target, m
-episode_flown         (n,)               s until lost or the end
-episode_reward        (n,)
-episode_path          (n,)               m
-episode_final_error   (n,)               |r - r_T|, m
-episode_final_offset  (n, 3)             r - r_T, world frame, m; NaN where the flight was lost
-episode_stabilised    (n,)               s until it was stable (``flights.py``); NaN: never
-episode_sideways      (n,)               largest distance from the straight way to the target, m; NaN: there is none
-episode_time_to       (n, T)             s until |r - r_T| was first within the tolerance; NaN: never
-episode_tolerances    (T,)               m
-episode_waypoints     (n, W)             s until each waypoint was reached; NaN: never; W = 0 without a course
-====================  =================  ============================================================================
-
-Trajectory i is that of episode i: all episodes of a scenario that is the same each time, the first few of others.
+docs/evaluate.md lists the arrays.
 """
 
 from pathlib import Path
@@ -83,7 +55,7 @@ class Recorder(Hook):
         self._wrench[:] = 0.0
 
     def arrays(self) -> Arrays:
-        """The arrays of this module's table but those of the episodes, as long as the longest flight."""
+        """The arrays of trajectories, as long as the longest flight."""
         log = self._log[: self._samples.max(initial=1)]
         time = np.arange(len(log)) * (self._stride * self._control_step)
         trajectories = {name: np.stack([sample[name] for sample in log], axis=1) for name in log[0]}
@@ -91,20 +63,21 @@ class Recorder(Hook):
 
 
 def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
-    """The ``episode_`` arrays of this module's table."""
-    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset", "stabilised", "sideways")
+    """The ``episode_`` arrays, of all flights."""
+    as_they_are = ("start", "target", "flown", "reward", "final_error", "final_offset", "stabilised", "sideways", "overshoot")
     return {
         "episode_seed": np.asarray(seeds, dtype=np.int64),
         "episode_outcome": np.select([flights.success, flights.survival, flights.collision], [*OUTCOMES][:3], [*OUTCOMES][3]),
         **{f"episode_{name}": getattr(flights, name) for name in as_they_are},
         "episode_path": flights.path_length,
         "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),
+        "episode_time_to_stay": np.stack(list(flights.time_to_stay.values()), axis=1),
         "episode_tolerances": np.array(list(flights.time_to)),
         "episode_waypoints": flights.waypoint_times,
     }
 
 
-read_flights = read_arrays  # by the names of this module's table; of episodes alone with the prefix ``episode_``
+read_flights = read_arrays  # by name; of episodes alone with the prefix ``episode_``
 
 
 class Track(NamedTuple):

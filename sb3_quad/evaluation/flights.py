@@ -41,6 +41,9 @@ class Flights:
     flown: FloatArray  # (n,), s until lost or the end
     # By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a course, to the last waypoint.
     time_to: Mapping[float, FloatArray]
+    # By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or was lost.
+    time_to_stay: Mapping[float, FloatArray]
+    overshoot: FloatArray  # (n,), largest |r - r_T| since it was first within the tightest tolerance, m; NaN if it never was
     path_length: FloatArray  # (n,), m, over the whole episode
     final_error: FloatArray  # (n,), |r - r_T| at the end, m
     final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
@@ -58,10 +61,14 @@ class Flights:
     @staticmethod
     def concatenate(parts: Sequence["Flights"]) -> "Flights":
         """Several parts as one, in order."""
-        names = [entry.name for entry in dataclasses.fields(Flights) if entry.name != "time_to"]
-        columns: dict[str, Any] = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-        times = {key: np.concatenate([part.time_to[key] for part in parts]) for key in parts[0].time_to}
-        return Flights(time_to=times, **columns)
+        columns: dict[str, Any] = {}
+        for name in (entry.name for entry in dataclasses.fields(Flights)):
+            values: list[Any] = [getattr(part, name) for part in parts]
+            if isinstance(values[0], Mapping):
+                columns[name] = {key: np.concatenate([value[key] for value in values]) for key in values[0]}
+            else:
+                columns[name] = np.concatenate(values)
+        return Flights(**columns)
 
 
 class Hook:
@@ -148,6 +155,8 @@ def _fly_fleet(
     wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
+    stays = times.copy()
+    first = times[int(np.argmin(limits))] if len(limits) else np.full(n, np.nan)  # touch of the tightest; a view
     flights = Flights(
         success=np.zeros(n, dtype=np.bool_),
         survival=np.ones(n, dtype=np.bool_),
@@ -156,6 +165,8 @@ def _fly_fleet(
         length=np.zeros(n, dtype=np.int64),
         flown=np.zeros(n),
         time_to=dict(zip(tolerances, times, strict=True)),
+        time_to_stay=dict(zip(tolerances, stays, strict=True)),
+        overshoot=np.where(np.isnan(first), np.nan, error),
         path_length=np.zeros(n),
         final_error=error.copy(),
         final_offset=np.full((n, 3), np.nan),
@@ -186,7 +197,12 @@ def _fly_fleet(
         position = state.position.copy()
         flights.final_error[flying], flights.success[flying] = error[flying], arrived[flying]
         flights.length[flying], flights.flown[flying] = step, step * control_step
-        times[np.isnan(times) & (error <= limits) & (flying & on_last)] = step * control_step
+        within = (error <= limits) & on_last
+        times[np.isnan(times) & within & flying] = step * control_step
+        stays[~within & flying] = np.nan
+        stays[np.isnan(stays) & within & flying] = step * control_step
+        after = flying & ~np.isnan(first)
+        flights.overshoot[after] = np.fmax(flights.overshoot, error)[after]
         flights.collision[flying & lost & collided] = True
         flying &= ~lost
         motion.see(step, state, flying)
@@ -203,6 +219,7 @@ def _fly_fleet(
             if onward.size:
                 observation = fleet.set_targets(onward, plan.waypoints[waypoint[onward]])
     flights.success[~(flying & on_last)] = False
+    stays[:, ~flying] = np.nan
     flights.final_offset[flying] = (state.position - state.target)[flying]
     return flights
 

@@ -18,6 +18,7 @@ PATH, MEDIAN, QUANTILE = Row("mean path", "m"), Row("final error, median", "m"),
 STABLE, SIDEWAYS = Row("mean time until stable", "s"), Row("beside the straight way", "m")
 REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
+LEAVES, OVERSHOOT = Row("leave it again", "%"), Row("overshoot, median", "m")
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
 MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
@@ -31,6 +32,11 @@ def time_row(tolerance: float | str) -> Row:
     return Row(f"{TIME} {float(tolerance):g} m", "s")
 
 
+def stay_row(tolerance: float) -> Row:
+    """The row with the time after which a tolerance is not left again."""
+    return Row(f"{TIME} stay within {tolerance:g} m", "s")
+
+
 def metric_cells(metrics: Metrics) -> Cells:
     """Everything that was measured of a controller in a scenario."""
     cells = {
@@ -39,6 +45,9 @@ def metric_cells(metrics: Metrics) -> Cells:
         REWARD: _mean(metrics.reward),
         FLOWN: _mean(metrics.flown),
         **{time_row(arrival.tolerance): _moment(arrival) for arrival in metrics.arrivals},
+        **{stay_row(arrival.tolerance): _moment(arrival.stays, "do") for arrival in metrics.arrivals},
+        LEAVES: Cell(words="–") if metrics.arrivals[0].leaves is None else _share(metrics.arrivals[0].leaves),
+        OVERSHOOT: Cell(metrics.overshoot, words="–"),
         PATH: _mean(metrics.path),
         MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
         QUANTILE: replace(_mean(metrics.final_error_95), decimals=3),
@@ -148,7 +157,8 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
         return [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
-    return [SUCCESS, SURVIVAL, REWARD, *map(time_row, tolerances), PATH, SIDEWAYS, MEDIAN, QUANTILE]
+    times = [stay_row(tolerances[0]), LEAVES, OVERSHOOT, *map(time_row, tolerances)]
+    return [SUCCESS, SURVIVAL, REWARD, *times, PATH, SIDEWAYS, MEDIAN, QUANTILE]
 
 
 def _beats(cell: Cell, other: Cell, higher: bool) -> bool:

@@ -1,6 +1,5 @@
 """Many flights in a few metrics."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -8,12 +7,9 @@ from pydantic import Field
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
-from sb3_quad.evaluation.flights import Flights, fly
+from sb3_quad.evaluation.flights import Flights
 from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.statistics import Estimate, bootstrap, mean, share
-from sb3_quad.vehicles.vehicle import Vehicle
-
-NEAR = 0.1  # m
 
 
 class Moment(Frozen):
@@ -24,9 +20,11 @@ class Moment(Frozen):
 
 
 class Arrival(Moment):
-    """Arrival within one tolerance."""
+    """Arrival within one tolerance: when it is first touched, and after which time it is not left again."""
 
     tolerance: float = Field(description="m")
+    stays: Moment = Field(description="flights that end within it, and after which time they stay")
+    leaves: Estimate | None = Field(description="share that leaves it again, of the flights that came to it")
 
 
 class Course(Frozen):
@@ -48,6 +46,7 @@ class Metrics(Frozen):
     reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
     flown: Estimate = Field(description="mean time flown, until lost or the end, s")
     arrivals: list[Arrival] = Field(description="by tolerance, the tightest first")
+    overshoot: float | None = Field(description="median of the largest |r - r_T| since the tightest tolerance, m")
     path: Estimate | None = Field(description="mean length of the path over the whole episode, m")
     final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
     final_error_median: float | None = Field(description="m")
@@ -76,7 +75,8 @@ def summarise(flights: Flights) -> Metrics:
         out_of_range=int((~done & ~flights.collision).sum()),
         reward=bootstrap(flights.reward),
         flown=bootstrap(flights.flown),
-        arrivals=[Arrival(tolerance=each, **_moment(times)) for each, times in sorted(flights.time_to.items())],
+        arrivals=[_arrival(each, times, flights.time_to_stay[each]) for each, times in sorted(flights.time_to.items())],
+        overshoot=float(np.nanmedian(flights.overshoot)) if np.isfinite(flights.overshoot).any() else None,
         path=mean(flights.path_length[done]),
         final_error=mean(error),
         final_error_median=float(np.median(error)) if some else None,
@@ -89,28 +89,11 @@ def summarise(flights: Flights) -> Metrics:
     )
 
 
+def _arrival(tolerance: float, times: FloatArray, stays: FloatArray) -> Arrival:
+    arrived = np.isfinite(times)
+    leaves = share((stays != times)[arrived]) if arrived.any() else None
+    return Arrival(tolerance=tolerance, stays=Moment(**_moment(stays)), leaves=leaves, **_moment(times))
+
+
 def _moment(times: FloatArray) -> dict[str, Any]:
     return {"share": share(np.isfinite(times)), "time": mean(times)}
-
-
-def measure_expert(
-    expert: Any, vehicle: Vehicle, seeds: Sequence[int], episodes: int = 960, time_limit: int = 1500
-) -> dict[str, Any]:
-    """Fly ``episodes`` recoveries per seed, and as many targets 10 m away with the first seed.
-
-    A tracking flight that never comes within 0.1 m counts as ``time_limit`` control steps.
-    """
-    keywords: dict[str, Any] = {"vehicle": vehicle, "noise": 0.0, "max_steps": time_limit}
-    recovery = Flights.concatenate([fly(expert, "state_recovery", episodes, seed, **keywords) for seed in seeds])
-    tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
-    times = np.nan_to_num(tracking.time_to[NEAR], nan=time_limit * vehicle.control_step)
-    return {
-        "recovery_survival": round(float(recovery.survival.mean()), 5),
-        "recovery_episodes": recovery.n,
-        "tracking_survival": round(float(tracking.survival.mean()), 5),
-        "tracking_episodes": tracking.n,
-        "time_to_0_1_m": round(float(times.mean()), 3),  # mean time until 0.1 m from the target, s
-        "tracking_reward": round(float(tracking.reward.mean()), 3),  # mean (Eqs. 4.5-4.9)
-        "observation_noise": 0.0,
-        "seeds": [*seeds],
-    }

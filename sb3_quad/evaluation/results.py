@@ -19,12 +19,10 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_arrays, write_csv
 from sb3_quad.base.validate import Frozen, read_record
 from sb3_quad.evaluation.metrics import Metrics
-from sb3_quad.evaluation.scenarios.parts import Vector
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
 WRITTEN = RESULTS, EPISODES, "report.html", "report.md"  # what does not outlast the results; the last two by a report
-Scaling = Literal["none", "adaptive"]
 _AXES = {
     "target": ("x", "y", "z"),
     "start": (*("x", "y", "z", "qw", "qx", "qy", "qz"), *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z")),
@@ -39,10 +37,6 @@ class ControllerRecord(Frozen):
     kind: Literal["expert", "model", "factory"]
     algorithm: str | None = Field(default=None, description="SB3 class that loaded a zip")
     content: str | None = Field(default=None, description="SHA-256 of the zip")
-    scaling: Scaling = Field(default="none", description="of its observation (4.3.1)")
-    offset: Vector | None = Field(
-        default=None, description="with adaptive scaling: the position components of μ, measured beforehand, m"
-    )
 
 
 class Entry(Frozen):
@@ -74,7 +68,7 @@ class Failure(Frozen):
 class Results(Frozen):
     """A folder of results."""
 
-    schema_version: Literal[3] = 3
+    schema_version: Literal[4] = 4
     suite: str
     description: str
     source: str = Field(default="reference", description="where the scenarios' reference comes from")
@@ -127,8 +121,10 @@ def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
     columns["waypoints_reached"] = np.isfinite(arrays["episode_waypoints"]).sum(axis=1)
     for name, axes in _AXES.items():
         columns |= {f"{name}_{axis}": values for axis, values in zip(axes, arrays[f"episode_{name}"].T, strict=True)}
-    times = zip(arrays["episode_tolerances"], arrays["episode_time_to"].T, strict=True)
-    columns |= {f"time_to_{tolerance:g}": values for tolerance, values in times}
+    for name in ("time_to", "time_to_stay"):
+        times = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
+        columns |= {f"{name}_{tolerance:g}": values for tolerance, values in times}
+    columns["overshoot"] = arrays["episode_overshoot"]
     columns |= {f"waypoint_{number}": values for number, values in enumerate(arrays["episode_waypoints"].T, 1)}
     return [
         {"controller": entry.controller, "scenario": entry.scenario, "episode": episode}

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
-from typing import Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.signals import StopSignals
@@ -13,30 +13,19 @@ TICK = 1.0  # s between two looks for a signal
 Key = TypeVar("Key")
 
 
-class Executor(Protocol):
-    """Calls functions in processes that each have one thread of PyTorch.
+if TYPE_CHECKING:
+    from sb3_quad.executors.ray import RayExecutor
 
-    A function is given by the name of its module, so it stands at the top of one; arguments and results are pickled.
-    """
+Executor: TypeAlias = "LocalExecutor | RayExecutor"
+"""Calls functions in processes that each have one thread of PyTorch, by ``submit``.
 
-    @property
-    def workers(self) -> int:
-        """How many calls run side by side, at most."""
-
-    def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        """Have a function called. Its future raises :class:`~sb3_quad.base.errors.WorkerDied` if the worker ended first."""
-
-    def stop(self) -> None:
-        """Cancel the calls that have not begun, and ask those under way to stop."""
-
-    def __enter__(self) -> "Executor": ...
-
-    def __exit__(self, *error: object) -> None:
-        """End all workers, at once."""
+A function is given by the name of its module, so it stands at the top of one; arguments and results are pickled. Its future
+raises :class:`~sb3_quad.base.errors.WorkerDied` if the worker ended first.
+"""
 
 
 def start_executor(kind: str, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0) -> Executor:
-    """An executor, to be used as a context manager.
+    """An executor, to be used as a context manager, at whose end all workers end at once.
 
     :param kind: ``local`` or ``ray``.
     :param workers: calls side by side; a cluster at an ``address`` has as many as it has room for.

@@ -10,13 +10,24 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import STATE, WRENCH_SIZE, P, QuadcopterState, W, first_rows, row_slices
+from sb3_quad.simulation.state import (
+    FORCE_WORLD,
+    STATE,
+    WRENCH_SIZE,
+    P,
+    QuadcopterState,
+    W,
+    drag_forces,
+    first_rows,
+    row_slices,
+)
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
+_DRAG_LEFT = 0.5  # of the drag of its own motion, uncompensated: it damps
 _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
 
@@ -139,6 +150,9 @@ class GeometricExpert(Expert):
         constants: tuple[FloatArray, ...] = self._constants
         if self._told is not None and state.vehicles is not None:
             constants = self._told.constants(state.vehicles)
+            if state.wrench is not None and state.vehicles[P.drag_x : P.drag_z + 1].any():
+                wrench = state.wrench.copy()
+                wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, np.zeros((3, 1)))
         _geometric(*moving, *constants, wrench, self.reserve, actions)
         return actions
 

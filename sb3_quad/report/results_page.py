@@ -100,26 +100,18 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
 
 
 def _controller_table(records: Sequence[ControllerRecord]) -> Table:
-    rows = []
-    for record in records:
-        scaled = "Eq. 4.10" if record.scaling == "adaptive" else ""
-        offset = "" if record.offset is None else f", offset μ = ({', '.join(f'{x:.4f}' for x in record.offset)}) m"
-        zip_hash = (record.content or "")[:12]
-        rows.append((record.label, record.spec, record.algorithm or "", zip_hash, scaled + offset))
-    return text_table("", ("name", "controller", "algorithm", "SHA-256", "observation scaled by"), rows, align="left")
+    rows = [(each.label, each.spec, each.algorithm or "", (each.content or "")[:12]) for each in records]
+    return text_table("", ("name", "controller", "algorithm", "SHA-256"), rows, align="left")
 
 
 def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
-    entries = {label: results.entry(label, scenario.name) for label in colours}
-    flights = [
-        ControllerFlights(label, colours[label], entry, read_tracks(Path(folder) / entry.flights))
-        for label, entry in entries.items()
-        if entry is not None
-    ]
-    recorded = [each for each in flights if each.tracks]
+    found = {label: results.entry(label, scenario.name) for label in colours}
+    entries = {label: entry for label, entry in found.items() if entry is not None}
+    tracks = {label: read_tracks(Path(folder) / entry.flights) for label, entry in entries.items()}
+    recorded = [ControllerFlights(label, colours[label], each) for label, each in tracks.items() if each]
     plots = [paths_plot(scenario, recorded)] if recorded else []
-    if flights and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
-        plots.append(arrivals_plot(scenario, flights))
+    if entries and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
+        plots.append(arrivals_plot(scenario, {label: entry.metrics for label, entry in entries.items()}, colours))
     if recorded:
         plots.append(errors_plot(scenario, recorded))
     return plots

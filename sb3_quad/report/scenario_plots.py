@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.evaluation.flightlog import Track
-from sb3_quad.evaluation.results import Entry, Results
+from sb3_quad.evaluation.metrics import Metrics
+from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.report.plots import HEIGHT, INK, POINTS, WIDTH, Plot, band, interval_ends, legend, new_axes, styled
@@ -20,25 +21,23 @@ SHOWN_FLIGHTS = 4  # of a controller, of random episodes
 
 
 class ControllerFlights(NamedTuple):
-    """One controller in one scenario: its colour, its metrics, its recorded flights."""
+    """One controller in one scenario: its colour, its recorded flights."""
 
     label: str
     colour: str
-    entry: Entry
     tracks: Sequence[Track]
 
 
 @styled
-def arrivals_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plot:
-    """Bars of the mean times to each tolerance, cf. Figs. 4.6 and 4.7."""
+def arrivals_plot(scenario: Scenario, metrics: Mapping[str, Metrics], colours: Mapping[str, str]) -> Plot:
+    """Bars of the mean times to each tolerance, cf. Figs. 4.6 and 4.7; metrics and colours by the controllers' labels."""
     figure, axes = new_axes("tolerance (m)", "time (s)")
-    places, width = np.arange(len(scenario.tolerances)), 0.75 / len(flights)
-    for number, each in enumerate(flights):
-        arrivals = each.entry.metrics.arrivals
-        value, low, high = interval_ends([arrival.time for arrival in arrivals])
-        spread, middle = np.stack([value - low, high - value]), places + (number - 0.5 * (len(flights) - 1)) * width
+    places, width = np.arange(len(scenario.tolerances)), 0.75 / len(metrics)
+    for number, (label, each) in enumerate(metrics.items()):
+        value, low, high = interval_ends([arrival.time for arrival in each.arrivals])
+        spread, middle = np.stack([value - low, high - value]), places + (number - 0.5 * (len(metrics) - 1)) * width
         whiskers = {"ecolor": INK, "elinewidth": 0.9, "capsize": 2}
-        axes.bar(middle, value, 0.92 * width, color=each.colour, label=each.label, yerr=spread, error_kw=whiskers)
+        axes.bar(middle, value, 0.92 * width, color=colours[label], label=label, yerr=spread, error_kw=whiskers)
     axes.set_xticks(places, [f"{tolerance:g}" for tolerance in scenario.tolerances])
     axes.grid(axis="x", visible=False)
     legend(figure)

@@ -14,7 +14,7 @@ from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
 from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
 from sb3_quad.simulation.observation import GUST_WORDS, NORMALS, OBSERVATION_SIZE, WORDS, observe
-from sb3_quad.simulation.physics import command_rotors, fly, moment, rotation_rows, turn_rotors
+from sb3_quad.simulation.physics import command_rotors, fly, moment, motor_factor, rotation_rows, turn_rotors
 from sb3_quad.simulation.random import STEP, gust_words
 from sb3_quad.simulation.reward import score, succeeds
 from sb3_quad.simulation.sampling import add_gusts, advance_gusts, count_episode, sample_episode, start_episode
@@ -52,7 +52,8 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "wrench": ("f8", WRENCH_SIZE),
     "wind": ("f8", 3),  # velocity of the air
     "drag": ("f8", 3),
-    "motor": ("f8", 2),  # km dt of a rotor that speeds up, and of one that slows down
+    "motor": ("f8", 2),  # motor_factor of a rotor that speeds up, and of one that slows down
+    "exact": ("f8", ()),  # 1 where motors are integrated exactly, else 0
     "lift": ("f8", ()),  # kF
     "fall": ("f8", ()),  # g dt
     "push": ("f8", ()),  # dt / m
@@ -364,7 +365,9 @@ def _divide(b, v, first, dt):
     for lane in range(LANES):
         i = first + lane
         ixx, iyy, izz, lift = v[P.ixx, i], v[P.iyy, i], v[P.izz, i], v[P.thrust_coefficient, i]
-        b.motor[0, lane], b.motor[1, lane] = v[P.motor_gain_up, i] * dt, v[P.motor_gain_down, i] * dt
+        exact = b.exact[lane] = v[P.exact_motors, i]
+        b.motor[0, lane] = motor_factor(v[P.motor_gain_up, i], exact, dt)
+        b.motor[1, lane] = motor_factor(v[P.motor_gain_down, i], exact, dt)
         b.push[lane] = dt / v[P.mass, i]
         b.drag[0, lane], b.drag[1, lane], b.drag[2, lane] = v[P.drag_x, i], v[P.drag_y, i], v[P.drag_z, i]
         b.fall[lane], b.lift[lane] = v[P.gravity, i] * dt, lift

@@ -34,6 +34,7 @@ def sample_vehicles(vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle
             "thrust_coefficient": column[P.thrust_coefficient],
             "motor_gain_up": column[P.motor_gain_up],
             "motor_gain_down": column[P.motor_gain_down],
+            "motor_integration": "exact",
             "drag": tuple(column[P.drag_x : P.drag_z + 1]),
             "thrust_limits": ((middle - half) / hover, (middle + half) / hover),
             "collision_radius": column[P.collision_radius],

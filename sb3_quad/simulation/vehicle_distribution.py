@@ -120,7 +120,7 @@ def sample_from_distribution(i, streams, table, vehicles):
     vehicles[P.thrust_middle, i], vehicles[P.thrust_half_range, i] = hover * (most + least) / 2.0, hover * (most - least) / 2.0
     vehicles[P.thrust_coefficient, i] *= share  # the rotors turn as fast as those of the base vehicle
     slow = between(table, D.motor_time_constant, u[3], 1.0)
-    vehicles[P.motor_gain_up, i] = 1.0 / slow
+    vehicles[P.motor_gain_up, i], vehicles[P.exact_motors, i] = 1.0 / slow, 1.0
     vehicles[P.motor_gain_down, i] = 1.0 / between(table, D.motor_time_constant_down, u[8], slow)
     for axis in range(3):
         vehicles[P.drag_x + axis, i] = mass * between(table, D.drag, u[9], vehicles[P.drag_x + axis, i] * share / mass)

@@ -18,7 +18,7 @@ from sb3_quad.base.imports import import_packages
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.controllers.zips import load_model
-from sb3_quad.evaluation.controllers import ControllerSpec, build
+from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario
 from sb3_quad.evaluation.flights import Flights, fly_settings
 from sb3_quad.evaluation.scenarios.scenario import Suite
@@ -170,8 +170,7 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
     spec, found = ControllerSpec("agent", str(agent)), {}
     for each in suite.scenarios:
         scenario = each.flown_by(spec.own and spec.own.vehicle)
-        controller = build(spec, scenario.nominal_vehicle())
-        found[each.name] = _numbers(fly_scenario(controller, scenario, own=spec.observed)[0])
+        found[each.name] = _numbers(fly_scenario(model, scenario, own=spec.observed)[0])
     return found
 
 

@@ -5,7 +5,6 @@ import subprocess
 import sys
 import uuid
 from pathlib import Path
-from tempfile import TemporaryFile
 from typing import Any
 
 import stable_baselines3
@@ -13,10 +12,9 @@ import torch
 import yaml
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_text
-from sb3_quad.base.literals import ZooLoader
+from sb3_quad.base.files import make_folder, write_text
 from sb3_quad.base.version import __version__
-from sb3_quad.base.yaml_files import parse_mapping_file
+from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, TRIMMED, run_agent
 from sb3_quad.controllers.zips import saved_data
 
@@ -87,7 +85,7 @@ class RunFolder:
 
         :raises ConfigError: either missing, unreadable or not a mapping.
         """
-        return parse_mapping_file(self.config, ZooLoader), parse_mapping_file(self.arguments, ZooLoader)
+        return read_yaml(self.config), read_yaml(self.arguments)
 
 
 def made_with() -> dict[str, str]:
@@ -131,20 +129,6 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
             return path
         except FileExistsError:
             number += 1
-
-
-def make_folder(path: str | Path, what: str, flag: str) -> None:
-    """Make a folder that files are to be written to, unless it is there.
-
-    :param what: the folder in the message, which also names the flag that gives another.
-    :raises ConfigError: it cannot be written.
-    """
-    try:
-        Path(path).mkdir(parents=True, exist_ok=True)
-        TemporaryFile(dir=path).close()
-    except (OSError, ValueError) as error:  # ValueError: no path
-        reason = getattr(error, "strerror", None) or error
-        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
 
 
 def _runs(parent: Path, name: str) -> dict[int, Path]:

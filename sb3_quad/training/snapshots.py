@@ -7,47 +7,59 @@ import random
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch as th
 from pydantic import TypeAdapter
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import Arrays
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import one_line, read_arrays, write_arrays, write_bytes
-from sb3_quad.callbacks.interruption import LastGoodModel
+from sb3_quad.base.errors import ConfigError, TrainingError
+from sb3_quad.base.files import model_bytes, one_line, read_arrays, write_arrays, write_bytes
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
-ENVIRONMENT, DATASET = "environment.", "dataset."  # before the names of their arrays
+ENVIRONMENT = "environment."  # before the names of its arrays
+COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}  # of what a model may keep: how far it is filled
 LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])  # by name: value, how many it is the mean of, not shown by
 NO_BYTES = np.zeros(0, np.uint8)
 ANY_LENGTH = ("model", "best_model", "random", "log")
 SHARE = 0.03  # of the run's time that snapshots may take
+PAUSE = 1.0  # s between two snapshots of an off-policy algorithm, whose rollouts are short
 
 
-class SnapshotFile(LastGoodModel):
-    """Writes the snapshot of a rollout's start to the run folder: of the first rollout, then of one in so many seconds.
+class Snapshot(NamedTuple):
+    """A model between two rollouts."""
 
-    Where writing takes long, as it does for a large dataset on a slow disk, snapshots are rarer.
+    timesteps: int
+    model: bytes  # the zip
+
+
+class SnapshotFile(BaseCallback):
+    """Takes a :class:`Snapshot` whenever a rollout starts, and writes that of the first, then one in so many seconds.
+
+    Where writing takes long, as it does for a large dataset on a slow disk, fewer are written.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training goes on.
     :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
+    :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from before that update.
     """
+
+    snapshot: Snapshot | None = None
 
     def __init__(self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]) -> None:
         super().__init__()
         self._run, self._every, self._report, self._hurry = run, every, report, hurry
         self._state: Arrays = {}
-        self._next_write = -np.inf  # s
+        self._taken, self._next_write = -np.inf, -np.inf  # s
 
     @property
     def is_fresh(self) -> bool:
@@ -59,14 +71,17 @@ class SnapshotFile(LastGoodModel):
         if self._run.resume_state.is_file():  # the log of a resumed run says what it would have said
             set_log(self.logger, read_arrays(self._run.resume_state, "log").get("log"), self._run.resume_state)
 
-    def _is_due(self) -> bool:
-        return super()._is_due() or self._hurry()
+    def _on_step(self) -> bool:
+        return True
 
     def _on_rollout_start(self) -> None:
-        before = self.snapshot
-        super()._on_rollout_start()
-        if self.snapshot is before:
+        start = time.monotonic()
+        if isinstance(self.model, OffPolicyAlgorithm) and start < self._taken + PAUSE and not self._hurry():
             return
+        for name, parameter in self.model.policy.named_parameters():
+            if not th.isfinite(parameter).all():
+                raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")
+        self._taken, self.snapshot = start, Snapshot(self.model.num_timesteps, model_bytes(self.model))
         self._state = self._beside_the_model()
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
@@ -89,11 +104,7 @@ class SnapshotFile(LastGoodModel):
         episodes, best_model = self._run.episodes, self._run.best_model
         state["episodes"] = np.array(episodes.stat().st_size if episodes.is_file() else 0)
         state["best_model"] = np.fromfile(best_model, dtype=np.uint8) if best_model.is_file() else NO_BYTES
-        if hasattr(model, "dataset"):
-            state[f"{DATASET}added"] = np.array(model.dataset.added)
-        for name, buffer in _replay_buffers(model).items():
-            state |= {f"{name}.pos": np.array(buffer.pos), f"{name}.full": np.array(buffer.full)}
-        return state
+        return state | _counters(model)
 
     def write(self) -> None:
         """Write the latest snapshot; until that is whole, the file holds the one before.
@@ -107,10 +118,8 @@ class SnapshotFile(LastGoodModel):
             "model": np.frombuffer(model, dtype=np.uint8),
             **self._state,
         }
-        if hasattr(self.model, "dataset"):
-            arrays |= _with_prefix(DATASET, self.model.dataset.snapshot(int(self._state[f"{DATASET}added"])))
-        for name, buffer in _replay_buffers(self.model).items():
-            arrays |= _with_prefix(f"{name}.", _filled(buffer))
+        for name, store in _stores(self.model).items():
+            arrays |= _with_prefix(f"{name}.", _filled(store))
         write_arrays(self._run.resume_state, **arrays)
 
 
@@ -139,17 +148,13 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
     except Exception as error:  # what is no state raises what it likes
         _require(False, f"random and torch are no states of random numbers ({one_line(error)})", path)
     _require(model.num_timesteps == int(state["timesteps"]), "timesteps is not that of model", path)
-    if hasattr(model, "dataset"):
-        _check(state, {f"{DATASET}added": one}, path)
-        added = int(state[f"{DATASET}added"])
-        _require(added >= 0, f"{DATASET}added is negative", path)
-        _check(state, _with_prefix(DATASET, model.dataset.snapshot(added)), path)
-        model.dataset.restore(_part(state, DATASET), path)
-    for name, buffer in _replay_buffers(model).items():
-        _check(state, {f"{name}.pos": one, f"{name}.full": np.array(False)}, path)
-        buffer.pos, buffer.full = int(state[f"{name}.pos"]), bool(state[f"{name}.full"])
-        _require(0 <= buffer.pos < buffer.buffer_size, f"{name}.pos is beyond its rows", path)
-        own = _with_prefix(f"{name}.", _filled(buffer))
+    _check(state, _counters(model), path)
+    for name, store in _stores(model).items():
+        for counter in COUNTERS[name]:
+            value = state[f"{name}.{counter}"].item()
+            _require(0 <= value < getattr(store, "buffer_size", np.inf), f"{name}.{counter} is beyond its rows", path)
+            setattr(store, counter, value)
+        own = _with_prefix(f"{name}.", _filled(store))
         # What was written later than the rest may hold more rows.
         state |= {each: state[each][: len(rows)] for each, rows in own.items() if each in state and state[each].ndim}
         _check(state, own, path)
@@ -188,21 +193,28 @@ def _part(state: Arrays, prefix: str) -> Arrays:
     return {name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)}
 
 
-def _replay_buffers(model: Any) -> dict[str, ReplayBuffer]:
-    """By name; those of an off-policy algorithm."""
-    buffers = {"replay_buffer": getattr(model, "replay_buffer", None)}
-    return {name: buffer for name, buffer in buffers.items() if isinstance(buffer, ReplayBuffer)}
+def _stores(model: Any) -> dict[str, Any]:
+    """What a model keeps beyond a rollout, by name."""
+    return {name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None}
 
 
-def _filled(buffer: ReplayBuffer) -> Arrays:
-    """Views of the rows that a replay buffer of this ``pos`` and ``full`` holds, by name.
+def _counters(model: Any) -> Arrays:
+    """How far these are filled."""
+    stores = _stores(model)
+    return {f"{name}.{each}": np.array(getattr(stores[name], each)) for name in stores for each in COUNTERS[name]}
+
+
+def _filled(store: Any) -> Arrays:
+    """Views of the rows that a dataset or a replay buffer holds, by name.
 
     :raises ConfigError: observations that are a Dict.
     """
-    if isinstance(buffer.observations, dict):
+    if not isinstance(store, ReplayBuffer):
+        return store.filled  # type: ignore[no-any-return]
+    if isinstance(store.observations, dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
-    rows = buffer.size() + 1  # the memory-efficient variant keeps the last next observation there
-    return {name: array[:rows] for name, array in vars(buffer).items() if isinstance(array, np.ndarray)}
+    rows = store.size() + 1  # the memory-efficient variant keeps the last next observation there
+    return {name: array[:rows] for name, array in vars(store).items() if isinstance(array, np.ndarray)}
 
 
 def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:

@@ -20,14 +20,13 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.files import locked, one_line, save_model, write_bytes
+from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog
 from sb3_quad.callbacks.every import Checkpoint
-from sb3_quad.callbacks.interruption import Snapshot
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.controllers.zips import load_model
@@ -36,8 +35,8 @@ from sb3_quad.training.algorithms import get_algorithm, takes_expert
 from sb3_quad.training.config import TrainingConfig, build_config
 from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, make_folder, open_run
-from sb3_quad.training.snapshots import SnapshotFile, load_snapshot
+from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
+from sb3_quad.training.snapshots import Snapshot, SnapshotFile, load_snapshot
 from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import instance
 

@@ -27,13 +27,14 @@ from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import Hook, fly
-from sb3_quad.evaluation.scaling import ROUNDS, hover_offset
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings, levels
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 _POSITION = GROUPS["position"]
+N_OFFSETS = 120  # flights to random targets, of which the final offset is the mean
+ROUNDS = 3  # the offset is measured anew after each correction
 STIFFNESS = 0.1  # λ
 N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
 TASKS = {"state_recovery": 0.5, "recovery_and_tracking": 0.5}
@@ -70,6 +71,24 @@ def trim(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = 
         shift_position(model, after, std[_POSITION])
         after = hover_offset(model, seed=each, settings=own)
     return Trim(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
+
+
+def hover_offset(
+    controller: Any, n_flights: int = N_OFFSETS, seed: int = 0, settings: FlightSettings | None = None
+) -> FloatArray:
+    """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking, over the flights that last.
+
+    :param settings: how it flies; task and episode length are those of this measurement.
+    :raises ConfigError: a controller that crashes on the way in more than half of the flights.
+    """
+    own = {} if settings is None else settings.in_any_task()
+    flights = fly(controller, "target_tracking", n_flights, seed, **own)
+    lost = 1.0 - float(flights.survival.mean())
+    if lost > 0.5:
+        raise ConfigError(
+            f"the steady offset from the target cannot be measured: {100 * lost:.0f} % of the flights to targets end early"
+        )
+    return np.asarray(flights.final_offset[flights.survival].mean(axis=0))
 
 
 def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) -> None:

@@ -1,12 +1,4 @@
-"""What a search varies, from YAML: settings and the values that each may have.
-
-======================================  ==================================================================================
-value                                   meaning
-======================================  ==================================================================================
-``{low: 0.98, high: 0.999}``            a number between the two; ``log: true``: on a logarithmic scale
-``{around: 5}``                         a number from a fifth of what the settings have to five times that, logarithmic
-``[mse, nll, huber]``                   one of these, which may be lists and mappings too
-======================================  ==================================================================================
+"""What a search varies, from YAML: settings and the values that each may have, as docs/tune.md lists them.
 
 Keys are those of the settings. ``policy_kwargs.net_arch`` is an entry of a mapping, and ``n_minibatches`` stands for the
 ``batch_size`` that divides a rollout into so many. Where the settings have ``lin_x``, the x is varied. Settings of which only

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
@@ -24,8 +24,8 @@ PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], 
 
 # What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
 PARAMETER_NAMES = (
-    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain_up", "motor_gain_down", "gravity"),
-    *("drag_x", "drag_y", "drag_z"),
+    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain_up", "motor_gain_down", "exact_motors"),
+    *("gravity", "drag_x", "drag_y", "drag_z"),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
 )
@@ -61,6 +61,10 @@ class Vehicle(Frozen):
     thrust_coefficient: PositiveFloat = Field(description="kF, N s^2, in F = kF ω^2 (Eq. 2.4)")
     motor_gain_up: PositiveFloat = Field(description="k_m of a rotor that speeds up, 1/s (Eq. 4.1)")
     motor_gain_down: PositiveFloat = Field(description="k_m of a rotor that slows down, 1/s")
+    motor_integration: Literal["euler", "exact"] = Field(
+        default="euler",
+        description="euler: Eq. 4.1 as printed, thrust of the new speed; exact: the speed's exponential, thrust of its middle",
+    )
     drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
         default=(0.0, 0.0, 0.0), description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"
     )
@@ -290,7 +294,7 @@ class Vehicle(Frozen):
     def parameters(self) -> FloatArray:
         """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of ``PARAMETER_NAMES``."""
         low, high = self.thrust_range
-        motors = self.motor_gain_up, self.motor_gain_down
+        motors = self.motor_gain_up, self.motor_gain_down, self.motor_integration == "exact"
         head = (self.mass, *self.inertia, self.thrust_coefficient, *motors, self.gravity, *self.drag)
         tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius, self.delay)
         return np.array([*head, *tail, *self.mixer[1:].ravel()], dtype=np.float64)

@@ -21,11 +21,11 @@ import torch
 import yaml
 from stable_baselines3.common.save_util import load_from_zip_file
 
-import sb3_quad.callbacks.interruption
 import sb3_quad.cli.closing
 import sb3_quad.evaluation.evaluate
 import sb3_quad.report.results_page
 import sb3_quad.sweep.run
+import sb3_quad.training.snapshots
 import sb3_quad.training.trim
 import sb3_quad.tuning.results
 from sb3_quad.cli import main
@@ -200,7 +200,7 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
     for module, name, value in (
         (sb3_quad.cli.closing, "FRESH_EPISODES", 4),
         (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
-        (sb3_quad.callbacks.interruption, "PAUSE", 0.1),
+        (sb3_quad.training.snapshots, "PAUSE", 0.1),
         (sb3_quad.training.trim, "N_FLIGHTS", 4),
         (sb3_quad.training.trim, "N_HEADINGS", 4),
     ):

@@ -61,7 +61,7 @@ def broken(request, tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sb3_quad.training.snapshots.SHARE", np.inf)  # each rollout has one
-        patch.setattr("sb3_quad.callbacks.interruption.PAUSE", 0.0)
+        patch.setattr("sb3_quad.training.snapshots.PAUSE", 0.0)
         with pytest.raises(RuntimeError, match="failed"):
             train(job, lambda line: None, should_continue=fail_the_third_time)
     return open_run(folder / request.param / "QuadTargetTracking-v0_1"), config

@@ -4,28 +4,23 @@ examples:
   sb3-quad benchmark                                   everything, about a minute
   sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
   sb3-quad benchmark --training                        rollouts and updates of trainings
-  sb3-quad benchmark --algo ppo_bc --conf-file robust/ppo_bc.yml --output benchmark.json
+  sb3-quad benchmark --algo ppo_bc --conf-file robust/ppo_bc.yml
 """
 
 import argparse
 import itertools
-import json
-import platform
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from functools import partial
-from importlib import metadata
 from timeit import Timer
 from typing import Any
 
-from sb3_quad.base.files import write_text
 from sb3_quad.cli.parser import YES_OR_NO, Parser, above_zero, positive
 
 ENV_ID = "QuadTargetTracking-v0"
 TRAINED = "QuadStateRecovery-v0"  # in the training loops
 REPETITIONS = 5
-PACKAGES = ("sb3_quad", "stable_baselines3", "gymnasium", "torch", "numpy", "numba", "pybullet")
 Rates = dict[str, list[float]]  # control steps per second of each repetition, all environments together
 
 
@@ -37,14 +32,11 @@ def add_arguments(parser: Parser) -> None:
     add("--algo", nargs="+", default=["dagger", "ppo_bc"], help="algorithms of the training loops (dagger ppo_bc)")
     add("-conf", "--conf-file", metavar="FILE", help="its settings (ALGO.yml)")
     add("--training", help="only, or no, training loops: their rollouts and updates", **YES_OR_NO)
-    add("--output", metavar="FILE", help="write everything as JSON, with versions and thread counts")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure one way after another, print, write. Returns the exit code."""
-    import numba
+    """Measure one way after another, print. Returns the exit code."""
     import numpy as np
-    import torch
 
     from sb3_quad.cli.output import console
     from sb3_quad.evaluation.tables import text_table
@@ -62,16 +54,6 @@ def run(options: argparse.Namespace) -> int:
     texts = [(f"{rate:,.0f}", f"{rate / median[0]:,.1f} x") for rate in median]
     rows = [(name, f"{n:,}", *text) for (name, n, _), text in zip(found, texts, strict=True)]
     screen.print(text_table("control steps per second (median of 5)", ("", "rows", "steps/s", "to the first line"), rows))
-    if options.output is not None:
-        machine = {
-            "machine": platform.platform(),
-            "python": platform.python_version(),
-            "versions": {package: metadata.version(package) for package in PACKAGES},
-            "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
-        }
-        results = [{"name": name, "n_envs": n, "rates": each} for name, n, each in found]
-        write_text(options.output, json.dumps({"machine": machine, "results": results}, indent=2) + "\n")
-        print(f"written to {options.output}")
     return 0
 
 

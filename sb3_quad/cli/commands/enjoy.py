@@ -148,7 +148,8 @@ def _check(options: argparse.Namespace, window: bool) -> None:
 def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     """What is flown, a :class:`~sb3_quad.show.episodes.Setting`, and who flies, by label."""
     from sb3_quad.cli.output import warn
-    from sb3_quad.evaluation.controllers import ControllerSpec, build, parse_controllers
+    from sb3_quad.controllers.resolve import resolve_expert
+    from sb3_quad.evaluation.controllers import ControllerSpec, parse_controllers
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
     from sb3_quad.simulation.settings import FlightSettings
     from sb3_quad.vehicles.vehicle import first_vehicle
@@ -173,7 +174,7 @@ def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
     vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
-        controllers[spec.label] = build(spec, vehicle)
+        controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller")
         own[spec.label] = {name: value for name, value in spec.observed.items() if name not in options.env_kwargs}
     return setting._replace(own=own), controllers
 

@@ -12,7 +12,6 @@ examples:
   sb3-quad evaluate pid agent.zip --suite quick                a quick look, in less than a minute
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
-  sb3-quad evaluate agent.zip --scaling both --scenario tracking    Fig. 4.7: μ measured, α by Eq. 4.10
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
   sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
@@ -32,14 +31,13 @@ DEFAULT_FOLDER = "evaluations"
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
-    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, quadcopters, quick, or a YAML file")
+    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, wind, quadcopters, quick or a file")
     add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
     add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
     add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
     add("--seed", type=whole, metavar="N", help="seed of each scenario, instead of its own")
     add("--vehicle", metavar="V", help="vehicle for all, by name or YAML file (each agent's own, where the suite names none)")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
-    add("--scaling", default="none", metavar="KIND", help="none (default), adaptive (the thesis's μ and α, 4.3.1) or both")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
     add("--overwrite", action="store_true", help="remove the results that the folder holds")
     add("--report", default=True, help="update report.html and its plots (yes)", **YES_OR_NO)
@@ -56,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.evaluation.scenarios.load import load_suite
 
     suite = load_suite(options.suite).with_changes(options.scenario, options.episodes, options.seed, options.vehicle)
-    controllers = parse_controllers(options.controllers, options.scaling)
+    controllers = parse_controllers(options.controllers)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
     start = time.perf_counter()
     with progress_bar(options.progress) as show:

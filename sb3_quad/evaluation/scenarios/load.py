@@ -27,6 +27,8 @@ UNITS = dict(
     noise="relative std",
     factor="× the wrench",
     gusts="std, N",
+    wind="m/s",
+    wind_gusts="std, m/s",
     duration="s",
 )
 WEIGHTS = {"force": "weights", "torque": "weights × arm length"}  # units of wrenches whose unit is weight
