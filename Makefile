@@ -62,15 +62,15 @@ AGENTS ?= any-quadcopter crazyflie-robust
 OTHERS := examples/other_simulators
 TRANSFER_FILES := build/transfer
 FLOWN := cf2x_L250 cf21B_500 rotorpy_crazyflie rotorpy_hummingbird crazyflie
-TRANSFER_PY := OMP_NUM_THREADS=1 TRANSFER_FILES=$(abspath $(TRANSFER_FILES)) $(TRANSFER_VENV)/bin/python -W ignore
+TRANSFER_PY := OMP_NUM_THREADS=1 TRANSFER_FILES=. $(abspath $(TRANSFER_VENV))/bin/python -W ignore
 
 test-transfer: $(TRANSFER_INSTALLED) transfer-files
-	$(TRANSFER_PY) -m pytest -q -c /dev/null --rootdir $(OTHERS) $(OTHERS) $(ARGS)
+	cd $(TRANSFER_FILES) && $(TRANSFER_PY) -m pytest -q -c /dev/null --rootdir $(abspath $(OTHERS)) $(abspath $(OTHERS)) $(ARGS)
 
 transfer-table: $(TRANSFER_INSTALLED) transfer-files
 	@cd $(TRANSFER_FILES) && for where in crazyflow,"--delay 0 1" rotorpy, l2f,; do \
 		echo; echo "In $${where%%,*}:"; echo; \
-		OMP_NUM_THREADS=1 $(abspath $(TRANSFER_VENV))/bin/python -W ignore $(abspath $(OTHERS))/in_$${where%%,*}.py *.onnx $${where#*,} $(ARGS); \
+		$(TRANSFER_PY) $(abspath $(OTHERS))/in_$${where%%,*}.py *.onnx $${where#*,} $(ARGS); \
 	done; echo; echo "In sb3_quad:"; echo; \
 	PYTHONPATH=$(CURDIR) $(abspath $(PY)) $(abspath $(OTHERS))/in_own.py *.onnx --delay 0 1 $(ARGS)
 
@@ -79,7 +79,7 @@ transfer-files: $(INSTALLED)
 	@rm -rf $(TRANSFER_FILES) && mkdir -p $(TRANSFER_FILES)
 	@for agent in $(AGENTS); do name=$$(basename $$agent .zip); for vehicle in $(FLOWN); do \
 		case $$name@$$vehicle in crazyflie*@*hummingbird) continue;; esac; \
-		$(PY) -m sb3_quad.cli export $$agent --format onnx --vehicle $$vehicle -o $(TRANSFER_FILES)/$$name@$$vehicle.onnx >/dev/null 2>&1 || exit 1; \
+		$(PY) -m sb3_quad.cli export $$agent --format onnx --vehicle $$vehicle -o $(TRANSFER_FILES)/$$name@$$vehicle.onnx >/dev/null || exit 1; \
 	done; done
 
 test-extras:
