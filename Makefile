@@ -16,7 +16,7 @@ LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all fuzz test-zoo test-transfer transfer-table transfer-files test-extras lint format type links commit-checks clean
+.PHONY: help install train test test-all fuzz test-zoo test-transfer transfer-table transfer-files test-extras lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -31,6 +31,7 @@ help:
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
 	@echo "make type           check types"
+	@echo "make type-demo      check types of the demo's page (npx fetches the compiler)"
 	@echo "make commit-checks  format, type and lint"
 	@echo "make clean          remove what was built and cached; logs/ and $(VENV)/ stay"
 
@@ -96,6 +97,10 @@ format: $(INSTALLED)
 
 type: $(INSTALLED) links
 	$(PY) -m mypy
+
+# The page's scripts are JavaScript with types in comments.
+type-demo:
+	npx --yes --package typescript@5 tsc -p sb3_quad/show/demo/jsconfig.json
 
 # mypy and import-linter do not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: links do.
 links:

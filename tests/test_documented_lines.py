@@ -32,6 +32,7 @@ SHORTER = {  # flags that a command is given beside those that stand there
     "sweep": ["--dry-run"],
     "train": ["--eval-episodes", "2", "--no-progress"],
     "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", "--no-progress"],
+    "demo": ["--overwrite"],
     "benchmark": ["--seconds", "0.02", "--sizes", "8"],
     "check-vehicle": ["-n", "2"],
 }

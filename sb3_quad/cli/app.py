@@ -22,6 +22,7 @@ EPILOG = """examples:
   sb3-quad evaluate pid agent.zip --suite quick                           an agent and an expert in one table
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flights in a window
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -o film.mp4     or as a film
+  sb3-quad demo                                                           a page in which anyone can throw the quadcopter
   sb3-quad train --help                                                   all options of a command, with examples
 
 exit codes:

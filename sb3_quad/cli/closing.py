@@ -115,5 +115,6 @@ def _print_next(run: RunFolder) -> None:
     agent, label = shlex.quote(str(run.result)), shlex.quote(f"{run.path.parent.name}_{run.path.name}")
     vehicle = " --vehicle itm" if agent_settings(run.result)[0].vehicles else ""  # else the one that it was trained on
     print(f"next:\n  sb3-quad enjoy {agent} --env {run.name} -o {label}.png")
+    print(f"  sb3-quad demo {agent} pid -o {label}.html")
     print(f"  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}")
     print(f"  sb3-quad export {agent} --format torchscript{vehicle}")

@@ -1,0 +1,203 @@
+/**
+ * The two experts on the true state, as sb3_quad/experts/{pid,geometric}.py have them. docs/experts.md explains their laws.
+ *
+ * @typedef {import("./vehicle.js").Vehicle} Vehicle
+ * @typedef {(state: Float64Array, actions: Float32Array) => void} Law writes the four actions for a state
+ */
+import { rotation } from "./dynamics.js";
+import { armsOf, commandLag, hoverThrust, thrustRange } from "./vehicle.js";
+
+const { sqrt, min, max, abs, atan2, sin, cos } = Math;
+
+/** Rotor thrusts from [ΣF, Mx, My, Mz], (4, 4), by Gauss and Jordan. @param {Vehicle} v */
+export function mixerInverse(v) {
+  const rows = [[1, 1, 1, 1], ...armsOf(v)].map((row, i) => [...row, ...[0, 1, 2, 3].map((k) => (k === i ? 1 : 0))]);
+  for (let k = 0; k < 4; k++) {
+    const best = rows.slice(k).reduce((far, row, j) => (abs(row[k]) > abs(rows[far][k]) ? k + j : far), k);
+    [rows[k], rows[best]] = [rows[best], rows[k]];
+    rows[k] = rows[k].map((each) => each / rows[k][k]);
+    for (let j = 0; j < 4; j++) if (j !== k) rows[j] = rows[j].map((each, i) => each - rows[j][k] * rows[k][i]);
+  }
+  return rows.map((row) => row.slice(4));
+}
+
+/** @param {number} value */
+const clipped = (value) => min(1, max(-1, value));
+
+/** The thesis's PID controller (Table A.1). @param {Vehicle} v @returns {Law} */
+export function pid(v, kp = 1.5, ki = 50, kd = 4.1, frequency = 9, damping = 1) {
+  const mixer = mixerInverse(v);
+  const [low, high] = thrustRange(v);
+  const [middle, half] = [(high + low) / 2, (high - low) / 2];
+  const stiff = v.inertia.map((i) => i * frequency ** 2), damp = v.inertia.map((i) => i * 2 * damping * frequency);
+  const { mass, gravity: g } = v;
+  const kiDt = ki * v.control_step;
+  return (s, actions) => {
+    const ex = s[17] - s[0], ey = s[18] - s[1], ez = s[19] - s[2];
+    const r = rotation(s);
+    const roll = atan2(r[7], r[8]), pitch = Math.asin(clipped(-r[6])), yaw = atan2(r[3], r[0]);
+    const [vx, vy, vz] = [s[7], s[8], s[9]];
+    const ax = kp * ex - kd * (r[0] * vx + r[3] * vy + r[6] * vz);
+    const ay = kp * ey - kd * (r[1] * vx + r[4] * vy + r[7] * vz);
+    const az = kp * ez - kd * (r[2] * vx + r[5] * vy + r[8] * vz);
+    const rollDes = (0.25 * (ax * sin(yaw) - ay * cos(yaw))) / g;
+    const pitchDes = (0.25 * (ax * cos(yaw) + ay * sin(yaw))) / g;
+    const u = [
+      mass * (g + az + kiDt * ez),
+      stiff[0] * (rollDes - roll) - damp[0] * s[10],
+      stiff[1] * (pitchDes - pitch) - damp[1] * s[11],
+      -stiff[2] * yaw - damp[2] * s[12],
+    ];
+    const thrusts = mixer.map((m) => m[0] * u[0] + m[1] * u[1] + m[2] * u[2] + m[3] * u[3]);
+    const largest = max(...thrusts);
+    const scale = largest > high ? high / largest : 1;
+    for (let k = 0; k < 4; k++) actions[k] = clipped((max(low, scale * thrusts[k]) - middle) / half);
+  };
+}
+
+/** Gains for a vehicle whose file has none. @param {Vehicle} v @returns {Object<string, number>} */
+export function derivedGains(v) {
+  const [low, high] = thrustRange(v);
+  const moment = armsOf(v).map((arm) => (arm.reduce((sum, each) => sum + abs(each), 0) * (high - low)) / 2);
+  const turn = min(moment[0] / v.inertia[0], moment[1] / v.inertia[1]), lag = commandLag(v), g = v.gravity;
+  const least = low / hoverThrust(v), most = max(high / hoverThrust(v), 1.01);
+  const rate = min(1 / (lag + 1 / sqrt(turn)), 0.438 / lag);
+  const sideways = sqrt(most ** 2 - 1), upwards = g * (most - 1);
+  return {
+    position: 0.271 * rate,
+    velocity: 0.458 * rate,
+    height_position: 0.446 * rate,
+    height_velocity: 0.748 * rate,
+    deceleration: 0.571 * g * sideways,
+    height_deceleration: 0.822 * upwards,
+    descent: g * min(0.9, 1.56 * (1 - least)),
+    tilt: 0.979 * sideways,
+    attitude: 1.19 * rate,
+    angular_deceleration: 1.81 * turn,
+    body_rates: 0.685 / lag,
+    yaw_rate: 0.11 / lag,
+    descent_deceleration: 0.408 * upwards,
+  };
+}
+
+/**
+ * Speed towards a target from which it can be braked.
+ * @param {number} distance
+ * @param {number} gain
+ * @param {number} deceleration
+ */
+function brakingProfile(distance, gain, deceleration) {
+  return (deceleration / gain) * (sqrt(1 + (2 * gain * gain * distance) / deceleration) - 1);
+}
+
+/** The geometric controller for large angles. @param {Vehicle} v @returns {Law} */
+export function geometric(v) {
+  /** @type {any} */
+  const gains = v.geometric_gains ?? derivedGains(v);
+  const mixer = mixerInverse(v);
+  const [low, high] = thrustRange(v);
+  const [ixx, iyy, izz] = v.inertia;
+  const lag = commandLag(v);
+  return (s, actions) => {
+    const r = rotation(s);
+    const [p, q, w] = [s[10], s[11], s[12]];
+    const [fx, fy, fz] = desiredForce([s[17] - s[0], s[18] - s[1], s[19] - s[2]], [s[7], s[8], s[9]], gains, v.gravity);
+    const size = sqrt(fx * fx + fy * fy + fz * fz);
+    const body = [0, 1, 2].map((k) => (r[k] * fx + r[3 + k] * fy + r[6 + k] * fz) / size);
+    const [b1, b2, b3] = rotated(body, p, q, w, lag);
+    const [nx, ny, rate] = wantedTurn(b1, b2, b3, p, q, gains);
+    const mx = ixx * (gains.body_rates * (rate * nx - p) + w * rate * ny) + (izz - iyy) * q * w;
+    const my = iyy * (gains.body_rates * (rate * ny - q) - w * rate * nx) + (ixx - izz) * w * p;
+    allocate(v.mass * size * b3, mx, my, -gains.yaw_rate * izz * w, mixer, low, high, actions);
+  };
+}
+
+/**
+ * Desired force of the rotors per mass, world frame, m/s².
+ * @param {number[]} e
+ * @param {number[]} v
+ * @param {any} gains
+ * @param {number} g
+ */
+function desiredForce([ex, ey, ez], [vx, vy, vz], gains, g) {
+  const distance = sqrt(ex * ex + ey * ey);
+  const speed = distance > 0 ? brakingProfile(distance, gains.position, gains.deceleration) / distance : gains.position;
+  const fx = gains.velocity * (speed * ex - vx), fy = gains.velocity * (speed * ey - vy);
+  const deceleration = ez > 0 ? gains.height_deceleration : gains.descent_deceleration;
+  const rise = (ez < 0 ? -1 : 1) * brakingProfile(abs(ez), gains.height_position, deceleration);
+  const fz = max(0.1 * g, g + max(-gains.descent, gains.height_velocity * (rise - vz)));
+  const horizontal = sqrt(fx * fx + fy * fy), limit = gains.tilt * fz;
+  const scale = horizontal > limit ? limit / horizontal : 1;
+  return [scale * fx, scale * fy, fz];
+}
+
+/**
+ * A direction fixed in the world as the body sees it some time later.
+ * @param {number[]} b
+ * @param {number} p
+ * @param {number} q
+ * @param {number} r
+ * @param {number} time
+ */
+function rotated([b1, b2, b3], p, q, r, time) {
+  const rate = sqrt(p * p + q * q + r * r);
+  if (rate < 1e-9) return [b1, b2, b3];
+  const n1 = p / rate, n2 = q / rate, n3 = r / rate;
+  const cosine = cos(rate * time), sine = -sin(rate * time);
+  const along = (n1 * b1 + n2 * b2 + n3 * b3) * (1 - cosine);
+  return [
+    cosine * b1 + sine * (n2 * b3 - n3 * b2) + along * n1,
+    cosine * b2 + sine * (n3 * b1 - n1 * b3) + along * n2,
+    cosine * b3 + sine * (n1 * b2 - n2 * b1) + along * n3,
+  ];
+}
+
+/**
+ * Axis and rate that turn the thrust to a direction, the long way round where the spin makes that quicker.
+ * @param {number} b1
+ * @param {number} b2
+ * @param {number} b3
+ * @param {number} p
+ * @param {number} q
+ * @param {any} gains
+ */
+function wantedTurn(b1, b2, b3, p, q, gains) {
+  const braking = gains.angular_deceleration;
+  const sine = sqrt(b1 * b1 + b2 * b2);
+  let angle = atan2(sine, b3);
+  let [nx, ny] = sine > 1e-9 ? [-b2 / sine, b1 / sine] : [1, 0];
+  const along = p * nx + q * ny;
+  const short = -along + 2 * sqrt(0.5 * along * along + braking * angle);
+  const long = along + 2 * sqrt(0.5 * along * along + braking * (2 * Math.PI - angle));
+  if (long < short) [nx, ny, angle] = [-nx, -ny, 2 * Math.PI - angle];
+  return [nx, ny, brakingProfile(angle, gains.attitude, braking)];
+}
+
+/**
+ * Roll and pitch before thrust, thrust before yaw, within every rotor's limits.
+ * @param {number} thrust
+ * @param {number} mx
+ * @param {number} my
+ * @param {number} mz
+ * @param {number[][]} mixer
+ * @param {number} low
+ * @param {number} high
+ * @param {Float32Array} actions
+ */
+function allocate(thrust, mx, my, mz, mixer, low, high, actions) {
+  const middle = (high + low) / 2, half = (high - low) / 2;
+  const differences = mixer.map((m) => m[1] * mx + m[2] * my);
+  const largest = max(...differences.map(abs));
+  const scale = largest > half ? half / largest : 1;
+  const most = max(0, ...differences), least = min(0, ...differences);
+  const common = min(high - scale * most, max(low - scale * least, min(high, max(low, thrust / 4))));
+  let share = 1;
+  for (let k = 0; k < 4; k++) {
+    const each = common + scale * differences[k], yaw = mixer[k][3] * mz;
+    const room = yaw > 0 ? high - each : each - low;
+    if (abs(yaw) * share > room) share = max(0, room / abs(yaw));
+  }
+  for (let k = 0; k < 4; k++) {
+    actions[k] = clipped((common + scale * differences[k] + share * mixer[k][3] * mz - middle) / half);
+  }
+}

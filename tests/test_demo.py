@@ -1,0 +1,401 @@
+"""The page of ``sb3-quad demo``: its model flies what Python flies, it reads zips, and in a browser it can be thrown."""
+
+import functools
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import A2C, PPO, SAC, TD3
+
+from sb3_quad.cli import main
+from sb3_quad.controllers.agent_settings import env_kwargs
+from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.controllers.resolve import resolve_expert
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.controllers import parse_controllers
+from sb3_quad.show.demo.page import DEFAULT_AGENTS, LIMIT, MODEL, describe, make_page, numbers, pack, script
+from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
+
+STEPS = 1000  # control steps
+NODE = shutil.which("node")
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+HARNESS = """
+const { readFileSync } = await import("node:fs");
+const job = JSON.parse(readFileSync(0, "utf8"));
+let agent = job.agent ?? { label: "given", kind: "pid" };
+if (agent.shapes) agent.layers = await unpackLayers(agent);
+if (job.zip) {
+  const bytes = new Uint8Array(readFileSync(job.zip));
+  try {
+    agent = (await readAgent("dropped", bytes.buffer)).agent;
+  } catch (error) {
+    console.log(JSON.stringify(error.message));
+    process.exit();
+  }
+}
+if (job.observations) {
+  console.log(JSON.stringify(job.observations.map((each) => [...forward(agent.layers, Float32Array.from(each))])));
+  process.exit();
+}
+const flight = new Flight(job.vehicle, agent);
+if (job.world) flight.setWorld(job.world, 0);
+flight.begin(job.start);
+const path = [];
+for (let k = 0; k < job.steps; k++) {
+  flight.step({ ...NO_WRENCH, ...job.wrench }, job.actions ? job.actions[k] : flight.act());
+  path.push([...flight.state]);
+}
+console.log(JSON.stringify(path));
+"""
+
+node = pytest.mark.skipif(NODE is None, reason="there is no node on this machine")
+chromium = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+
+
+def in_node(tmp_path, **job):
+    """What the page's model answers, without a browser."""
+    file = tmp_path / "model.mjs"
+    file.write_text(script(MODEL) + HARNESS)
+    done = subprocess.run([NODE, str(file)], input=json.dumps(job), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+def start_of(env):
+    """How the episode of an environment's only row begins."""
+    state = env.true_state()
+    names = {"position": "position", "quaternion": "quaternion", "velocity": "velocity", "rates": "body_rates"}
+    return {ours: getattr(state, theirs)[0].tolist() for ours, theirs in {**names, "target": "target"}.items()}
+
+
+def fly(env, actions, steps=STEPS):
+    """The states, (steps, 20), that follow the present one; ``actions(observation, step)``."""
+    observation, path = env.observe(), []
+    for step in range(steps):
+        observation, _, dones, _ = env.step(actions(observation, step))
+        assert not dones[0]
+        path.append(env.true_state().array[:, 0].copy())
+    return np.array(path)
+
+
+def apart(ours, theirs):
+    """The largest distance between two paths, m."""
+    return np.linalg.norm(np.array(ours)[:, :3] - theirs[:, :3], axis=1).max()
+
+
+class Env(QuadcopterVecEnv):
+    """One row that begins its first episode, without noise."""
+
+    def __init__(self, **keywords):
+        super().__init__(1, max_episode_steps=10 * STEPS, seed=5, n_threads=1, **{"noise": 0.0, **keywords})
+        self.first = self.reset()
+
+    def observe(self):
+        return self.first
+
+
+BREEZY = {"drag": (0.3, 0.4, 0.2), "motor_gain_up": 30.0, "motor_gain_down": 12.0, "motor_integration": "exact"}
+WORLD = {"mass": 1.2, "motor_gain": 0.7, "thrust": 0.9}
+
+
+@node
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*VEHICLES.names(), "breezy", "other world"])
+def test_given_actions_lead_to_where_python_flies(name, tmp_path):
+    vehicle = load_vehicle("itm" if " " in name or name == "breezy" else name)
+    if name == "breezy":
+        vehicle = vehicle.model_copy(update=BREEZY)
+    task = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}
+    random = {key: [value, value] for key, value in {**WORLD, "delay": 3}.items()} if name == "other world" else None
+    env = Env(task="recovery_and_tracking", vehicle=vehicle, task_kwargs=task, randomize=random)
+    wrench = {"force": [0.2, -0.1, 0.3], "torque": [1e-4, -2e-4, 1e-4], "wind": [3.0, -2.0, 0.5]}
+    env.set_wrench(wrench["force"], wrench["torque"])
+    env.set_wind(wrench["wind"])
+    walk = np.cumsum(0.03 * np.random.default_rng(0).standard_normal((STEPS, 4)), axis=0)
+    actions = np.clip(vehicle.hover_action + walk, -1, 1).astype(np.float32)
+    world = {"mass": 1.2, "motors": 0.7, "thrust": 0.9, "delay": 3} if random else None
+    job = {"vehicle": vehicle.model_dump(mode="json"), "start": start_of(env), "wrench": wrench, "world": world}
+    path = in_node(tmp_path, **job, steps=STEPS, actions=actions.astype(float).tolist())
+    assert apart(path, fly(env, lambda _, step: actions[[step]])) <= 1e-9
+
+
+@node
+@pytest.mark.slow
+@pytest.mark.parametrize("name", VEHICLES.names())
+@pytest.mark.parametrize("expert", ["pid", "geometric", "derived"])
+def test_the_experts_fly_as_in_python(expert, name, tmp_path):
+    vehicle = load_vehicle(name)
+    if expert == "derived":
+        vehicle = vehicle.model_copy(update={"geometric_gains": None})
+    kind = "pid" if expert == "pid" else "geometric"
+    env, law = Env(task="state_recovery", vehicle=vehicle), resolve_expert(kind, vehicle)
+    agent = {"label": kind, "kind": kind}
+    path = in_node(tmp_path, vehicle=vehicle.model_dump(mode="json"), agent=agent, start=start_of(env), steps=STEPS)
+    assert apart(path, fly(env, lambda *_: law.actions(env.true_state()))) <= 1e-6
+
+
+AGENTS = ["itm-imitation", "itm-recovery", "itm-robust", "any-quadcopter"]
+ANY_PLUS = "any-quadcopter", "hummingbird"
+
+
+@node
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("how", "task"),
+    [("float32", "state_recovery"), ("float32", "target_tracking"), ("float16", "state_recovery"), ("zip", "target_tracking")],
+)
+@pytest.mark.parametrize(("name", "vehicle"), [*((name, "itm") for name in AGENTS), ("any-quadcopter", "crazyflie"), ANY_PLUS])
+def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path):
+    """Exact weights, those rounded to half precision (also in Python), and those that the page reads from the zip itself."""
+    (spec,), flown = parse_controllers([name]), load_vehicle(vehicle)
+    model = PPO.load(pretrained(name), device="cpu")
+    described, network = describe(spec)
+    agent = {"label": name, **described, **pack(network, how == "float16")}
+    if how == "float16":
+        own = *model.policy.mlp_extractor.policy_net, model.policy.action_net
+        layers = [part for layer in own for part in layer.parameters()]
+        for part in layers:
+            part.data = part.data.half().float()
+        assert np.abs(numbers(network) - np.concatenate([part.detach().numpy().ravel() for part in layers])).max() > 0
+    env = Env(**{**env_kwargs(name), "task": task, "vehicle": flown, "noise": 0.0, "vehicles": None})
+    start, turn = start_of(env), flown.turn_to(spec.own.layout)
+    if turn.angle:  # the page flies the vehicle in its own axes, Python in those that the agent knows
+        w, x, y, z = start["quaternion"]
+        c, s = math.cos(turn.angle / 2), math.sin(turn.angle / 2)
+        start["quaternion"] = [w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]
+        start["rates"] = (turn.axes.T @ start["rates"]).tolist()
+    source = {"zip": str(pretrained(name))} if how == "zip" else {"agent": agent}
+    path = in_node(tmp_path, vehicle=flown.model_dump(mode="json"), **source, start=start, steps=STEPS)
+    flight = fly(env, lambda observation, _: model.predict(observation, deterministic=True)[0])
+    assert apart(path, flight) <= 1e-4
+    assert np.linalg.norm(flight[-1, :3] - flight[-1, 17:20]) < 0.1
+
+
+KINDS = {
+    "ppo": (PPO, {}),
+    "relu": (PPO, {"policy_kwargs": {"net_arch": [33, 16, 8], "activation_fn": torch.nn.ReLU}}),
+    "squashed": (A2C, {"use_sde": True, "policy_kwargs": {"squash_output": True}}),
+    "sac": (SAC, {"policy_kwargs": {"net_arch": [32, 32]}}),
+    "td3": (TD3, {"policy_kwargs": {"net_arch": [32, 32]}}),
+}
+
+
+@node
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_page_reads_zips_of_any_algorithm(kind, tmp_path):
+    algorithm, keywords = KINDS[kind]
+    model = algorithm("MlpPolicy", Env(), device="cpu", seed=0, **keywords)
+    model.save(tmp_path / "agent.zip")
+    observations = np.random.default_rng(0).standard_normal((5, 18)).astype(np.float32) * 3
+    found = in_node(tmp_path, zip=str(tmp_path / "agent.zip"), observations=observations.astype(float).tolist())
+    expected = model.predict(observations, deterministic=True)[0]
+    np.testing.assert_allclose(np.clip(found, -1, 1), expected, atol=1e-5)
+
+
+@node
+@pytest.mark.slow
+def test_a_zip_that_does_not_fit_is_refused_in_one_line(tmp_path):
+    import gymnasium
+
+    content = pretrained("itm-recovery").read_bytes()
+    PPO("MlpPolicy", gymnasium.make("Pendulum-v1"), device="cpu").save(tmp_path / "pendulum.zip")
+    (tmp_path / "text.zip").write_text("no zip")
+    rebuild = b"torch._utils\n_rebuild_tensor_v2"
+    (tmp_path / "pickled.zip").write_bytes(content.replace(rebuild, rebuild[:-1] + b"9"))
+    expected = {
+        "pendulum": "network takes 3 numbers and gives 1",
+        "text": "this is no zip",
+        "pickled": "torch._utils _rebuild_tensor_v9, which this page does not read",
+    }
+    for name, message in expected.items():
+        assert message in in_node(tmp_path, zip=str(tmp_path / f"{name}.zip"))
+
+
+@pytest.mark.parametrize("given", ["told_geometric", "examples.hover:Hover", "nothere.zip"])
+def test_a_controller_that_the_page_cannot_fly_is_named(given, tmp_path, capsys):
+    assert main(["demo", given, "-o", str(tmp_path / "demo.html")]) == 2
+    said = capsys.readouterr().err
+    assert given in said and said.count("\n") == 1 and not (tmp_path / "demo.html").exists()
+
+
+def test_a_page_is_one_file_that_needs_no_other(tmp_path, capsys):
+    file = tmp_path / "demo.html"
+    assert main(["demo", "two <!--<script> PIDs=pid", "geometric", "--vehicle", "crazyflie", "-o", str(file)]) == 0
+    text = file.read_text()
+    assert not re.search(r"https?://|<link(?! rel=\"icon\" href=\"data:)|src=|@import|url\(|^import |^export ", text, re.M)
+    data = json.loads(text.split('id="data">')[1].split("</script>")[0])
+    assert [agent["label"] for agent in data["agents"]] == ["two <!--<script> PIDs", "geometric"] and data[
+        "vehicle"
+    ] == "crazyflie"
+    assert main(["demo", "pid", "-o", str(file)]) == 2  # exists
+    assert "--overwrite" in capsys.readouterr().err
+
+
+@functools.cache
+def default_page():
+    return make_page(parse_controllers(DEFAULT_AGENTS))
+
+
+@pytest.mark.slow
+def test_the_default_page_is_small():
+    page, _, rounded = default_page()
+    assert len(page.encode()) <= LIMIT
+    assert set(rounded) <= {"itm-robust", "any-quadcopter"} and all(f"{label}" in page for label in rounded)
+
+
+@pytest.mark.slow
+def test_the_scripts_keep_their_types(tmp_path):
+    compiler = shutil.which("tsc")
+    if compiler is None:
+        pytest.skip("there is no tsc on this machine (npm install --global typescript)")
+    from importlib.resources import files
+
+    folder = files("sb3_quad.show.demo")
+    done = subprocess.run([compiler, "-p", str(folder / "jsconfig.json")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout
+
+
+_AT_3_AND_4 = """import fcntl, os, sys
+high = [fcntl.fcntl(int(each), fcntl.F_DUPFD, 10) for each in sys.argv[1:3]]
+for descriptor, each in zip((3, 4), high):
+    os.dup2(each, descriptor)
+os.execv(sys.argv[3], sys.argv[3:])
+"""
+
+
+class Browser:
+    """Headless Chromium at the other end of two pipes (Chrome DevTools Protocol)."""
+
+    def __init__(self, folder):
+        ours, theirs = os.pipe(), os.pipe()
+        arguments = ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}", "--remote-debugging-pipe")
+        command = (sys.executable, "-c", _AT_3_AND_4, str(ours[0]), str(theirs[1]), CHROMIUM, *arguments, "about:blank")
+        nowhere = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self.process = subprocess.Popen(command, pass_fds=(ours[0], theirs[1]), **nowhere)
+        os.close(ours[0])
+        os.close(theirs[1])
+        self.out, self.answers = os.fdopen(ours[1], "wb", 0), os.fdopen(theirs[0], "rb")
+        self.count, self.session, self.errors, self.rest = 0, None, [], b""
+        (page,) = [each for each in self.call("Target.getTargets")["targetInfos"] if each["type"] == "page"]
+        self.session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
+        self.call("Runtime.enable")
+        self.call("Log.enable")
+
+    def call(self, method, **params):
+        self.count += 1
+        message = {"id": self.count, "method": method, "params": params}
+        self.out.write(json.dumps(message | ({"sessionId": self.session} if self.session else {})).encode() + b"\0")
+        while True:
+            while b"\0" not in self.rest:
+                self.rest += self.answers.read1(1 << 16) or pytest.fail("chromium has ended")
+            text, self.rest = self.rest.split(b"\0", 1)
+            answer = json.loads(text)
+            if answer.get("method") in ("Runtime.exceptionThrown", "Log.entryAdded"):
+                self.errors.append(answer["params"])
+            if answer.get("id") == self.count:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def value(self, expression):
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True)
+        assert "exceptionDetails" not in answer, (answer, self.errors)
+        return answer["result"].get("value")
+
+    def wait_for(self, expression):
+        """The first value of an expression that is true, within two minutes."""
+        end = time.monotonic() + 120
+        while time.monotonic() < end:
+            if value := self.value(expression):
+                return value
+            time.sleep(0.05)
+        pytest.fail(f"never true: {expression}; {self.errors}")
+
+    def open(self, file, width, height):
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+        self.call("Page.navigate", url=file.as_uri())
+        self.wait_for("typeof demo === 'object' && demo.frames() > 2")
+
+    def drag(self, start, end):
+        """Press, move within 0.1 s by the events' own clock, and let go while moving."""
+        now = time.time()
+        for k, kind in enumerate(["mousePressed", *9 * ["mouseMoved"], "mouseReleased"]):
+            x, y = (a + (b - a) * min(k, 9) / 9 for a, b in zip(start, end, strict=True))
+            how = {"button": "left", "buttons": 1, "clickCount": 1, "timestamp": now + 0.01 * k}
+            self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **how)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    found = Browser(tmp_path_factory.mktemp("browser"))
+    yield found
+    found.call("Browser.close")
+    found.process.wait(30)
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    file = tmp_path_factory.mktemp("page") / "demo.html"
+    file.write_text(default_page()[0])
+    return file
+
+
+@chromium
+@pytest.mark.slow
+def test_a_throw_comes_back_and_a_push_is_felt(browser, page):
+    browser.open(page, 1280, 800)
+    assert browser.value("demo.fleet.flying.length") == 4
+    browser.wait_for("demo.fleet.flying.some((each) => each.flight.time > 0.5)")  # it flies by itself
+    rounds = browser.value("demo.fleet.rounds")
+    place = "demo.camera.project(demo.player.bodies()[1].position).slice(0, 2)"
+    x, y = browser.value(place)
+    browser.drag((x, y), (x + 60, y - 90))
+    assert browser.value("demo.fleet.rounds") == rounds + 1  # all begin anew, from where they were let go
+    thrown = browser.value("demo.fleet.start")
+    assert np.linalg.norm(thrown["velocity"]) > 0.5
+    geometric = "demo.fleet.entries[1].flight"
+    assert browser.value(f"{geometric}.distance") > 0.3
+    browser.wait_for(f"{geometric}.arrival > 0 && {geometric}.distance < 0.05")
+    browser.wait_for("document.querySelector('#score tr:nth-child(2) td').textContent.includes(' of ')")
+
+    browser.value("document.getElementById('tool-push').click()")
+    x, y = browser.value(place)
+    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, button="left", buttons=1, clickCount=1)
+    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 150, y=y, button="left", buttons=1)
+    browser.wait_for(f"{geometric}.distance > 0.2")
+    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
+    browser.wait_for(f"{geometric}.distance < 0.05")
+
+    assert browser.value("document.getElementById('limit').hidden")
+    browser.value("demo.fleet.vehicle.time_optimal = { 10: 1.5 }")
+    browser.value("demo.player.start('10 m away')")
+    browser.wait_for("document.getElementById('limit').innerText.includes('1.50 s')")
+    assert not browser.errors
+
+
+@chromium
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (390, 844)])
+def test_everything_has_a_name_and_fits(browser, page, width, height):
+    browser.open(page, width, height)
+    assert browser.value("document.documentElement.scrollWidth") <= width
+    nameless = """[...document.querySelectorAll("button, input, select, canvas")].filter((each) =>
+        !(each.ariaLabel || each.textContent.trim() || [...(each.labels ?? [])].some((label) => label.textContent.trim())))
+        .map((each) => each.outerHTML)"""
+    assert browser.value(nameless) == []
+    browser.value("dispatchEvent(new KeyboardEvent('keydown', { key: 'r' }))")
+    assert browser.value("document.querySelector('#start-random').ariaPressed") == "true"
+    browser.value("dispatchEvent(new KeyboardEvent('keydown', { key: ' ' }))")
+    frozen = browser.value("demo.fleet.entries[0].flight.time")
+    frames = browser.value("demo.frames()")
+    browser.wait_for(f"demo.frames() > {frames} + 5")
+    assert browser.value("demo.fleet.entries[0].flight.time") == frozen
+    assert not browser.errors
