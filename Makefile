@@ -3,6 +3,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 ZOO_VENV ?= .venv-zoo
+TRANSFER_VENV ?= .venv-transfer
 ARGS ?=
 MINUTES ?= 10
 
@@ -10,11 +11,12 @@ PY := $(VENV)/bin/python
 INSTALL := $(PY) -m pip install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
 INSTALLED := $(VENV)/.installed
 ZOO_INSTALLED := $(ZOO_VENV)/.installed
+TRANSFER_INSTALLED := $(TRANSFER_VENV)/.installed
 LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all fuzz test-zoo test-extras lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all fuzz test-zoo test-transfer transfer-table transfer-files test-extras lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -23,6 +25,8 @@ help:
 	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
 	@echo "make test-zoo       run the tests that need rl_zoo3 or Ray, in an environment of its own"
+	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
+	@echo "make transfer-table print the table of docs/export.md about it, ARGS=\"-n 64 --seed 2\""
 	@echo "make test-extras    install each extra into an empty environment, as README says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
@@ -53,6 +57,31 @@ fuzz: $(INSTALLED)
 
 test-zoo: $(ZOO_INSTALLED)
 	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py $(ARGS)
+
+# Shipped agents as NAME@VEHICLE.onnx; AGENTS="any-quadcopter run/agent.zip" others.
+AGENTS ?= any-quadcopter crazyflie-robust
+OTHERS := examples/other_simulators
+TRANSFER_FILES := build/transfer
+FLOWN := cf2x_L250 cf21B_500 rotorpy_crazyflie rotorpy_hummingbird crazyflie
+TRANSFER_PY := OMP_NUM_THREADS=1 TRANSFER_FILES=. $(abspath $(TRANSFER_VENV))/bin/python -W ignore
+
+test-transfer: $(TRANSFER_INSTALLED) transfer-files
+	cd $(TRANSFER_FILES) && $(TRANSFER_PY) -m pytest -q -c /dev/null --rootdir $(abspath $(OTHERS)) $(abspath $(OTHERS)) $(ARGS)
+
+transfer-table: $(TRANSFER_INSTALLED) transfer-files
+	@cd $(TRANSFER_FILES) && for where in crazyflow,"--delay 0 1" rotorpy, l2f,; do \
+		echo; echo "In $${where%%,*}:"; echo; \
+		$(TRANSFER_PY) $(abspath $(OTHERS))/in_$${where%%,*}.py *.onnx $${where#*,} $(ARGS); \
+	done; echo; echo "In sb3_quad:"; echo; \
+	PYTHONPATH=$(CURDIR) $(abspath $(PY)) $(abspath $(OTHERS))/in_own.py *.onnx --delay 0 1 $(ARGS)
+
+# A crazyflie-robust flies the crazyflies only.
+transfer-files: $(INSTALLED)
+	@rm -rf $(TRANSFER_FILES) && mkdir -p $(TRANSFER_FILES)
+	@for agent in $(AGENTS); do name=$$(basename $$agent .zip); for vehicle in $(FLOWN); do \
+		case $$name@$$vehicle in crazyflie*@*hummingbird) continue;; esac; \
+		$(PY) -m sb3_quad.cli export $$agent --format onnx --vehicle $$vehicle -o $(TRANSFER_FILES)/$$name@$$vehicle.onnx >/dev/null || exit 1; \
+	done; done
 
 test-extras:
 	PYTHON=$(PYTHON) .ci/extras $(ARGS)
@@ -101,6 +130,12 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt | $(PY)
 		echo "Installing into $(VENV), pinned by constraints.txt; some minutes the first time ..."; \
 		$(INSTALL) setuptools hatchling && $(INSTALL) --no-build-isolation --editable '.[dev]' && echo "$(CURDIR)" >$@; \
 	fi
+
+# Simulators of others, without this package: they fly its exported files.
+$(TRANSFER_INSTALLED): examples/other_simulators/requirements.txt
+	$(PYTHON) -m venv $(TRANSFER_VENV)
+	@$(TRANSFER_VENV)/bin/python -m pip install --quiet --no-compile --disable-pip-version-check --requirement $<
+	@touch $@
 
 # Ray and rl_zoo3, in an environment that borrows all others.
 $(ZOO_INSTALLED): constraints.txt $(INSTALLED)

@@ -1,0 +1,55 @@
+"""``make test-transfer``: each simulator turns as its rotors say, and the shipped agents, exported, fly in it."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from flights import ExportedAgent, check_rotors, fly
+from in_crazyflow import CELLS as CRAZYFLOW
+from in_l2f import CELLS as L2F
+from in_rotorpy import CELLS as ROTORPY
+
+FILES = Path(os.environ["TRANSFER_FILES"])
+MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {"l2f": L2F["crazyflie"].make}
+MAKERS |= {f"rotorpy {name}": ROTORPY[name].make for name in ("crazyflie", "hummingbird")}
+
+
+@pytest.mark.parametrize("name", MAKERS)
+def test_one_rotor_at_a_time_turns_the_body_to_its_side(name):
+    check_rotors(MAKERS[name])
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2, 3], [3, 2, 1, 0], [1, 2, 3, 0]])
+@pytest.mark.parametrize("name", MAKERS)
+def test_rotors_in_a_wrong_order_are_noticed(name, order):
+    def mistaken(n):
+        simulator = MAKERS[name](n)
+        simulator.rotors = simulator.rotors[order]
+        return simulator
+
+    with pytest.raises(SystemExit, match="turn the body"):
+        check_rotors(mistaken)
+
+
+def test_a_file_for_other_rotors_is_refused():
+    with pytest.raises(SystemExit, match="export for that --vehicle"):
+        ExportedAgent(str(FILES / "any-quadcopter@rotorpy_crazyflie.onnx"), CRAZYFLOW["cf21B_500"].make(4))
+
+
+@pytest.mark.parametrize(
+    ("make", "file", "least"),
+    [
+        (MAKERS["crazyflow cf21B_500"], "any-quadcopter@cf21B_500", 0.97),
+        (MAKERS["crazyflow cf2x_L250"], "any-quadcopter@cf2x_L250", 0.65),
+        (MAKERS["rotorpy crazyflie"], "any-quadcopter@rotorpy_crazyflie", 0.97),
+        (MAKERS["rotorpy hummingbird"], "any-quadcopter@rotorpy_hummingbird", 0.97),
+        (MAKERS["l2f"], "any-quadcopter@crazyflie", 0.9),
+    ],
+)
+@pytest.mark.parametrize("task", ["targets", "recoveries"])
+def test_exported_agents_fly(task, make, file, least):
+    simulator = make(32)
+    flights = fly(simulator, ExportedAgent(str(FILES / f"{file}.onnx"), simulator), task, seed=3, noise=0.05, delay=0)
+    assert flights.succeeded.mean() >= least
+    assert np.median(flights.error[flights.survived]) < 0.03
