@@ -5,7 +5,7 @@ step after which |r - r_T| is within it; the path is that of the whole episode, 
 """
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
@@ -25,6 +25,7 @@ from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
+NEAR = 0.1  # m, of arrival, where it is among the tolerances; else the tightest is
 ACTIONS = quadcopter_spaces()[1]
 TILT, RATE, HOLD = np.radians(45.0), 2.0, 0.2  # stable: tilt (rad), roll and pitch rate (rad/s) below these, for so long (s)
 
@@ -43,7 +44,7 @@ class Flights:
     time_to: Mapping[float, FloatArray]
     # By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or was lost.
     time_to_stay: Mapping[float, FloatArray]
-    overshoot: FloatArray  # (n,), largest |r - r_T| since it was first within the tightest tolerance, m; NaN if it never was
+    overshoot: FloatArray  # (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
     path_length: FloatArray  # (n,), m, over the whole episode
     final_error: FloatArray  # (n,), |r - r_T| at the end, m
     final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
@@ -69,6 +70,12 @@ class Flights:
             else:
                 columns[name] = np.concatenate(values)
         return Flights(**columns)
+
+
+def arrival_tolerance(tolerances: Iterable[float]) -> float:
+    """The tolerance, m, by which overshoot and the time to stay are judged."""
+    known = [*tolerances]
+    return NEAR if NEAR in known else min(known)
 
 
 class Hook:
@@ -156,7 +163,7 @@ def _fly_fleet(
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     stays = times.copy()
-    first = times[int(np.argmin(limits))] if len(limits) else np.full(n, np.nan)  # touch of the tightest; a view
+    first = times[[*tolerances].index(arrival_tolerance(tolerances))] if len(limits) else np.full(n, np.nan)  # a view
     flights = Flights(
         success=np.zeros(n, dtype=np.bool_),
         survival=np.ones(n, dtype=np.bool_),

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
+from sb3_quad.evaluation.flights import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
 from sb3_quad.evaluation.scenarios.load import axis_name
@@ -39,14 +40,16 @@ def stay_row(tolerance: float) -> Row:
 
 def metric_cells(metrics: Metrics) -> Cells:
     """Everything that was measured of a controller in a scenario."""
+    near = arrival_tolerance(each.tolerance for each in metrics.arrivals)
+    arrival = next(each for each in metrics.arrivals if each.tolerance == near)
     cells = {
         SUCCESS: _share(metrics.success),
         SURVIVAL: _share(metrics.survival),
         REWARD: _mean(metrics.reward),
         FLOWN: _mean(metrics.flown),
-        **{time_row(arrival.tolerance): _moment(arrival) for arrival in metrics.arrivals},
-        **{stay_row(arrival.tolerance): _moment(arrival.stays, "do") for arrival in metrics.arrivals},
-        LEAVES: Cell(words="–") if metrics.arrivals[0].leaves is None else _share(metrics.arrivals[0].leaves),
+        stay_row(near): _moment(arrival.stays, "do"),
+        **{time_row(each.tolerance): _moment(each) for each in metrics.arrivals},
+        LEAVES: Cell(words="–") if arrival.leaves is None else _share(arrival.leaves),
         OVERSHOOT: Cell(metrics.overshoot, words="–"),
         PATH: _mean(metrics.path),
         MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
@@ -157,7 +160,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
         return [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
-    times = [stay_row(tolerances[0]), LEAVES, OVERSHOOT, *map(time_row, tolerances)]
+    times = [stay_row(arrival_tolerance(tolerances)), LEAVES, OVERSHOOT, *map(time_row, tolerances)]
     return [SUCCESS, SURVIVAL, REWARD, *times, PATH, SIDEWAYS, MEDIAN, QUANTILE]
 
 

@@ -46,7 +46,7 @@ class Metrics(Frozen):
     reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
     flown: Estimate = Field(description="mean time flown, until lost or the end, s")
     arrivals: list[Arrival] = Field(description="by tolerance, the tightest first")
-    overshoot: float | None = Field(description="median of the largest |r - r_T| since the tightest tolerance, m")
+    overshoot: float | None = Field(description="median of the largest |r - r_T| since arrival, m")
     path: Estimate | None = Field(description="mean length of the path over the whole episode, m")
     final_error: Estimate | None = Field(description="mean |r - r_T| at the end, m")
     final_error_median: float | None = Field(description="m")
