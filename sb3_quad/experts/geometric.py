@@ -36,8 +36,8 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
 
     Found together for ITM, Crazyflie, Hummingbird, one with slow motors, and vehicles of the distribution ``raptor``, told.
     The scales are the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest angular acceleration a_φ
-    about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards,
-    g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust limits in hover thrusts.
+    about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1),
+    sideways at constant height, g √(c² - 1), and downwards, g (1 - l), with thrust limits l and c in hover thrusts.
     """
     derived = _derived_gains(vehicle.parameters()[:, None], vehicle.control_step)
     return GeometricGains.model_validate({name: float(value[0]) for name, value in derived.items()})
@@ -109,8 +109,8 @@ class GeometricExpert(Expert):
     thrust direction only, before the yaw, as in Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control"
     (IEEE Trans. Control Systems Technology 28(2), 2020), since no task here asks for a heading. What it adds to them:
     velocities and body rates that the vehicle can brake from, the attitude as it will be when the command acts, the long
-    way round where the spin makes that quicker, and rotor thrusts that give up yaw before thrust and thrust before tilt. Its actions are a
-    function of what the 18 observed features hold; it has no state.
+    way round where the spin makes that quicker, and rotor thrusts that give up yaw before thrust and thrust before tilt.
+    Its actions are a function of what the 18 observed features hold; it has no state.
 
     :param vehicle: name, YAML path or Vehicle it is designed for.
     :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
