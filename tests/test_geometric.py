@@ -100,7 +100,7 @@ def test_it_recovers_from_nearly_every_start_and_is_quick_to_a_target() -> None:
     recovery = fly(EXPERT, "state_recovery", 1920, 13, max_steps=600, noise=0.0)
     tracking = fly(EXPERT, "target_tracking", 480, 13, max_steps=800, noise=0.0)
     assert recovery.success.mean() >= 0.998
-    assert tracking.success.all() and tracking.time_to[0.1].mean() < 3.0
+    assert tracking.success.all() and tracking.time_to[0.1].mean() < 2.6
     assert tracking.final_error.max() < 0.01
 
 

@@ -241,3 +241,9 @@ def test_a_layout_that_cannot_be_had_is_refused() -> None:
     long = ITM.model_copy(update={"rotor_positions": ((0.3, 0.05), (0.3, -0.05), (-0.3, -0.05), (-0.3, 0.05))})
     with pytest.raises(ConfigError, match="no turn brings the rotors"):
         long.in_layout_of(ITM)
+
+
+def test_the_least_time_is_of_this_vehicle_alone() -> None:
+    other = ITM.model_copy(update={"name": "mine", "geometric_gains": None})
+    assert ITM.time_optimal and other.time_optimal == ITM.time_optimal
+    assert ITM.model_copy(update={"mass": 2.0}).time_optimal is None

@@ -35,10 +35,9 @@ def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, in proportion to its control authority, by search.
 
     Found together for ITM, Crazyflie, Hummingbird, one with slow motors, and vehicles of the distribution ``raptor``, told.
-    The scales are the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest
-    angular acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations:
-    upwards, g (c - 1), sideways at constant height, g √(c² - 1), and level downwards, g (1 - l), with l and c the thrust
-    limits in hover thrusts.
+    The scales are the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest angular acceleration a_φ
+    about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1),
+    sideways at constant height, g √(c² - 1), and downwards, g (1 - l), with thrust limits l and c in hover thrusts.
     """
     derived = _derived_gains(vehicle.parameters()[:, None], vehicle.control_step)
     return GeometricGains.model_validate({name: float(value[0]) for name, value in derived.items()})
@@ -111,8 +110,7 @@ class GeometricExpert(Expert):
     (IEEE Trans. Control Systems Technology 28(2), 2020), since no task here asks for a heading. What it adds to them:
     velocities and body rates that the vehicle can brake from, the attitude as it will be when the command acts, the long
     way round where the spin makes that quicker, and rotor thrusts that give up yaw before thrust and thrust before tilt.
-
-    The actions are a function of what the 18 observed features hold; the expert has no state.
+    Its actions are a function of what the 18 observed features hold; it has no state.
 
     :param vehicle: name, YAML path or Vehicle it is designed for.
     :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
@@ -196,8 +194,8 @@ def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, spare):  # type
     way = math.sqrt((distance / brake) ** 2 + (ez / height_brake) ** 2)  # both brake at once, on a straight line
     speed = _braking_profile(gains[G.position], way)
     fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
-    rise = gains[G.height_velocity] * (_braking_profile(gains[G.height_position], way) * ez - vz)
-    climb = max(-gains[G.descent], rise)
+    climb = gains[G.height_velocity] * (_braking_profile(gains[G.height_position], way) * ez - vz)
+    climb = max(-gains[G.descent], climb)
     # As much of this acceleration as leaves the force no greater than the one that holds the height at the greatest tilt.
     weight = g - az
     square, across = fx * fx + fy * fy + climb * climb, climb * weight - fx * ax - fy * ay
