@@ -64,30 +64,29 @@ export function derivedGains(v) {
   const rate = min(1 / (lag + 1 / sqrt(turn)), 0.438 / lag);
   const sideways = sqrt(most ** 2 - 1), upwards = g * (most - 1);
   return {
-    position: 0.271 * rate,
-    velocity: 0.458 * rate,
-    height_position: 0.446 * rate,
-    height_velocity: 0.748 * rate,
-    deceleration: 0.571 * g * sideways,
-    height_deceleration: 0.822 * upwards,
+    position: 0.285 * rate,
+    velocity: 0.607 * rate,
+    height_position: 0.407 * rate,
+    height_velocity: 0.937 * rate,
+    deceleration: 1.07 * g * sideways,
+    height_deceleration: 1.63 * g * (1 - least),
     descent: g * min(0.9, 1.56 * (1 - least)),
-    tilt: 0.979 * sideways,
-    attitude: 1.19 * rate,
-    angular_deceleration: 1.81 * turn,
-    body_rates: 0.685 / lag,
-    yaw_rate: 0.11 / lag,
-    descent_deceleration: 0.408 * upwards,
+    tilt: 1.9 * sideways,
+    attitude: 1.53 * rate,
+    angular_deceleration: 1.17 * turn,
+    body_rates: 0.587 / lag,
+    yaw_rate: 0.132 / lag,
+    descent_deceleration: 0.612 * upwards,
   };
 }
 
 /**
- * Speed towards a target from which it can be braked.
- * @param {number} distance
+ * Speed per distance from which one can brake.
  * @param {number} gain
- * @param {number} deceleration
+ * @param {number} distanceByDeceleration
  */
-function brakingProfile(distance, gain, deceleration) {
-  return (deceleration / gain) * (sqrt(1 + (2 * gain * gain * distance) / deceleration) - 1);
+function brakingProfile(gain, distanceByDeceleration) {
+  return (2 * gain) / (1 + sqrt(1 + 2 * gain * gain * distanceByDeceleration));
 }
 
 /** The geometric controller for large angles. @param {Vehicle} v @returns {Law} */
@@ -120,15 +119,14 @@ export function geometric(v) {
  * @param {number} g
  */
 function desiredForce([ex, ey, ez], [vx, vy, vz], gains, g) {
-  const distance = sqrt(ex * ex + ey * ey);
-  const speed = distance > 0 ? brakingProfile(distance, gains.position, gains.deceleration) / distance : gains.position;
+  const heightBrake = ez > 0 ? gains.height_deceleration : gains.descent_deceleration;
+  const way = sqrt((ex * ex + ey * ey) / gains.deceleration ** 2 + (ez / heightBrake) ** 2);
+  const speed = brakingProfile(gains.position, way);
   const fx = gains.velocity * (speed * ex - vx), fy = gains.velocity * (speed * ey - vy);
-  const deceleration = ez > 0 ? gains.height_deceleration : gains.descent_deceleration;
-  const rise = (ez < 0 ? -1 : 1) * brakingProfile(abs(ez), gains.height_position, deceleration);
-  const fz = max(0.1 * g, g + max(-gains.descent, gains.height_velocity * (rise - vz)));
-  const horizontal = sqrt(fx * fx + fy * fy), limit = gains.tilt * fz;
-  const scale = horizontal > limit ? limit / horizontal : 1;
-  return [scale * fx, scale * fy, fz];
+  const climb = max(-gains.descent, gains.height_velocity * (brakingProfile(gains.height_position, way) * ez - vz));
+  const square = fx * fx + fy * fy + climb * climb, across = climb * g, room = (g * gains.tilt) ** 2;
+  const scale = square + 2 * across > room ? max(0, sqrt(across * across + square * room) - across) / square : 1;
+  return [scale * fx, scale * fy, max(0.1 * g, g + scale * climb)];
 }
 
 /**
@@ -170,7 +168,7 @@ function wantedTurn(b1, b2, b3, p, q, gains) {
   const short = -along + 2 * sqrt(0.5 * along * along + braking * angle);
   const long = along + 2 * sqrt(0.5 * along * along + braking * (2 * Math.PI - angle));
   if (long < short) [nx, ny, angle] = [-nx, -ny, 2 * Math.PI - angle];
-  return [nx, ny, brakingProfile(angle, gains.attitude, braking)];
+  return [nx, ny, angle * brakingProfile(gains.attitude, angle / braking)];
 }
 
 /**

@@ -256,6 +256,6 @@ export function physicalLimit(vehicle, start) {
   const times = vehicle.time_optimal;
   const level = start.quaternion[0] === 1 && ![...start.velocity, ...start.rates].some(Boolean);
   const distance = Math.hypot(...start.target.map((each, k) => each - start.position[k]));
-  const limit = level && times ? times[String(Math.round(distance * 1000) / 1000)] : null;
-  return typeof limit === "number" ? limit : null;
+  const known = level ? Object.entries(times ?? {}).find(([metres]) => Math.abs(Number(metres) - distance) < 1e-3) : undefined;
+  return known ? known[1] : null;
 }
