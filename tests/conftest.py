@@ -31,7 +31,7 @@ HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
 
 
 class WithoutPyBullet(importlib.abc.MetaPathFinder):
-    """Skips what imports PyBullet where there is none: a test, or a file of them. tests/test_without_pybullet.py is the rest."""
+    """Where there is no PyBullet, skips what imports it: a test, or a file of them. test_without_pybullet.py has the rest."""
 
     def find_spec(self, name, path=None, target=None):
         if name in ("pybullet", "sb3_quad.base.bullet"):
