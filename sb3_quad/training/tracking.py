@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import stable_baselines3
 from stable_baselines3.common.callbacks import BaseCallback
@@ -17,17 +16,13 @@ from sb3_quad.training.runs import made_with
 METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")  # beside the settings, under HPARAMS
 
 
-def _settings(job: TrainingJob) -> dict[str, Any]:
-    return {**job.config.settings, "algo": job.config.algo, "env": job.config.env_id, "seed": job.seed}
-
-
 class HyperparameterLog(BaseCallback):
     """Logs a job's settings when its training begins; only TensorBoard shows them."""
 
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
-        given = _settings(job).items()
-        self._shown = {name: value if isinstance(value, (bool, int, float)) else str(value) for name, value in given}
+        given = {**job.config.settings, "algo": job.config.algo, "env": job.config.env_id, "seed": job.seed}
+        self._shown = {name: value if isinstance(value, (bool, int, float)) else str(value) for name, value in given.items()}
 
     def _on_training_start(self) -> None:
         shown = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
@@ -55,7 +50,7 @@ def tracked(job: TrainingJob) -> Iterator[None]:
             entity=job.wandb_entity,
             group=job.wandb_group,
             tags=[*(job.wandb_tags or ()), f"v{stable_baselines3.__version__}"],
-            config={**job.arguments(), **_settings(job), **made_with()},
+            config={**job.arguments(), **job.config.settings, **made_with()},
             sync_tensorboard=True,
         )
     except wandb.Error as error:
