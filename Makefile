@@ -24,7 +24,7 @@ help:
 	@echo "make test           run the tests that a change is likely to break, in minutes"
 	@echo "make test-all       run these and the slow ones: documents that train, wheels, kills, compilers"
 	@echo "make fuzz           search with random examples for what the tests do not know yet, for MINUTES=10"
-	@echo "make test-zoo       run the tests that need rl_zoo3 or Ray, in an environment of its own"
+	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
 	@echo "make transfer-table print the table of docs/export.md about it, ARGS=\"-n 64 --seed 2\""
 	@echo "make test-extras    install each extra into an empty environment, as README says, and try it; ARGS=\"tune zoo\" some"
@@ -56,7 +56,7 @@ fuzz: $(INSTALLED)
 	done
 
 test-zoo: $(ZOO_INSTALLED)
-	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py $(ARGS)
+	$(ZOO_VENV)/bin/python -m pytest tests/test_zoo.py tests/test_ray.py tests/test_tracking.py $(ARGS)
 
 # Shipped agents as NAME@VEHICLE.onnx; AGENTS="any-quadcopter run/agent.zip" others.
 AGENTS ?= any-quadcopter crazyflie-robust
@@ -137,11 +137,11 @@ $(TRANSFER_INSTALLED): examples/other_simulators/requirements.txt
 	@$(TRANSFER_VENV)/bin/python -m pip install --quiet --no-compile --disable-pip-version-check --requirement $<
 	@touch $@
 
-# Ray and rl_zoo3, in an environment that borrows all others.
+# Ray, rl_zoo3 and wandb, in an environment that borrows all others.
 $(ZOO_INSTALLED): constraints.txt $(INSTALLED)
 	$(PY) -m venv --without-pip $(ZOO_VENV)
 	@$(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \
 		"$$($(ZOO_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
 	@$(PY) -m pip --python $(ZOO_VENV)/bin/python install --quiet --no-compile --disable-pip-version-check \
-		--constraint constraints.txt 'rl_zoo3[plots]' requests ray
+		--constraint constraints.txt 'rl_zoo3[plots]' requests ray wandb
 	@touch $@

@@ -2,25 +2,37 @@
 
     python examples/publish.py logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent
     python examples/publish.py logs/ppo/QuadStateRecovery-v0_2/best_model.zip --name other --command "my.py" -o published
+    python examples/publish.py itm-recovery --name itm-recovery --hub
+    python examples/publish.py itm-recovery --name itm-recovery --push somebody/itm-recovery
 
 The zip holds the weights and plain numbers only, so that other versions of Stable-Baselines3 can read it too. For the card, as
 model hubs show it, the policy flies fresh episodes: 3,840 recoveries, and 960 targets at each of 10, 15 and 20 m. How it was
 trained is taken from its run folder; what is recorded nowhere, the card calls so. The agents of the package were made so.
+
+With --hub a folder NAME is laid out as huggingface_sb3 lays out a model: the card as README.md, with its metadata, the zip and
+what is in it, config.json and results.json, whose rewards are those of the agent's own task. --push also uploads it to the
+Hugging Face Hub, with `pip install huggingface-hub` and `hf auth login`.
 """
 
 import argparse
+import datetime
 import io
+import json
 import sys
+import zipfile
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import jinja2
+import stable_baselines3
+import yaml
 from stable_baselines3 import PPO
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
+from sb3_quad.base.imports import require
 from sb3_quad.base.seeds import seed_for
 from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli import app
@@ -28,6 +40,7 @@ from sb3_quad.cli.parser import Parser, add_common, positive
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
+from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.flights import Flights, fly
 from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
 from sb3_quad.evaluation.metrics import Metrics, summarise
@@ -56,6 +69,8 @@ def add_arguments(parser: Parser) -> None:
     add("-o", metavar="FOLDER", dest="folder", default=".", help="folder for both (here)")
     add("--command", metavar="TEXT", dest="made_by", help="the command that trained it (command.txt of the run)")
     add("--episodes", type=positive, default=960, metavar="N", help="episodes of each task (960; recoveries: 4 times as many)")
+    add("--hub", action="store_true", help="lay out a folder NAME as huggingface_sb3 does, instead of the two files")
+    add("--push", metavar="USER/REPO", help="also upload that folder to the Hugging Face Hub")
     add_common(parser, "trust", "overwrite")
 
 
@@ -63,7 +78,10 @@ def run(options: argparse.Namespace) -> int:
     """Slim, fly, write. Returns the exit code."""
     if file_name(options.name) != options.name:
         raise ConfigError(f"--name {options.name!r}: letters, digits and, between them, '_', '.' and '-'; folders are for -o")
-    zip_file, card_file = (Path(options.folder) / f"{options.name}.{suffix}" for suffix in ("zip", "md"))
+    api = require("huggingface_hub", "", "--push").HfApi() if options.push else None
+    laid_out, folder = options.hub or options.push, Path(options.folder)
+    folder = folder / options.name if laid_out else folder
+    zip_file, card_file = folder / f"{options.name}.zip", folder / ("README.md" if laid_out else f"{options.name}.md")
     for path in (zip_file, card_file):
         refuse_existing(path, options.overwrite)
     settings, source = agent_settings(options.model)
@@ -77,12 +95,19 @@ def run(options: argparse.Namespace) -> int:
     with ExitStack() as last, replacing(zip_file) as zip_stream, replacing(card_file) as card_stream:
         zip_stream.write(content)
         zip_stream.flush()
-        rows = measure(load_model(zip_stream.name), options.episodes, **how)
+        flown = measure(load_model(zip_stream.name), options.episodes, **how)
+        rows = {name: summarise(each) for name, each in flown.items()}
         text = write_card(options.name, rows, options.made_by or command, facts, {**how, "vehicle": how["vehicle"].name})
-        card_stream.write(text.encode("utf-8"))
+        metadata, files = hub_layout(options.name, content, settings.task, flown) if laid_out else ("", {})
+        card_stream.write(f"{metadata}{text}".encode())
         signals = last.enter_context(StopSignals())  # nothing comes between replacing the one and the other
+        for path, data in files.items():
+            last.enter_context(replacing(folder / path)).write(data)
     print(text)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
+    if api is not None and not signals.exit_code:
+        api.create_repo(repo_id=options.push, exist_ok=True)
+        print(api.upload_folder(repo_id=options.push, folder_path=folder, commit_message=f"Add {options.name}"))
     return signals.exit_code
 
 
@@ -136,20 +161,52 @@ def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> byte
     return buffer.getvalue()
 
 
-def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Metrics]:
-    """The rows of the table, by name: recoveries, then targets at each distance.
+def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Flights]:
+    """The flights of the table's rows, by name: recoveries, then targets at each distance.
 
     :param n_episodes: at each distance.
     :param settings: ``vehicle``, ``noise`` and ``observation_std``, as :func:`~sb3_quad.evaluation.flights.fly` takes them.
     """
     parts = [fly(policy, "state_recovery", n_episodes, seed_for("card", k), **settings) for k in range(N_RECOVERIES)]
-    rows = {RECOVERY: summarise(Flights.concatenate(parts))}
+    rows = {RECOVERY: Flights.concatenate(parts)}
     for distance in DISTANCES:
         task = {"target_distance": distance}
         seed = seed_for("card", int(1000 * distance))
-        flown = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
-        rows[f"targets {distance:.0f} m away"] = summarise(flown)
+        rows[f"targets {distance:.0f} m away"] = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
     return rows
+
+
+def hub_layout(name: str, content: bytes, task: Any, flown: Mapping[str, Flights]) -> tuple[str, dict[str, bytes]]:
+    """What huggingface_sb3 puts before a card and beside a zip: the metadata, and the other files by their paths.
+
+    :param content: of the zip, whose parts lie unpacked in a folder ``name``.
+    :param task: that the agent was trained for; of several the recovery.
+    :param flown: what :func:`measure` gave.
+    """
+    tracks = task == "target_tracking"
+    (env_id,) = (each for each, its in ENVIRONMENTS.items() if (its == "target_tracking") == tracks)
+    rewards = next(flights.reward for row, flights in flown.items() if (row == RECOVERY) != tracks)
+    mean, std = float(rewards.mean()), float(rewards.std())
+    metric = {"type": "mean_reward", "value": f"{mean:.2f} +/- {std:.2f}", "name": "mean_reward", "verified": False}
+    kind, dataset = "reinforcement-learning", {"name": env_id, "type": env_id}
+    result = {"task": {"type": kind, "name": kind}, "dataset": dataset, "metrics": [metric]}
+    metadata = {
+        "library_name": "stable-baselines3",
+        "tags": [env_id, "deep-reinforcement-learning", kind, "stable-baselines3"],
+        "model-index": [{"name": "PPO", "results": [result]}],
+    }
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        files = {f"{name}/{member}": archive.read(member) for member in archive.namelist()}
+    config = {**json.loads(files[f"{name}/data"]), "system_info": stable_baselines3.get_system_info(print_info=False)[0]}
+    results = {
+        "mean_reward": mean,
+        "std_reward": std,
+        "is_deterministic": True,
+        "n_eval_episodes": len(rewards),
+        "eval_datetime": datetime.datetime.now().isoformat(),
+    }
+    files |= {f"{key}.json": json.dumps(each).encode() for key, each in (("config", config), ("results", results))}
+    return f"---\n{yaml.safe_dump(metadata, sort_keys=False)}---\n\n", files
 
 
 def write_card(
@@ -157,7 +214,7 @@ def write_card(
 ) -> str:
     """The card of a policy, Markdown.
 
-    :param measured: what :func:`measure` gave with ``settings``.
+    :param measured: of each row of :func:`measure` with ``settings``.
     :param command: what was typed to train it.
     :param facts: further rows on its training, such as seed, commit and versions.
     """

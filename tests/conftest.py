@@ -1,9 +1,12 @@
 """What every test starts from (the CPU, one thread of torch, fixed seeds, no display), and small agents to fly and read."""
 
+import importlib.abc
+import importlib.util
 import os
 import random
 import shutil
 import signal
+import sys
 from pathlib import Path
 
 os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read when torch is imported; the tests are the same on every machine
@@ -25,6 +28,18 @@ HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
     "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
     "sac_bc": ["learning_starts:100", "buffer_size:2000", "batch_size:64", "gradient_steps:2"],
 }
+
+
+class WithoutPyBullet(importlib.abc.MetaPathFinder):
+    """Where there is no PyBullet, skips what imports it: a test, or a file of them. test_without_pybullet.py has the rest."""
+
+    def find_spec(self, name, path=None, target=None):
+        if name in ("pybullet", "sb3_quad.base.bullet"):
+            pytest.skip("needs PyBullet, the extra [pybullet]", allow_module_level=True)
+
+
+if importlib.util.find_spec("pybullet") is None:
+    sys.meta_path.insert(0, WithoutPyBullet())
 
 
 def pytest_configure():

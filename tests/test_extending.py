@@ -110,6 +110,7 @@ def test_each_is_small_and_fits_the_code(diff, tmp_path):
 @pytest.mark.timeout(1300)
 def test_the_extended_package_flies_as_pybullet_does(extended):
     """And what it compiles computes what its cache holds, to the last bit, also the weights of a training."""
+    pytest.importorskip("pybullet")
     environment = {**os.environ, "PYTHONPATH": str(extended)}
     command = [sys.executable, "-W", "ignore", "-c", SCRIPT.replace("STEPS", str(STEPS))]
     run = functools.partial(subprocess.run, cwd=extended, env=environment, capture_output=True, text=True, timeout=600)

@@ -87,7 +87,6 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
         ("train -optimize", "option '-optimize': the command sb3-quad tune does that"),
         ("train --optimize-hyperparameters", "the command sb3-quad tune does that"),
         ("train --sampler tpe", "option '--sampler': it belongs to sb3-quad tune"),
-        ("train --track", "docs/zoo.md"),
         ("report folder --nothing", "option '--nothing': see --help, and docs/zoo.md"),
         ("train 5", "argument '5': see --help"),
         ("train --algo a2c", "algorithm 'a2c': (valid: dagger,"),

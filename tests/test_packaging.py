@@ -20,7 +20,7 @@ import sb3_quad
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
 DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
-APART = ("zoo", "ray")  # extras in the environment of make test-zoo
+APART = ("zoo", "ray", "track", "pybullet")  # extras in the environment of make test-zoo, and one that most have anyway
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 
@@ -53,7 +53,7 @@ def package_folders():
 
 def requirements(text):
     """The names in lines such as ``rl_zoo3[plots]>=2.9``."""
-    return {re.split(r"[\[>=]", line)[0].strip().lower() for line in text.splitlines() if line.strip()}
+    return {re.split(r"[\[>=;]", line)[0].strip().lower() for line in text.splitlines() if line.strip()}
 
 
 @pytest.fixture(scope="module")

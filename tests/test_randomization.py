@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sb3_quad import sample_vehicles
+from sb3_quad import envs, sample_vehicles
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
+from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts import geometric
 from sb3_quad.experts.geometric import GeometricExpert, told_cautious, told_geometric
@@ -76,7 +76,7 @@ def test_a_row_and_pybullet_fly_the_same(seed, keywords):
         seen.append(observation)
         states.append(batch.state.copy())
         rewards.append(reward)
-    single = QuadcopterEnv(**keywords)
+    single = envs.QuadcopterEnv(**keywords)
     for row, own in enumerate(row_seeds(seed, n)):
         observations, flown, returns = [single.reset(seed=own)[0]], [single.true_state().array[:, 0].copy()], []
         for action in actions[:, row]:

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from sb3_quad import envs
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs import QuadcopterEnv, QuadcopterVecEnv
+from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.random import EPISODE, STEP, philox
@@ -117,7 +118,7 @@ def test_additive_noise_does_not_vanish_at_the_target():
 
 
 def test_noise_is_the_same_on_pybullet_and_for_short():
-    batch, single = QuadcopterVecEnv(1, noise=NOISE, seed=3), QuadcopterEnv(noise=NOISE)
+    batch, single = QuadcopterVecEnv(1, noise=NOISE, seed=3), envs.QuadcopterEnv(noise=NOISE)
     seen = batch.reset()[0], single.reset(seed=row_seeds(3, 1)[0])[0]
     for _ in range(100):
         np.testing.assert_allclose(*seen, atol=1e-6)  # float32

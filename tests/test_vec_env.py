@@ -14,10 +14,10 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecMonitor
 
+from sb3_quad import envs
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.notices import tell
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.compiled import compile_notice
@@ -68,7 +68,7 @@ def first_episodes(env, choose, limit):
 def test_whole_episodes_are_pybullets(task, controller):
     n, limit = 4, 700
     batch = QuadcopterVecEnv(n, task=task, noise=0.0, seed=20, max_episode_steps=limit)
-    single = QuadcopterEnv(task=task, noise=0.0)
+    single = envs.QuadcopterEnv(task=task, noise=0.0)
     table = np.random.default_rng(1).uniform(-1, 1, (n, limit, 4)).astype(np.float32)
     pid = PIDExpert()
     counts = {"batch": 0}
@@ -99,7 +99,7 @@ def test_whole_episodes_are_pybullets(task, controller):
 
 
 def test_noise_is_the_same_in_both():
-    batch, single = QuadcopterVecEnv(3, task="state_recovery", seed=7), QuadcopterEnv(task="state_recovery")
+    batch, single = QuadcopterVecEnv(3, task="state_recovery", seed=7), envs.QuadcopterEnv(task="state_recovery")
     first = batch.reset()
     for row in range(3):
         np.testing.assert_allclose(single.reset(seed=row_seeds(7, 3)[row])[0], first[row], atol=1e-6)
@@ -255,7 +255,7 @@ def test_the_end_of_an_episode():
     ],
 )
 def test_success_is_to_be_at_the_target_in_the_end(task, distance, tilt, succeeds):
-    batch, single = QuadcopterVecEnv(2, task, max_episode_steps=1), QuadcopterEnv(task)
+    batch, single = QuadcopterVecEnv(2, task, max_episode_steps=1), envs.QuadcopterEnv(task)
     quaternion = [np.cos(np.radians(tilt / 2)), np.sin(np.radians(tilt / 2)), 0.0, 0.0]
     start = {"position": [0, 0, 15], "quaternion": quaternion, "velocity": [0, 0, 0], "body_rates": [0, 0, 0]}
     single.reset(options={"state": start, "target": [0, 0, 15 + distance]})

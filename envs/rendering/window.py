@@ -5,7 +5,6 @@ import os
 import sys
 
 import numpy as np
-import pybullet_data
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.bullet import p
@@ -33,6 +32,8 @@ def open_window(width: int, height: int) -> int:
         raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
     for option in (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS):
         p.configureDebugVisualizer(option, 0, physicsClientId=client)
+    import pybullet_data
+
     plane = f"{pybullet_data.getDataPath()}/plane.urdf"
     ground = p.loadURDF(plane, useFixedBase=True, globalScaling=2.0, physicsClientId=client)
     p.setCollisionFilterGroupMask(ground, -1, 0, 0, physicsClientId=client)

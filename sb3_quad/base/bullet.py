@@ -1,8 +1,15 @@
-"""PyBullet, imported without the line about its build that it prints: ``from sb3_quad.base.bullet import p``."""
+"""PyBullet, imported without the line about its build that it prints: ``from sb3_quad.base.bullet import p``.
+
+It comes with the package where it has a wheel, up to Python 3.11; elsewhere this import says how to get it.
+"""
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from sb3_quad.base.imports import require
+
+NEEDS = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend pybullet, enjoy)"
 
 
 @contextmanager
@@ -20,6 +27,6 @@ def _standard_error_silenced() -> Iterator[None]:
 
 
 with _standard_error_silenced():
-    import pybullet as p
+    p = require("pybullet", "pybullet", NEEDS)
 
 __all__ = ["p"]

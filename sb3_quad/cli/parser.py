@@ -12,11 +12,7 @@ from pydantic import BaseModel
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 
-_BRIDGE = "Weights & Biases needs rl_zoo3 itself and the bridge, docs/zoo.md"
-ELSEWHERE = {
-    **dict.fromkeys(("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that"),
-    **dict.fromkeys(("--track", *(f"--wandb-{name}" for name in ("project-name", "entity", "group", "tags"))), _BRIDGE),
-}
+ELSEWHERE = dict.fromkeys(("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that")
 """Flags of rl_zoo3 that no command has, and what has their part."""
 
 

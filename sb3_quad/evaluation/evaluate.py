@@ -1,6 +1,7 @@
 """A suite for any number of controllers: scenario by scenario flown, summed up and written into a folder of its own."""
 
 import hashlib
+import importlib
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -85,6 +86,8 @@ def evaluate(
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
+    if backend == "pybullet":  # once, rather than for each controller
+        importlib.import_module("sb3_quad.base.bullet")
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
     place, failures = Path(folder), list[Failure]()

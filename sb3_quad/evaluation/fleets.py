@@ -6,7 +6,6 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from sb3_quad.base.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
@@ -67,6 +66,8 @@ class PyBulletFleet:
     """As :class:`BatchFleet`, with a PyBullet environment per row, in turn; the controller still sees them as one batch."""
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
+        from sb3_quad.envs.quadcopter_env import QuadcopterEnv  # PyBullet may be missing
+
         self._seeds = seeds
         self._envs = [QuadcopterEnv(**dict(settings.with_changes(max_episode_steps=ENDLESS))) for _ in seeds]
         self.vehicle, self.observation_size = self._envs[0].vehicle, self._envs[0].batch.observation.size

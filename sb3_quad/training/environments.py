@@ -1,5 +1,6 @@
 """The vectorised environment of a job: batched, one process, or one process each; the same learning problem in all."""
 
+import importlib
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -55,6 +56,8 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
                 raise ConfigError("env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy")
             env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs})
         else:
+            if config.task is not None:  # here, where a worker process could not say what is missing
+                importlib.import_module("sb3_quad.base.bullet")
             makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
                 partial(_make_one, config, row, n_envs if staggered else 1) for row in range(n_envs)
             ]

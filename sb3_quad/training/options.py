@@ -2,9 +2,10 @@
 
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt
+from pydantic import AfterValidator, Field, NonNegativeFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.imports import require
 from sb3_quad.base.seeds import Seed
 from sb3_quad.base.validate import Frozen
 
@@ -61,3 +62,17 @@ class JobOptions(RunOptions):
     verbose: Literal[0, 1, 2] = option(0, "1: SB3's tables, 2: debugging")
     uuid: bool = option(False, "add a UUID to the run folder's name", "-uuid", metavar=None)
     progress: bool = option(False, "progress bar", "-P", metavar=None)
+    track: bool = option(False, "track with Weights & Biases; -tb is runs without one", metavar=None)
+    wandb_project_name: str = option("sb3", "its project", metavar="NAME")
+    wandb_entity: str | None = option(None, "its entity, a user or team", metavar="NAME")
+    wandb_group: str | None = option(None, "its group of runs", metavar="NAME")
+    wandb_tags: list[str] | None = option(None, "tags of the run", "-tags", metavar="TAG")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _tracked(cls, given: dict[str, Any]) -> dict[str, Any]:
+        """Weights & Biases takes what TensorBoard is given."""
+        if not given.get("track"):
+            return given
+        require("wandb", "track", "--track")
+        return {**given, "tensorboard_log": given.get("tensorboard_log") or "runs"}

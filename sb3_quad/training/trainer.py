@@ -37,6 +37,7 @@ from sb3_quad.training.environments import WORKER_ENDED, make_environments
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import Snapshot, SnapshotFile, load_snapshot
+from sb3_quad.training.tracking import HyperparameterLog, tracked
 from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import instance
 
@@ -82,11 +83,12 @@ def train(
     with StopSignals() as signals, _environments(job) as (env, eval_envs):
         model = build_model(job, env)
         callbacks = _own_callbacks(config)  # a misspelt keyword leaves no run folder
-        run = claim_run(job.log_folder, config.algo, config.env_id, job.uuid)
-        with locked(run.path, "run folder"):
-            run.write_yaml(config.settings, job.arguments() | made_with())
-            on_start(run)
-            return _learn(job, run, model, eval_envs, callbacks, signals, report, should_continue)
+        with tracked(job):
+            run = claim_run(job.log_folder, config.algo, config.env_id, job.uuid)
+            with locked(run.path, "run folder"):
+                run.write_yaml(config.settings, job.arguments() | made_with())
+                on_start(run)
+                return _learn(job, run, model, eval_envs, callbacks, signals, report, should_continue)
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
@@ -116,7 +118,8 @@ def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingR
             model = load_snapshot(run, config.algo, env, job.device, **attributes)
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
-        return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
+        with tracked(job):
+            return _learn(job, run, model, eval_envs, _own_callbacks(config), signals, report)
 
 
 @contextmanager
@@ -200,7 +203,7 @@ def _learn(
     last_good, best = SnapshotFile(run, job.snapshot_every, report, lambda: signals.received is not None), None
     if config.task is not None and not (config.env_wrapper or config.vec_env_wrapper):  # flights have no wrappers
         job.flight_settings.write_into(model)
-    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, config.env_id)]
+    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, config.env_id), HyperparameterLog(job)]
     if eval_envs:
         best = BestModel(
             eval_envs[None],

@@ -57,7 +57,8 @@ def add_arguments(parser: Parser) -> None:
     add("--thesis", action="store_const", const=THESIS, dest="conf_file", help=f"the thesis's method: --conf-file {THESIS}")
     add("--seed", type=seed, metavar="N", help="seed (0); negative: a random one, recorded in args.yml")
     add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
-    add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose")
+    add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose", "track", "wandb_project_name")
+    add_fields(parser, JobOptions, "wandb_entity", "wandb_group", "wandb_tags", wandb_tags={"nargs": "+", "type": str})
     add("--resume", metavar="RUN_FOLDER", help="continue an interrupted or killed run with all its settings")
 
 
