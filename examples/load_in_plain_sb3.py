@@ -50,6 +50,8 @@ class Quadcopter:
     def __init__(self, vehicle, position):
         self.vehicle, self.position, self.rotation = vehicle, position, np.eye(3)
         self.velocity, self.body_rates = np.zeros(3), np.zeros(3)
+        same = vehicle.get("motor_gain")  # in zips from before rotors could slow down at a rate of their own
+        self.motor_gains = [vehicle.get(f"motor_gain_{which}", same) for which in ("up", "down")]
         x, y = np.transpose(vehicle["rotor_positions"])
         self.arms = np.stack([y, -x, vehicle["moment_thrust_ratio"] * np.array(vehicle["rotor_directions"])])
         hover = vehicle["mass"] * vehicle["gravity"] / 4
@@ -61,7 +63,8 @@ class Quadcopter:
         self.commands.append((self.low + self.high + (self.high - self.low) * np.clip(action, -1, 1)) / 2)
         command, dt, inertia = self.commands.pop(0), self.vehicle["physics_step"], np.array(self.vehicle["inertia"])
         for _ in range(round(self.vehicle["control_step"] / dt)):
-            self.roots += self.vehicle["motor_gain"] * dt * (np.sqrt(command) - self.roots)
+            missing = np.sqrt(command) - self.roots
+            self.roots += np.where(missing > 0.0, *self.motor_gains) * dt * missing
             moment = self.arms @ self.roots**2 - np.cross(self.body_rates, inertia * self.body_rates)
             self.velocity += dt * (self.rotation[:, 2] * np.sum(self.roots**2) / self.vehicle["mass"])
             self.velocity[2] -= dt * self.vehicle["gravity"]

@@ -59,7 +59,7 @@ def test_what_messages_call_a_file(here):
         (
             "imt",
             None,
-            "unknown vehicle 'imt': did you mean 'itm'? (valid: crazyflie, hummingbird, itm), or the path of a .yaml",
+            "unknown vehicle 'imt': did you mean 'itm'? (valid: cf21B_500, cf2x_L250, crazyflie, hummingbird, itm, rotorpy_",
         ),
         ("missing.yaml", None, "missing.yaml: no such file"),
         ("bad.yaml", b"\xff\xfe\x00\x01", "bad.yaml: cannot be read"),
