@@ -20,6 +20,7 @@ PENDULUM = "Pendulum-v1: {policy: MlpPolicy, n_timesteps: 100, n_steps: 100, bat
 ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "--executor ray": "tests/test_ray.py",
     "--resume": "tests/test_runs.py",
+    "--track": "tests/test_tracking.py",
     "my_experts:lqr": "tests/test_docs.py",
     "my_package.control:make": "a module of the user's",
     "$RUNS": "agents of a sweep of an hour and a half",
