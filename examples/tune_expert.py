@@ -60,7 +60,7 @@ class Objective:
     def __init__(self, vehicle: Vehicle, starts: int, targets: int, seed: int) -> None:
         self.vehicle, self.starts = vehicle, starts
         begun = row_seeds(seed_for("search", seed), starts + max(targets // 2, 1))
-        heights = self.fly(GeometricExpert(vehicle), "state_recovery", begun[:starts], DESCENT)[1].lowest
+        heights = self.fly(GeometricExpert(vehicle), "state_recovery", begun[:starts], DESCENT)[1].height
         self.hardest = [begun[row] for row in np.sort(np.argsort(heights)[: max(starts // 60, 1)])]
         self.tracking, self.recovery = begun[:targets], begun[starts:]
 
