@@ -47,6 +47,7 @@ SETTINGS = {"n_timesteps": 20, "n_envs": 2, "n_steps": 10, "batch_size": 20, "po
 BASES = {
     "benchmark": "--no-training --seconds 0.001 --sizes 2 --n-envs 1",
     "check-vehicle": "itm -n 1",
+    "demo": "pid",
     "enjoy": "pid --no-render -n 3",
     "evaluate": "pid --suite suite.yaml --no-report",
     "export": "itm-recovery --format torchscript",
