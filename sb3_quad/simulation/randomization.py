@@ -212,10 +212,13 @@ class Randomization(Frozen):
         return self
 
     @property
+    def _motor_gains(self) -> tuple[Factor | None, Factor | None, Factor | None]:
+        return self.motor_gain, self.motor_gain_up, self.motor_gain_down
+
+    @property
     def sets_vehicle(self) -> bool:
         """Whether an episode begins with a vehicle of its own."""
-        motors = (self.motor_gain, self.motor_gain_up, self.motor_gain_down)
-        changes = (self.mass, self.inertia, *motors, self.thrust, self.delay, self.drag)
+        changes = (self.mass, self.inertia, *self._motor_gains, self.thrust, self.delay, self.drag)
         return self.sets_arms or any(each is not None for each in changes)
 
     @property
@@ -239,7 +242,7 @@ class Randomization(Frozen):
                 f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
                 f" its rotors lift {vehicle.thrust_limits[1]:g} times its weight"
             )
-        both, up, down = ((each and each.high) or 1.0 for each in (self.motor_gain, self.motor_gain_up, self.motor_gain_down))
+        both, up, down = ((each and each.high) or 1.0 for each in self._motor_gains)
         gain = both * max(vehicle.motor_gain_up * up, vehicle.motor_gain_down * down)
         if gain * vehicle.physics_step > 1.0:
             raise ConfigError(
@@ -249,8 +252,7 @@ class Randomization(Frozen):
     def numbers(self, control_step: float) -> FloatArray:
         """What :mod:`.sampling` reads, in the order of ``RANDOMIZATION``; a share of 0 where no vehicle is randomised."""
         delay = self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})  # its whole part is the delay
-        motors = (self.motor_gain, self.motor_gain_up, self.motor_gain_down)
-        ranges = (self.mass, self.inertia, *motors, self.thrust, self.arm, self.center_of_mass, delay, self.drag)
+        ranges = (self.mass, self.inertia, *self._motor_gains, self.thrust, self.arm, self.center_of_mass, delay, self.drag)
         numbers = [self.share if self.sets_vehicle else 0.0, self.wrench_share]
         for each in ranges:
             numbers += FIXED_NUMBERS if each is None else each.numbers()

@@ -113,14 +113,8 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
     if gust.shape[1] > 0:
         unit = weight if table[R.gust_by_weight] != 0.0 else 1.0
         _begin_gusts(i, table, R.gust_std, unit * is_pushed, uniforms(streams, i, 4, GUST), gust)
-    u = uniforms(streams, i, 5, WIND)
-    if table[R.wind + 2] != FIXED:
-        for axis in range(3):
-            wind[axis, i] = 0.0
-        if is_pushed:  # level, unless its direction is given
-            _push(table, R.wind, u[8], 0.5, u[9], 1.0, wind, 0, 0, i)
-    if wind_gust.shape[1] > 0:
-        _begin_gusts(i, table, R.wind_std, 1.0 * is_pushed, u, wind_gust)
+    if table[R.wind + 2] != FIXED or wind_gust.shape[1] > 0:
+        _begin_wind(i, streams, table, is_pushed, wind, wind_gust)
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
@@ -172,6 +166,19 @@ def _randomize_vehicle(i, streams, table, vehicles):
         vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
     if table[R.delay + 2] != FIXED:
         vehicles[P.delay, i] = min(math.floor(between(table, R.delay, u[10], 0.0)), table[R.delay + 1] - 1.0)
+
+
+@compiled
+def _begin_wind(i, streams, table, is_pushed, wind, wind_gust):
+    """The constant wind of row i's episode, level unless its direction is given, and the first of its gusts, in place."""
+    u = uniforms(streams, i, 5, WIND)
+    if table[R.wind + 2] != FIXED:
+        for axis in range(3):
+            wind[axis, i] = 0.0
+        if is_pushed:
+            _push(table, R.wind, u[8], 0.5, u[9], 1.0, wind, 0, 0, i)
+    if wind_gust.shape[1] > 0:
+        _begin_gusts(i, table, R.wind_std, 1.0 * is_pushed, u, wind_gust)
 
 
 @compiled
