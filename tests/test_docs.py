@@ -31,7 +31,7 @@ def python_blocks(page: str) -> list[str]:
     return ["\n" * text.count("\n", 0, match.start(1)) + match.group(1) for match in found]
 
 
-NAMES = ["README.md", *sorted(f"docs/{path.name}" for path in ROOT.glob("docs/*.md"))]
+NAMES = ["README.md", *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/**/*.md"))]
 PAGES = {page: python_blocks(page) for page in NAMES}
 
 
@@ -108,9 +108,9 @@ STAGES = ("README.md", "docs/ppo_bc.md")  # which train both stages, and show wh
 CHECKS = {
     "README.md": check_readme,
     "docs/dagger.md": check_dagger,
-    "docs/dynamics.md": check_dynamics,
     "docs/environments.md": check_environments,
     "docs/ppo_bc.md": check_ppo_bc,
+    "docs/research/dynamics.md": check_dynamics,
     "docs/vehicles.md": check_vehicles,
 }
 

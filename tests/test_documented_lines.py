@@ -15,7 +15,7 @@ from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.training import pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/*.md"))]
+PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 PENDULUM = "Pendulum-v1: {policy: MlpPolicy, n_timesteps: 100, n_steps: 100, batch_size: 50, gradient_steps: 2}"
 ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "--executor ray": "tests/test_ray.py",

@@ -140,7 +140,7 @@ def test_the_extra_for_developers_holds_all_but_those_apart(options):
 def test_extras_are_installed_from_a_clone(options):
     """The package is on no index, and zsh wants the brackets quoted."""
     code = [path for name in CODE for path in (ROOT / name).rglob("*.py")]
-    for path in [ROOT / "README.md", *ROOT.glob("docs/*.md"), *code]:
+    for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *code]:
         for written in re.findall(r"pip install [^`\n]*\[[^`\n]*", path.read_text(encoding="utf-8")):
             named = re.match(r"pip install (?:-c constraints.txt )?'\.\[(\w+|\{extra\})\]'", written)
             assert named, f"{path}: {written}"

@@ -102,7 +102,7 @@ class _TrueConstants:
 
 
 class GeometricExpert(Expert):
-    """Position and attitude control on S² for large angles; docs/experts.md has its law in formulas.
+    """Position and attitude control on S² for large angles; docs/research/experts.md has its law in formulas.
 
     After Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (CDC 2010), with reduced
     attitude (Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control", IEEE Control Systems 31(3), 2011): the

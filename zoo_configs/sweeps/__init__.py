@@ -1,1 +1,1 @@
-"""Sweeps, by which tables of docs/results.md are made."""
+"""Sweeps, by which tables of docs/research/results.md are made."""

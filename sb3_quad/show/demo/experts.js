@@ -1,5 +1,5 @@
 /**
- * The two experts on the true state, as sb3_quad/experts/{pid,geometric}.py have them. docs/experts.md explains their laws.
+ * The two experts on the true state, as sb3_quad/experts/{pid,geometric}.py have them. docs/research/experts.md explains their laws.
  *
  * @typedef {import("./vehicle.js").Vehicle} Vehicle
  * @typedef {(state: Float64Array, actions: Float32Array) => void} Law writes the four actions for a state
