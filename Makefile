@@ -4,6 +4,7 @@ PYTHON ?= python3
 VENV ?= .venv
 ZOO_VENV ?= .venv-zoo
 TRANSFER_VENV ?= .venv-transfer
+DOCS_VENV ?= .venv-docs
 ARGS ?=
 MINUTES ?= 10
 
@@ -12,11 +13,12 @@ INSTALL := $(PY) -m pip install --quiet --no-compile --disable-pip-version-check
 INSTALLED := $(VENV)/.installed
 ZOO_INSTALLED := $(ZOO_VENV)/.installed
 TRANSFER_INSTALLED := $(TRANSFER_VENV)/.installed
+DOCS_INSTALLED := $(DOCS_VENV)/.installed
 LINKS := build/type/sb3_quad
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install train test test-all fuzz test-zoo test-transfer transfer-table transfer-files test-extras lint format type type-demo links commit-checks clean
+.PHONY: help install train test test-all fuzz test-zoo test-transfer transfer-table transfer-files test-extras docs docs-links lint format type type-demo links commit-checks clean
 
 help:
 	@echo "make install        make $(VENV)/ with the package and its tools; then: . $(VENV)/bin/activate && sb3-quad --help"
@@ -28,6 +30,8 @@ help:
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
 	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --seed 2\""
 	@echo "make test-extras    install each extra into an empty environment, as README says, and try it; ARGS=\"tune zoo\" some"
+	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
+	@echo "make docs-links     ask each address outside of the site, where there is a network"
 	@echo "make lint           check code style, and which package imports which"
 	@echo "make format         put code into that style"
 	@echo "make type           check types"
@@ -86,6 +90,16 @@ transfer-files: $(INSTALLED)
 test-extras:
 	PYTHON=$(PYTHON) .ci/extras $(ARGS)
 
+# -n: what a page or a docstring refers to must be there.
+SPHINX := $(DOCS_VENV)/bin/python -m sphinx -n -W --keep-going -q -d build/doctrees
+
+docs: $(DOCS_INSTALLED)
+	$(SPHINX) -b html docs build/docs $(ARGS)
+	@echo "build/docs/index.html"
+
+docs-links: $(DOCS_INSTALLED)
+	$(SPHINX) -b linkcheck docs build/links $(ARGS)
+
 lint: $(INSTALLED) links
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
@@ -137,11 +151,15 @@ $(TRANSFER_INSTALLED): examples/other_simulators/requirements.txt
 	@$(TRANSFER_VENV)/bin/python -m pip install --quiet --no-compile --disable-pip-version-check --requirement $<
 	@touch $@
 
-# Ray, rl_zoo3 and wandb, in an environment that borrows all others.
+# Environments that borrow all packages of the first: Ray, rl_zoo3 and wandb; Sphinx.
+BORROW = $(PY) -m venv --without-pip $(1) && $(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \
+	"$$($(1)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth" && \
+	$(PY) -m pip --python $(1) install --quiet --no-compile --disable-pip-version-check --constraint constraints.txt
+
 $(ZOO_INSTALLED): constraints.txt $(INSTALLED)
-	$(PY) -m venv --without-pip $(ZOO_VENV)
-	@$(PY) -c 'import sysconfig as s; print(s.get_path("purelib")); print(s.get_path("platlib"))' > \
-		"$$($(ZOO_VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/borrowed.pth"
-	@$(PY) -m pip --python $(ZOO_VENV)/bin/python install --quiet --no-compile --disable-pip-version-check \
-		--constraint constraints.txt 'rl_zoo3[plots]' requests ray wandb
+	@$(call BORROW,$(ZOO_VENV)) 'rl_zoo3[plots]' requests ray wandb
+	@touch $@
+
+$(DOCS_INSTALLED): constraints.txt docs/requirements.txt $(INSTALLED)
+	@$(call BORROW,$(DOCS_VENV)) --requirement docs/requirements.txt
 	@touch $@

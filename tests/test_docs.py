@@ -16,11 +16,11 @@ from sb3_quad.evaluation.flights import fly
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or by what it is
     ("docs/evaluate.md", 0): "reads the folder of a whole evaluation",
-    ("docs/experts.md", 0): "flies 13,440 episodes",
-    ("docs/experts.md", 1): "a module, flown below",
+    ("docs/experts.md", 0): "a module, flown below",
     ("docs/export.md", 0): "tests/test_export.py",
     ("docs/export.md", 1): "tests/test_export.py",
     ("docs/export.md", 2): "tests/test_export.py",
+    ("docs/research/experts.md", 0): "flies 13,440 episodes",
 }
 
 
@@ -100,6 +100,11 @@ def check_environments(scope):
     assert scope["difference"] < 1e-9
 
 
+def check_tutorial(scope):
+    """The agents fly, and what was paid for less turning is earned."""
+    assert scope["mine"].mass == 1.4
+
+
 def check_vehicles(scope):
     assert abs(scope["flights"].survival.mean() - 0.953) < 0.01
 
@@ -111,7 +116,8 @@ CHECKS = {
     "docs/environments.md": check_environments,
     "docs/ppo_bc.md": check_ppo_bc,
     "docs/research/dynamics.md": check_dynamics,
-    "docs/vehicles.md": check_vehicles,
+    "docs/research/vehicles.md": check_vehicles,
+    "docs/tutorial.md": check_tutorial,
 }
 
 
@@ -151,7 +157,7 @@ def test_links_lead_to_files_and_headings(page):
 
 @pytest.fixture
 def module_folder(folder, monkeypatch):
-    (folder / "my_experts.py").write_text(PAGES["docs/experts.md"][1])
+    (folder / "my_experts.py").write_text(PAGES["docs/experts.md"][0])
     monkeypatch.syspath_prepend(str(folder))
     yield folder
     sys.modules.pop("my_experts", None)

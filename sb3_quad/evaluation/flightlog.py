@@ -1,6 +1,6 @@
 """Sampled trajectories of flights, and the ``.npz`` file that holds them beside the metrics of every flight.
 
-docs/evaluate.md lists the arrays.
+docs/reference/evaluation.md lists the arrays.
 """
 
 from pathlib import Path
