@@ -22,6 +22,7 @@ import sb3_quad  # noqa: E402
 project, version, author = "sb3_quad", sb3_quad.__version__, "the sb3_quad developers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
+exclude_patterns = ["projects_entry.md"]  # a text for elsewhere
 myst_heading_anchors = 4
 html_theme, html_title = "furo", f"sb3_quad {version}"
 html_static_path = ["_static"]
@@ -31,6 +32,7 @@ autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 autodoc_member_order = "bysource"
 autodoc_inherit_docstrings = False
+linkcheck_anchors = False
 nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*")]  # what other packages document
 
 PACKAGES = ("sb3_quad", "sb3_quad.envs", "sb3_quad.callbacks", "sb3_quad.vehicles")  # whose __all__ is in the reference
@@ -88,9 +90,19 @@ def link_cards(app: Sphinx, page: str, source: list[str]) -> None:
     source[0] = card.sub(r"](/reference/cards.md#\1)", source[0])
 
 
+def write_demo(app: Sphinx) -> None:
+    """The page of `sb3-quad demo`, which demo.md shows in a frame."""
+    from sb3_quad.evaluation.controllers import parse_controllers
+    from sb3_quad.show.demo.page import DEFAULT_AGENTS, make_page
+
+    if app.builder.format == "html":
+        (Path(app.outdir) / "throw.html").write_text(make_page(parse_controllers(DEFAULT_AGENTS), None)[0], encoding="utf-8")
+
+
 def setup(app: Sphinx) -> None:
     """Connect the above."""
     app.add_directive("manual", Manual)
+    app.connect("builder-inited", write_demo)
     app.connect("source-read", link_cards)
     app.connect("autodoc-process-docstring", describe_fields)
     app.connect("env-check-consistency", check_coverage)

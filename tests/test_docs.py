@@ -155,6 +155,13 @@ def test_links_lead_to_files_and_headings(page):
             assert heading in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
 
 
+def test_the_pages_for_users_are_short():
+    """With 900 words of README, 20,000; thesis, changelog, notes and reference are apart."""
+    apart = {"thesis.md", "choices.md", "changelog.md", "projects_entry.md"}
+    words = {path.name: len(path.read_text(encoding="utf-8").split()) for path in ROOT.glob("docs/*.md") if path.name not in apart}
+    assert sum(words.values()) <= 19_000, words
+
+
 @pytest.fixture
 def module_folder(folder, monkeypatch):
     (folder / "my_experts.py").write_text(PAGES["docs/experts.md"][0])
