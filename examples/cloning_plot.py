@@ -1,4 +1,4 @@
-"""The picture of docs/research/results.md: how far agents hover from their targets after stage two, with the cloning term and without.
+"""How far agents hover from their targets after stage two, with the cloning term and without: docs/research/results.md.
 
     sb3-quad sweep cloning
     python examples/cloning_plot.py logs/sweep/cloning_1/results.csv cloning.png

@@ -101,8 +101,7 @@ def check_environments(scope):
 
 
 def check_tutorial(scope):
-    """The agents fly, and what was paid for less turning is earned."""
-    assert scope["mine"].mass == 1.4
+    assert scope["flights"].survival.all() and np.median(scope["flights"].final_error) < 0.05
 
 
 def check_vehicles(scope):
@@ -158,8 +157,8 @@ def test_links_lead_to_files_and_headings(page):
 def test_the_pages_for_users_are_short():
     """With 900 words of README, 20,000; thesis, changelog, notes and reference are apart."""
     apart = {"thesis.md", "choices.md", "changelog.md", "projects_entry.md"}
-    words = {path.name: len(path.read_text(encoding="utf-8").split()) for path in ROOT.glob("docs/*.md") if path.name not in apart}
-    assert sum(words.values()) <= 19_000, words
+    pages = [path for path in ROOT.glob("docs/*.md") if path.name not in apart]
+    assert sum(len(path.read_text(encoding="utf-8").split()) for path in pages) <= 19_000
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""rl_zoo3 and this package: the table of docs/reference/zoo_flags.md, and the bridge in rl_zoo3's own environment (``make test-zoo``).
+"""rl_zoo3 and this package: docs/reference/zoo_flags.md, and the bridge in rl_zoo3's own environment (``make test-zoo``).
 
 rl_zoo3 patches Gymnasium where it is imported, so everything of it runs in processes of its own; skipped where it is missing.
 """
@@ -45,7 +45,7 @@ with_zoo = pytest.mark.skipif(importlib.util.find_spec("rl_zoo3") is None, reaso
 
 def table():
     """From a script of rl_zoo3 to its rows: option strings, status, remark."""
-    sections = re.split(r"^## ", (ROOT / "docs" / "reference" / "zoo_flags.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    sections = re.split(r"^## ", (ROOT / "docs/reference/zoo_flags.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
     found = {}
     for section in sections:
         name = section.split("\n", 1)[0].strip()

@@ -31,7 +31,7 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
 
     All arguments of :class:`stable_baselines3.PPO` keep their meaning and defaults. An update that adds nothing (a cloning
     weight and an ``l2_coef`` of 0, no ``critic_warmup``, and either no ``clip_range_vf`` or ``max_clipped_value=False``) is
-    PPO's, bit for bit; any other is equal to PPO's to rounding, plus what is added, in less time (docs/research/results.md). A saved
+    PPO's, bit for bit; any other is equal to PPO's to rounding, plus what is added, in less time (docs/ppo_bc.md). A saved
     model loads with ``PPO.load``, even where this package is not installed.
 
     :param expert: who labels the visited states: an object with ``actions(state)`` on the true state of our environments,
