@@ -91,7 +91,7 @@ test-extras:
 	PYTHON=$(PYTHON) .ci/extras $(ARGS)
 
 # -n: what a page or a docstring refers to must be there.
-SPHINX := $(DOCS_VENV)/bin/python -m sphinx -n -W --keep-going -q -d build/doctrees
+SPHINX := $(DOCS_VENV)/bin/python -m sphinx -E -n -W --keep-going -q -d build/doctrees
 
 docs: $(DOCS_INSTALLED)
 	$(SPHINX) -b html docs build/docs $(ARGS)

@@ -25,6 +25,7 @@ myst_enable_extensions = ["colon_fence", "dollarmath"]
 exclude_patterns = ["projects_entry.md"]  # a text for elsewhere
 myst_heading_anchors = 4
 html_theme, html_title = "furo", f"sb3_quad {version}"
+html_show_copyright = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 copybutton_exclude = ".linenos, .gp, .go"
@@ -78,7 +79,8 @@ def check_coverage(app: Sphinx, env: BuildEnvironment) -> None:
     for page in [ROOT / "README.md", *ROOT.glob("docs/**/*.md")]:
         for module, names in IMPORTED.findall(page.read_text(encoding="utf-8")):
             wanted |= {f"{module}.{name.strip()}" for name in names.split(",")}
-    documented = [find(path) for path in env.domains.python_domain.objects]
+    kinds = ("class", "function", "data", "exception")
+    documented = [find(path) for path, each in env.domains.python_domain.objects.items() if each.objtype in kinds]
     for path in sorted(wanted):
         if not any(find(path) is each for each in documented):
             logging.getLogger(__name__).warning("%s is not in the reference", path)

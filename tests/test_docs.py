@@ -16,11 +16,11 @@ from sb3_quad.evaluation.flights import fly
 ROOT = Path(__file__).resolve().parent.parent
 ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or by what it is
     ("docs/evaluate.md", 0): "reads the folder of a whole evaluation",
-    ("docs/experts.md", 0): "a module, flown below",
     ("docs/export.md", 0): "tests/test_export.py",
     ("docs/export.md", 1): "tests/test_export.py",
     ("docs/export.md", 2): "tests/test_export.py",
     ("docs/research/experts.md", 0): "flies 13,440 episodes",
+    ("docs/research/experts.md", 1): "a module, flown below",
 }
 
 
@@ -163,7 +163,7 @@ def test_the_pages_for_users_are_short():
 
 @pytest.fixture
 def module_folder(folder, monkeypatch):
-    (folder / "my_experts.py").write_text(PAGES["docs/experts.md"][0])
+    (folder / "my_experts.py").write_text(PAGES["docs/research/experts.md"][1])
     monkeypatch.syspath_prepend(str(folder))
     yield folder
     sys.modules.pop("my_experts", None)

@@ -21,7 +21,7 @@ ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "--executor ray": "tests/test_ray.py",
     "--resume": "tests/test_runs.py",
     "--track": "tests/test_tracking.py",
-    "my_experts:lqr": "tests/test_docs.py",
+    "my_experts:": "tests/test_docs.py",
     "my_package.control:make": "a module of the user's",
     "$RUNS": "agents of a sweep of an hour and a half",
     "…": "a line in short",

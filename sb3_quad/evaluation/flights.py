@@ -34,25 +34,25 @@ TILT, RATE, HOLD = np.radians(45.0), 2.0, 0.2  # stable: tilt (rad), roll and pi
 class Flights:
     """The metrics of n episodes, one per row."""
 
-    success: BoolArray  # (n,), survived, and ended at the (last) target: success_distance and success_tilt of the task
-    survival: BoolArray  # (n,), neither collision nor out of range: the thesis's success
-    collision: BoolArray  # (n,), the ground was touched
-    reward: FloatArray  # (n,), sum of the rewards
-    length: IntArray  # (n,), control steps
-    flown: FloatArray  # (n,), s until lost or the end
-    # By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a course, to the last waypoint.
+    success: BoolArray  #: (n,), survived, and ended at the (last) target: success_distance and success_tilt of the task
+    survival: BoolArray  #: (n,), neither collision nor out of range: the thesis's success
+    collision: BoolArray  #: (n,), the ground was touched
+    reward: FloatArray  #: (n,), sum of the rewards
+    length: IntArray  #: (n,), control steps
+    flown: FloatArray  #: (n,), s until lost or the end
+    #: By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a course, to the last waypoint.
     time_to: Mapping[float, FloatArray]
-    # By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or was lost.
+    #: By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or was lost.
     time_to_stay: Mapping[float, FloatArray]
-    overshoot: FloatArray  # (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
-    path_length: FloatArray  # (n,), m, over the whole episode
-    final_error: FloatArray  # (n,), |r - r_T| at the end, m
-    final_offset: FloatArray  # (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
-    stabilised: FloatArray  # (n,), s until it was stable again, NaN if it never was, see Motion
-    sideways: FloatArray  # (n,), largest distance from the straight way to the target, m; NaN where there is none
-    waypoint_times: FloatArray  # (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
-    start: FloatArray  # (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates (body); SI
-    target: FloatArray  # (n, 3), the first target, m
+    overshoot: FloatArray  #: (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
+    path_length: FloatArray  #: (n,), m, over the whole episode
+    final_error: FloatArray  #: (n,), |r - r_T| at the end, m
+    final_offset: FloatArray  #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    stabilised: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
+    sideways: FloatArray  #: (n,), largest distance from the straight way to the target, m; NaN where there is none
+    waypoint_times: FloatArray  #: (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
+    start: FloatArray  #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates (body); SI
+    target: FloatArray  #: (n, 3), the first target, m
 
     @property
     def n(self) -> int:
