@@ -29,7 +29,7 @@ help:
 	@echo "make test-zoo       run the tests that need rl_zoo3, Ray or wandb, in an environment of its own"
 	@echo "make test-transfer  fly exported agents in the simulators of others, in an environment of its own"
 	@echo "make transfer-table print the table of docs/research/export.md, ARGS=\"-n 64 --seed 2\""
-	@echo "make test-extras    install each extra into an empty environment, as README says, and try it; ARGS=\"tune zoo\" some"
+	@echo "make test-extras    install each extra into an empty environment, as docs/installation.md says, and try it; ARGS=\"tune zoo\" some"
 	@echo "make docs           build the site into build/docs/, in an environment of its own; what is missing or broken is an error"
 	@echo "make docs-links     ask each address outside of the site, where there is a network"
 	@echo "make lint           check code style, and which package imports which"

@@ -42,9 +42,21 @@ from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.controllers.zips import load_model, saved_algorithm, saved_data
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.evaluation.flights import Flights, fly
-from sb3_quad.evaluation.metric_tables import MEDIAN, QUANTILE, REWARD, SUCCESS, SURVIVAL, metric_cells, time_row
+from sb3_quad.evaluation.metric_tables import (
+    LIMIT,
+    MEDIAN,
+    QUANTILE,
+    REWARD,
+    SUCCESS,
+    SURVIVAL,
+    metric_cells,
+    stay_row,
+    time_row,
+)
 from sb3_quad.evaluation.metrics import Metrics, summarise
 from sb3_quad.evaluation.results import file_name
+from sb3_quad.evaluation.scenarios.parts import Target
+from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.export.network import check_policy
 from sb3_quad.simulation.frames import ObservationSettings
@@ -55,9 +67,9 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 UNKNOWN = "not recorded"
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
-DISTANCES = (10.0, 15.0, 20.0)  # m
-RECOVERY, NEAR = "state recovery", time_row(0.1)
-SHOWN = (SUCCESS, SURVIVAL, REWARD, NEAR, MEDIAN, QUANTILE)
+TARGETS = {f"targets {distance:.0f} m away": distance for distance in (10.0, 15.0, 20.0)}  # m
+RECOVERY, TIMES = "state recovery", (stay_row(0.1), LIMIT, time_row(0.1))
+SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE)
 
 
 def add_arguments(parser: Parser) -> None:
@@ -97,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
         zip_stream.flush()
         flown = measure(load_model(zip_stream.name), options.episodes, **how)
         rows = {name: summarise(each) for name, each in flown.items()}
-        text = write_card(options.name, rows, options.made_by or command, facts, {**how, "vehicle": how["vehicle"].name})
+        text = write_card(options.name, rows, options.made_by or command, facts, how)
         metadata, files = hub_layout(options.name, content, settings.task, flown) if laid_out else ("", {})
         card_stream.write(f"{metadata}{text}".encode())
         signals = last.enter_context(StopSignals())  # nothing comes between replacing the one and the other
@@ -169,10 +181,10 @@ def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Flights]
     """
     parts = [fly(policy, "state_recovery", n_episodes, seed_for("card", k), **settings) for k in range(N_RECOVERIES)]
     rows = {RECOVERY: Flights.concatenate(parts)}
-    for distance in DISTANCES:
+    for name, distance in TARGETS.items():
         task = {"target_distance": distance}
         seed = seed_for("card", int(1000 * distance))
-        rows[f"targets {distance:.0f} m away"] = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
+        rows[name] = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
     return rows
 
 
@@ -220,9 +232,11 @@ def write_card(
     """
     rows = []
     for task, metrics in measured.items():
-        cells = dict(metric_cells(metrics))
+        target, flown = Target(distance=TARGETS.get(task, 0.0)), (settings["vehicle"], settings.get("vehicles"))
+        limit = Scenario(name="card", target=target, vehicle=flown[0], vehicles=flown[1]).physical_limit
+        cells = {**metric_cells(metrics), LIMIT: Cell(limit, words="–")}
         if task == RECOVERY:  # begins at its target
-            cells[NEAR] = Cell(words="–")
+            cells |= dict.fromkeys(TIMES, Cell(words="–"))
         rows.append(Row(task, "", [cells[row] for row in SHOWN]))
     columns = [Column(row.heading) for row in SHOWN]
     seen = ObservationSettings.model_validate(
@@ -234,7 +248,7 @@ def write_card(
     return template.render(
         name=name,
         frames=", ".join(f"{key}={value!r}" for key, value in seen.model_dump(exclude_defaults=True).items()),
-        vehicle=f"the vehicle `{settings['vehicle']}`" if settings.get("vehicles") is None else str(settings["vehicles"]),
+        vehicle=f"the vehicle `{settings['vehicle'].name}`" if settings.get("vehicles") is None else str(settings["vehicles"]),
         noise=in_words(settings["noise"]),
         recoveries=f"{measured[RECOVERY].n:,}",
         targets=f"{next(metrics.n for task, metrics in measured.items() if task != RECOVERY):,}",

@@ -25,6 +25,7 @@ from sb3_quad.evaluation.results import load_results
 from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.vehicles.vehicle import load_vehicle
 
 SUITE = """
 name: small
@@ -91,6 +92,16 @@ def rows(folder: str = "out") -> list[dict[str, str]]:
 
 def times_of_change(folder):
     return {path: path.stat().st_mtime_ns for path in sorted(folder.rglob("*.npz"))}
+
+
+def test_the_physical_limit_stands_beside_the_time_to_stay(here, capsys):
+    some = ["--suite", "thesis", "--scenario", "tracking", "tracking_15m", "--episodes", "2"]
+    assert main(["evaluate", "geometric", "crazyflie-robust", *some, "-o", "out", "--no-report"]) == 0
+    limits = [load_vehicle(name).time_optimal[10] for name in ("itm", "crazyflie")]
+    assert [entry.physical_limit for entry in load_results("out").entries] == [*limits, None, None]
+    lines = capsys.readouterr().out.splitlines()
+    (at,) = (number for number, line in enumerate(lines) if "physical limit of that time, s" in line)
+    assert all(f"{limit:.2f}" in lines[at] for limit in limits) and "to stay within 0.1 m, s" in lines[at - 1]
 
 
 def test_table_results_and_episodes_agree(here, capsys):

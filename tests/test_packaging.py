@@ -133,8 +133,8 @@ def test_the_extra_for_developers_holds_all_but_those_apart(options):
     extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
     assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", *APART))) - {"torch"}
     assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
-    readme, tried = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", ".ci/extras"))
-    assert all(f"| `[{name}]` |" in readme and re.search(rf"^ +{name}\)", tried, re.MULTILINE) for name in extras)
+    page, tried = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/installation.md", ".ci/extras"))
+    assert all(f"| `[{name}]` |" in page and re.search(rf"^ +{name}\)", tried, re.MULTILINE) for name in extras)
 
 
 def test_extras_are_installed_from_a_clone(options):

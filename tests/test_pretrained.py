@@ -160,6 +160,7 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_ru
         "`dagger`, ",
         "16 fresh recoveries and 4 fresh targets",
         "| state recovery |",
+        "| 1.94 |",  # the physical limit, beside the time to stay
     ):
         assert part in card
     slim, whole = (PPO.load(path, device="cpu") for path in (tmp_path / "mine.zip", source))

@@ -105,6 +105,35 @@ def test_vary_is_a_grid_of_named_cells():
     assert axis_label("start.attitude.tilt") == "tilt (deg)"
 
 
+@pytest.mark.parametrize(
+    ("entry", "limit"),
+    [
+        ("target: {distance: 10}", 10),
+        ("target: {distance: 20}, noise: 0", 20),
+        ("target: {distance: 15}", None),
+        ("target: [10, 0, 15]", None),  # one of the directions that the mean is of
+        ("start: {position: [0, 0, 14]}, target: {distance: 10}", None),
+        ("start: {velocity: [1, 0, 0]}, target: {distance: 10}", None),
+        ("vehicle_changes: {delay: 4}, target: {distance: 10}", None),
+        ("vehicles: raptor, target: {distance: 10}", None),
+        ("randomize: {gusts: {std: 1}}, target: {distance: 10}", None),
+        ("wrenches: [{force: [1, 0, 0]}], target: {distance: 10}", None),
+        ("tolerances: [0.2], target: {distance: 10}", None),
+        ("start: {attitude: uniform}", None),
+    ],
+)
+def test_the_physical_limit_is_told_where_it_is_that_of_the_flights(entry, limit):
+    for name in ("crazyflie", "itm"):
+        vehicle = load_vehicle(name)
+        expected = None if limit is None else vehicle.time_optimal[limit]
+        each = scenario(f"vehicle: {name}, {entry}")
+        assert each.physical_limit == expected
+        older = vehicle.model_copy(update={"time_optimal": None})  # as the zips of agents from before its limit was known
+        assert each.model_copy(update={"vehicle": older}).physical_limit == expected
+        other = vehicle.model_copy(update={"mass": 1.01 * vehicle.mass})
+        assert each.model_copy(update={"vehicle": other}).physical_limit is None
+
+
 @pytest.mark.parametrize("name", ["itm", "crazyflie"])
 def test_wrenches_in_weights_grow_with_the_vehicle_and_change_no_others(name):
     vehicle = load_vehicle(name)

@@ -205,7 +205,7 @@ def test_a_sequence_explains_its_signs(fall, hit, monkeypatch):
 
 
 @pytest.mark.skipif(not VIDEO, reason="the extra [video] is not installed")
-@pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif", "film.webp"])
 def test_videos_hold_every_frame(tmp_path, name):
     import imageio.v2 as imageio
 

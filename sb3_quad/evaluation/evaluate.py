@@ -185,6 +185,7 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
         seconds=round(time.perf_counter() - start, 3),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         metrics=summarise(flights),
+        physical_limit=scenario.physical_limit,
         flights=flights_path(job.record.label, scenario.name),
     )
     return entry, {**episode_arrays(flights, scenario.episode_seeds()), **trajectories}

@@ -19,6 +19,7 @@ PATH, MEDIAN, QUANTILE = Row("mean path", "m"), Row("final error, median", "m"),
 STABLE, SIDEWAYS = Row("mean time until stable", "s"), Row("beside the straight way", "m")
 REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
+LIMIT = Row("physical limit of that time", "s")
 LEAVES, OVERSHOOT = Row("leave it again", "%"), Row("overshoot, median", "m")
 ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
@@ -65,9 +66,9 @@ def metric_cells(metrics: Metrics) -> Cells:
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
-    """As :func:`metric_cells`, of the controller with that label; None if it failed."""
+    """As :func:`metric_cells`, of the controller with that label, beside what its vehicle could do; None if it failed."""
     entry = results.entry(controller, scenario.name)
-    return None if entry is None else metric_cells(entry.metrics)
+    return None if entry is None else {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
 
 
 def reference_cells(reference: Reference) -> Cells:
@@ -160,7 +161,7 @@ def _rows_of(scenario: Scenario) -> list[Row]:
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
     if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
         return [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
-    times = [stay_row(arrival_tolerance(tolerances)), LEAVES, OVERSHOOT, *map(time_row, tolerances)]
+    times = [stay_row(arrival_tolerance(tolerances)), LIMIT, LEAVES, OVERSHOOT, *map(time_row, tolerances)]
     return [SUCCESS, SURVIVAL, REWARD, *times, PATH, SIDEWAYS, MEDIAN, QUANTILE]
 
 

@@ -49,6 +49,7 @@ class Entry(Frozen):
     seconds: float = Field(description="wall-clock time it took")
     date: str = Field(description="day on which it was flown, UTC, year-month-day")
     metrics: Metrics
+    physical_limit: float | None = Field(default=None, description="Scenario.physical_limit, beside the time to stay, s")
     flights: str = Field(description="path of the .npz, relative to the folder")
 
     @property

@@ -30,7 +30,7 @@ PANELS_ABREAST = 3
 LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a target that is replaced
 WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-FORMATS = (".mp4", ".gif")
+FORMATS = (".mp4", ".webp", ".gif")
 
 
 def check_film(path: Path) -> Any:

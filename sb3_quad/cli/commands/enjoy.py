@@ -55,7 +55,7 @@ def add_arguments(parser: Parser) -> None:
     add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
     add("--target", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where to fly to, m")
     add("--no-render", action="store_true", help="only fly and print how it went")
-    output = "write films (.mp4, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
+    output = "write films (.mp4, .webp, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
     add("-o", "--output", nargs="+", default=[], metavar="FILE", help=output)
     add("--size", type=_size, metavar="WxH", help="size of one controller's panel, pixels")
     add("--speed", type=above_zero, default=1.0, metavar="X", help="playback speed of film and window; 0.5 is slow motion (1)")
