@@ -1,6 +1,7 @@
 """The Python of the README and of docs/ runs as it stands there; the fast tests shorten its trainings."""
 
 import re
+import runpy
 import sys
 from pathlib import Path
 
@@ -132,14 +133,18 @@ def test_a_page_gives_what_it_says(page, capsys):
 
 
 @pytest.mark.slow
-def test_two_pages_train_the_same_stages_and_show_the_same(monkeypatch):
+def test_pages_and_examples_train_the_same_stages_and_show_the_same(monkeypatch):
     """Of which one trains in full, above. After three rollouts the actor has learnt, too."""
-    trained, pages = shorten_trainings(monkeypatch, rollouts=3), ("README.md", "docs/ppo_bc.md")
-    scopes = [run(page) for page in pages]
-    assert scopes[1]["model"].num_timesteps == 3 * 60_000 + 60_000
-    assert len(trained) == 5 and trained[:2] == trained[2:4]  # the second page then goes on
-    ours, theirs = (re.findall(r"\d+\.\d+", shown_output(page))[-4:] for page in pages)
-    assert ours == theirs
+    trained, shown = shorten_trainings(monkeypatch, rollouts=3), {}
+    for page in ("README.md", "docs/ppo_bc.md"):
+        scope, shown[page] = run(page), re.findall(r"\d+\.\d+", shown_output(page))[-4:]
+    assert scope["model"].num_timesteps == 3 * 60_000 + 60_000  # the second page goes on
+    del trained[4:]
+    for script in (["train_dagger.py"], ["train_ppo_bc.py", "dagger.zip"]):
+        monkeypatch.setattr(sys, "argv", script)
+        runpy.run_path(str(ROOT / "examples" / script[0]), run_name="__main__")
+    assert trained[:2] == trained[2:4] == trained[4:]
+    assert shown["README.md"] == shown["docs/ppo_bc.md"]
 
 
 def test_exceptions_and_checks_belong_to_pages():
