@@ -1,6 +1,7 @@
 """The Python of the README and of docs/ runs as it stands there; the fast tests shorten its trainings."""
 
 import re
+import runpy
 import sys
 from pathlib import Path
 
@@ -53,21 +54,29 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def shorten_trainings(monkeypatch):
-    """Trainings end after their first rollout."""
-    learn = OnPolicyAlgorithm.learn
+def shorten_trainings(monkeypatch, rollouts=1):
+    """Trainings end after so many rollouts. A list of them: how long they were to be, and the weights that they end with."""
+    learn, trained = OnPolicyAlgorithm.learn, []
 
     def short(self, total_timesteps, *args, **kwargs):
-        return learn(self, min(total_timesteps, self.n_steps * self.n_envs), *args, **{**kwargs, "progress_bar": False})
+        size = min(total_timesteps, rollouts * self.n_steps * self.n_envs)
+        learn(self, size, *args, **{**kwargs, "progress_bar": False})
+        trained.append((total_timesteps, [each.tolist() for each in self.policy.state_dict().values()]))
+        return self
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
     monkeypatch.setattr(sb3_quad.training.trim, "trim", lambda model: None)  # which needs an agent that flies
+    return trained
+
+
+def shown_output(page):
+    (shown,) = re.findall(r"^```text\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    return shown
 
 
 def check_output(page, output):
     """A page shows what its code prints, to within what another seed changes; stage two recovers more often."""
-    (shown,) = re.findall(r"^```text\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
-    number = re.compile(r"\d+\.\d+")
+    shown, number = shown_output(page), re.compile(r"\d+\.\d+")
     assert number.sub("#", shown) in number.sub("#", output)
     ours, theirs = ([[float(each) for each in number.findall(line)] for line in text.splitlines()] for text in (output, shown))
     for (survival, error), (shown_survival, shown_error) in zip(
@@ -87,10 +96,6 @@ def check_dagger(scope):
     assert len(scope["model"].dataset) == scope["model"].num_timesteps
 
 
-def check_ppo_bc(scope):
-    assert scope["model"].num_timesteps == 3_060_000
-
-
 def check_dynamics(scope):
     assert len(scope["difference"]) == 5 and 0.0 < max(scope["difference"].values()) < 1e-9
     assert scope["observed"] < 1e-6 and scope["fastest"] > 20.0
@@ -108,12 +113,10 @@ def check_vehicles(scope):
     assert abs(scope["flights"].survival.mean() - 0.953) < 0.01
 
 
-STAGES = ("README.md", "docs/ppo_bc.md")  # which train both stages, and show what they print
 CHECKS = {
     "README.md": check_readme,
     "docs/dagger.md": check_dagger,
     "docs/environments.md": check_environments,
-    "docs/ppo_bc.md": check_ppo_bc,
     "docs/research/dynamics.md": check_dynamics,
     "docs/research/vehicles.md": check_vehicles,
     "docs/tutorial.md": check_tutorial,
@@ -130,8 +133,23 @@ def test_a_page_runs_with_trainings_of_one_rollout(page, monkeypatch):
 @pytest.mark.parametrize("page", CHECKS)
 def test_a_page_gives_what_it_says(page, capsys):
     CHECKS[page](run(page))
-    if page in STAGES:
+    if page == "README.md":
         check_output(page, capsys.readouterr().out)
+
+
+@pytest.mark.slow
+def test_pages_and_examples_train_the_same_stages_and_show_the_same(monkeypatch):
+    """Of which one trains in full, above. After three rollouts the actor has learnt, too."""
+    trained, shown = shorten_trainings(monkeypatch, rollouts=3), {}
+    for page in ("README.md", "docs/ppo_bc.md"):
+        scope, shown[page] = run(page), re.findall(r"\d+\.\d+", shown_output(page))[-4:]
+    assert scope["model"].num_timesteps == 3 * 60_000 + 60_000  # the second page goes on
+    del trained[4:]
+    for script in (["train_dagger.py"], ["train_ppo_bc.py", "dagger.zip"]):
+        monkeypatch.setattr(sys, "argv", script)
+        runpy.run_path(str(ROOT / "examples" / script[0]), run_name="__main__")
+    assert trained[:2] == trained[2:4] == trained[4:]
+    assert shown["README.md"] == shown["docs/ppo_bc.md"]
 
 
 def test_exceptions_and_checks_belong_to_pages():

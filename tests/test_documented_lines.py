@@ -1,17 +1,21 @@
-"""Every `sb3-quad` line of README, docs/ and --help runs, on one rollout, a few flights and a few seconds of film."""
+"""Every `sb3-quad` line of README, docs/ and --help runs, on one small rollout and a few flights of a second."""
 
 import re
 import shlex
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 from stable_baselines3 import PPO
 
-from sb3_quad.base.yaml_files import YamlFolder
+from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
 from sb3_quad.cli import main
 from sb3_quad.cli.app import COMMANDS
 from sb3_quad.controllers.pretrained import pretrained
+from sb3_quad.evaluation import evaluate
+from sb3_quad.evaluation.scenarios import load
+from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training import pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,16 +31,18 @@ ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "…": "a line in short",
 }
 SHORTER = {  # flags that a command is given beside those that stand there
-    "evaluate": ["--episodes", "2", "--overwrite"],
+    "evaluate": ["--episodes", "2", "--overwrite", "--no-report"],  # a report is written for the lines of report
     "enjoy": ["-n", "20", "--overwrite"],
     "export": ["--overwrite"],
     "sweep": ["--dry-run"],
     "train": ["--eval-episodes", "2", "--no-progress"],
     "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", "--no-progress"],
     "demo": ["--overwrite"],
-    "benchmark": ["--seconds", "0.02", "--sizes", "8"],
+    "benchmark": ["--seconds", "0.02", "--sizes", "8", "--n-envs", "1"],
     "check-vehicle": ["-n", "2"],
 }
+SMALL = {"n_timesteps": 960, "n_envs": 48, "n_steps": 20, "batch_size": 240, "n_epochs": 2, "gradient_steps": 4}
+FLOWN = 100  # control steps, at most
 WITHOUT = ("-n", "--n-trials", "--max-total-trials", "--sizes", "-P")  # flags that SHORTER gives, or that need a screen
 
 
@@ -91,19 +97,24 @@ def folder(tmp_path_factory, trained_runs):
 
 
 def shorter(content):
-    """Settings with one short rollout, no requirement and no trim, which an agent of one rollout would not pass."""
+    """Settings with one small rollout and small grids; no requirement and no trim, which an agent of one rollout fails."""
     if not isinstance(content, dict):
         return [shorter(each) for each in content] if isinstance(content, list) else content
     kept = {key: shorter(value) for key, value in content.items() if key not in ("require", "trim", "position_scale")}
-    return kept | ({"n_timesteps": 960} if isinstance(kept.get("n_timesteps"), int) else {})
+    if isinstance(kept.get("vary"), dict):
+        kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}
+    return kept | {key: min(kept[key], most) for key, most in SMALL.items() if isinstance(kept.get(key), int)}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
-    command, *arguments = shlex.split(line)
-    read = YamlFolder.read
+    command, *arguments = shlex.split(line.replace("--n-envs 8", "--n-envs 2"))  # each may be a process
+    read, longest = YamlFolder.read, FlightSettings.longest_episode.fget
     monkeypatch.setattr(YamlFolder, "read", lambda self, source: (shorter(read(self, source)[0]), read(self, source)[1]))
+    monkeypatch.setattr(load, "parse_yaml", lambda text, where: shorter(parse_yaml(text, where)))
+    monkeypatch.setattr(evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1))  # processes would fly longer
+    monkeypatch.setattr(FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN)))
     monkeypatch.setattr(pipeline, "is_pipeline_run", lambda path: False)
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(folder)

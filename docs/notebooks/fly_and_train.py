@@ -1,0 +1,206 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Fly and train in five minutes
+#
+# First you fly an agent that comes with the package. Then you train one of your own: it imitates a PID controller, and
+# PPO takes it further than its teacher. Everything runs on one core of a CPU.
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.utils import LinearSchedule
+
+from sb3_quad import PPOBC, DAgger, PIDExpert, load_pretrained
+from sb3_quad.base.colours import COLOURS
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.report.plots import STYLE
+from sb3_quad.training.transfer import transfer_policy
+from sb3_quad.training.trim import trim
+
+plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
+
+# %% tags=["parameters"]
+EPISODES = 480  # of each comparison
+IMITATION = 600_000  # timesteps of stage one
+REINFORCEMENT = 3_000_000  # timesteps of stage two
+
+# %% [markdown]
+# ## Fly
+#
+# A *state recovery* begins in any attitude, upside down included, with random velocity and body rates. The controller
+# has to level the quadcopter and bring it back to where it was let go. `fly` flies any number of episodes side by side,
+# and the same seed gives every controller the same starts. A `Recorder` keeps the trajectories.
+
+
+# %%
+def recorded(controller, n=24, seed=7):
+    """Trajectories of n recoveries."""
+    recorder = Recorder(n)
+    fly(controller, "state_recovery", n_episodes=n, seed=seed, max_steps=600, hooks=[recorder])
+    return recorder.arrays()
+
+
+def plot_recoveries(controllers):
+    """Tilt and distance from the target over time, one column for each controller; a cross where a flight is lost."""
+    _, axes = plt.subplots(2, len(controllers), figsize=(4.2 * len(controllers), 4.6), sharex=True, sharey="row")
+    for (top, bottom), (name, controller), colour in zip(axes.T, controllers.items(), COLOURS, strict=False):
+        flights = recorded(controller)
+        _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
+        tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1)))  # of the body's z axis
+        distance = np.linalg.norm(flights["position"] - flights["target"], axis=-1)
+        for panel, values in ((top, tilt), (bottom, distance)):
+            panel.plot(flights["time"], values.T, color=colour, alpha=0.55, linewidth=1)
+            for row, samples in zip(values, flights["samples"], strict=True):
+                if samples < len(flights["time"]):
+                    panel.plot(flights["time"][samples - 1], row[samples - 1], "x", color="#1c2430", markersize=5)
+        top.set_title(name, loc="left", fontweight="bold")
+        bottom.set(xlabel="time (s)", xlim=(0, 6))
+    axes[0, 0].set(ylabel="tilt (deg)", yticks=[0, 45, 90, 135, 180])
+    axes[1, 0].set(ylabel="distance from the target (m)", ylim=(0, 20))
+    plt.show()
+
+
+plot_recoveries({"PID expert": PIDExpert(), "itm-recovery, which comes with the package": load_pretrained("itm-recovery")})
+
+# %% [markdown]
+# Each line is a flight, each cross the end of one. The PID controller linearises at hover, and loses most flights that
+# begin upside down. The agent has learnt to turn over first.
+#
+# ## Stage one: imitate
+#
+# `DAgger` lets the policy fly and asks the expert what it would have done in each state. It is used as any algorithm of
+# Stable-Baselines3 is. `QuadcopterVecEnv` flies all its quadcopters in one compiled call.
+
+# %%
+imitation = DAgger(
+    "MlpPolicy",
+    QuadcopterVecEnv(240, task="target_tracking", seed=0),
+    expert=PIDExpert(),
+    n_steps=250,
+    batch_size=4096,
+    gradient_steps=60,
+    n_epochs=2,
+    learning_rate=LinearSchedule(4e-3, 2e-4, 1.0),
+    bc_loss="mse",
+    gamma=0.998,
+    dataset_capacity=500_000,
+    seed=0,
+    device="cpu",
+)
+imitation.learn(IMITATION)
+imitation.save("imitation")
+
+# %% [markdown]
+# ## Stage two: go beyond the expert
+#
+# `PPOBC` is PPO with a cloning term that keeps the policy near the expert. `bc_filter="agreement"` leaves out the
+# states in which the agent recovers and the PID would do otherwise. The callback is one of Stable-Baselines3, and notes
+# the mean reward of the last episodes.
+
+
+# %%
+class RewardCurve(BaseCallback):
+    """Mean reward of the last thousand episodes after each rollout."""
+
+    def _on_training_start(self):
+        self.points = []
+
+    def _on_step(self):
+        return True
+
+    def _on_rollout_end(self):
+        rewards = [episode["r"] for episode in self.model.ep_info_buffer]
+        self.points.append((self.num_timesteps, np.mean(rewards) if rewards else np.nan))
+
+
+agent = PPOBC(
+    "MlpPolicy",
+    QuadcopterVecEnv(
+        480,
+        task={"state_recovery": 0.6, "far_tracking": 0.4},
+        task_kwargs={"precision_cost": 0.03, "nearest_target": 0.0},
+        max_episode_steps=500,
+        seed=0,
+    ),
+    expert=PIDExpert(),
+    bc_coef=0.1,
+    bc_loss="mse",
+    bc_filter="agreement",
+    critic_warmup=2,
+    n_steps=125,
+    batch_size=3750,
+    n_epochs=6,
+    learning_rate=LinearSchedule(1e-3, 5e-5, 1.0),
+    gamma=0.995,
+    gae_lambda=0.98,
+    policy_kwargs={"log_std_init": -0.9},
+    stats_window_size=1000,
+    seed=0,
+    device="cpu",
+)
+transfer_policy("imitation.zip", agent)  # policy and critic
+curve = RewardCurve()
+agent.learn(REINFORCEMENT, callback=curve)
+timesteps, rewards = np.array(curve.points).T
+
+# %%
+figure, axes = plt.subplots(figsize=(6.4, 3))
+axes.plot(timesteps / 1e6, rewards, color=COLOURS[0])
+axes.set(xlabel="million timesteps of stage two", ylabel="mean reward of an episode", title="Learning curve")
+plt.show()
+
+# %% [markdown]
+# A policy that hovers beside its target is corrected without training: `trim` measures the offset and takes it out of
+# the first layer.
+
+# %%
+trim(agent)
+agent.save("my_agent")
+
+# %% [markdown]
+# ## Who recovers
+#
+# All three fly the same fresh episodes, which no training has seen.
+
+# %%
+stages = {"PID expert": PIDExpert(), "stage one, DAgger": imitation, "stage two, PPO+BC": agent}
+recoveries = {name: fly(each, "state_recovery", EPISODES, seed=1000) for name, each in stages.items()}
+targets = {name: fly(each, "target_tracking", EPISODES, seed=1000) for name, each in stages.items()}
+for name in stages:
+    survival, error = recoveries[name].survival.mean(), np.median(targets[name].final_error)
+    print(f"{name:18} {survival:6.1%} of recoveries survive; median final error of targets 10 m away {error:.3f} m")
+
+# %%
+figure, axes = plt.subplots(figsize=(6.4, 3))
+times = np.linspace(0, 6, 301)
+for (name, flights), colour in zip(recoveries.items(), COLOURS, strict=False):
+    stable = [(flights.stabilised <= time).mean() * 100 for time in times]
+    axes.plot(times, stable, color=colour, label=name, linewidth=2)
+axes.set(xlabel="time since the start (s)", ylabel="flights that are stable (%)", xlim=(0, 6), ylim=(0, 102))
+axes.set_title("How soon they are stable again")
+axes.legend(loc="lower right")
+plt.show()
+
+# %%
+plot_recoveries(stages)
+
+# %% [markdown]
+# ## Further
+#
+# `my_agent.zip` is a zip of stock `PPO`. The same two stages with more timesteps, evaluations, snapshots and a table at
+# the end are one command: `sb3-quad train --thesis`. `sb3-quad demo my_agent.zip pid` writes a page in which you throw
+# your own agent about.

@@ -1,0 +1,231 @@
+# ---
+# jupyter:
+#   jupytext:
+#     text_representation:
+#       extension: .py
+#       format_name: percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Your own expert and reward
+#
+# The experts of the package hurry. Suppose your quadcopter carries a cup of coffee: it should fly slowly and hardly
+# tilt. An expert of your own says so by example, a reward of your own by a price.
+
+# %%
+import matplotlib.pyplot as plt
+import numpy as np
+from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnvWrapper
+
+from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained
+from sb3_quad.base.colours import COLOURS
+from sb3_quad.envs import QuadcopterVecEnv
+from sb3_quad.evaluation.flightlog import Recorder
+from sb3_quad.evaluation.flights import fly
+from sb3_quad.experts.protocol import Expert
+from sb3_quad.report.plots import STYLE
+from sb3_quad.simulation.state import TARGET, QuadcopterState
+from sb3_quad.training.transfer import transfer_policy
+
+plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
+
+# %% tags=["parameters"]
+EPISODES = 240  # of each comparison
+IMITATION = 900_000  # timesteps that the agent imitates
+REINFORCEMENT = 600_000  # timesteps that another learns from the reward
+
+# %% [markdown]
+# ## An expert
+#
+# An expert has `actions(state)`: for the true state of n vehicles it returns n rows of four rotor thrusts in [-1, 1].
+# Here the geometric controller of the package does the work, and only ever sees a target close ahead. The nearer that
+# target, the slower it flies.
+
+
+# %%
+class UnhurriedExpert(Expert):
+    """Flies to a point at most ``reach`` metres ahead on the way to the target."""
+
+    def __init__(self, vehicle="itm", reach=0.6):
+        super().__init__(vehicle)
+        self.reach, self.controller = reach, GeometricExpert(vehicle)
+
+    def actions(self, state):
+        """Float32 (n, 4), for the true state of n vehicles."""
+        way = state.target - state.position
+        share = np.minimum(1.0, self.reach / np.maximum(state.distance, 1e-9))
+        near = state.array.copy()
+        near[TARGET] = (state.position + share[:, None] * way).T
+        return self.controller.actions(QuadcopterState(near))
+
+
+# %% [markdown]
+# ## Does it do what you want
+#
+# Everything that flies is asked in the same way, so that `fly` takes the expert as it is.
+
+
+# %%
+def recorded(controller, n=24, seed=7):
+    """Trajectories of n flights to targets 10 m away."""
+    recorder = Recorder(n)
+    fly(controller, "target_tracking", n_episodes=n, seed=seed, hooks=[recorder])
+    return recorder.arrays()
+
+
+def plot_flights(controllers):
+    """Distance from the target, speed and tilt over time: the median of the flights, and the range of nine in ten."""
+    _, panels = plt.subplots(1, 3, figsize=(11, 3.2))
+    for (name, controller), colour in zip(controllers.items(), COLOURS, strict=False):
+        flights = recorded(controller)
+        _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
+        values = (
+            np.linalg.norm(flights["position"] - flights["target"], axis=-1),
+            np.linalg.norm(flights["velocity"], axis=-1),
+            np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1))),
+        )
+        for panel, each in zip(panels, values, strict=True):
+            low, middle, high = np.nanpercentile(each, [5, 50, 95], axis=0)
+            panel.fill_between(flights["time"], low, high, color=colour, alpha=0.15, linewidth=0)
+            panel.plot(flights["time"], middle, color=colour, label=name)
+    for panel, label in zip(panels, ("distance from the target (m)", "speed (m/s)", "tilt (deg)"), strict=True):
+        panel.set(xlabel="time (s)", ylabel=label, xlim=(0, 15), ylim=(0, None))
+    panels[0].legend()
+    plt.show()
+
+
+expert = UnhurriedExpert()
+plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert})
+
+# %% [markdown]
+# ## An agent that imitates it
+#
+# The agent sees 18 noisy features instead of the true state. `beta` is the share of the flights that the expert flies
+# itself: all in the first rollout, fewer in each that follows.
+
+# %%
+agent = DAgger(
+    "MlpPolicy",
+    QuadcopterVecEnv(240, task="target_tracking", seed=0),
+    expert=expert,
+    n_steps=125,
+    batch_size=2048,
+    gradient_steps=100,
+    n_epochs=1,
+    gamma=0.99,
+    learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
+    beta=1.0,
+    beta_decay=0.2,
+    beta_final=0.0,
+    seed=0,
+    device="cpu",
+)
+agent.learn(IMITATION)
+agent.save("unhurried")
+plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert, "agent": agent})
+
+# %% [markdown]
+# ## A reward
+#
+# The coefficients of the task's reward have names, and are arguments of the environment: `task_kwargs={"tilt_cost":
+# 0.004}` doubles the thesis's price of a tilt. Anything else is a wrapper. This one charges for restless rotors, which
+# spill coffee too.
+
+
+# %%
+class CalmActions(VecEnvWrapper):
+    """Takes ``cost`` times the mean squared change of the action from the reward of every control step."""
+
+    def __init__(self, venv, cost):
+        super().__init__(venv)
+        self.cost = cost
+
+    def reset(self):
+        """Begin a new episode in every row; hover is the action before."""
+        self.last = np.zeros((self.num_envs, *self.action_space.shape), dtype=np.float32)
+        return self.venv.reset()
+
+    def step_async(self, actions):
+        """Note how much the action changes."""
+        self.change = np.square(actions - self.last).mean(axis=1)
+        self.last = actions.copy()
+        self.venv.step_async(actions)
+
+    def step_wait(self):
+        """The environment's own reward, less the cost."""
+        observations, rewards, dones, infos = self.venv.step_wait()
+        self.last[dones] = 0.0  # these rows begin their next episode
+        return observations, rewards - self.cost * self.change.astype(np.float32), dones, infos
+
+
+# %% [markdown]
+# `itm-imitation` comes with the package and has never heard of that price. `PPOBC` goes on from it: PPO, with a cloning
+# term that keeps the policy near an expert.
+
+
+# %%
+def make_env(n_envs, seed):
+    """Flights to targets 10 m away, where tilts cost twice as much as in the thesis, and restless rotors something."""
+    env = QuadcopterVecEnv(n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed)
+    return CalmActions(env, cost=2.0)
+
+
+calm = PPOBC(
+    "MlpPolicy",
+    make_env(240, seed=0),
+    expert=GeometricExpert(),
+    bc_coef=5.0,
+    bc_loss="huber",
+    n_steps=125,
+    batch_size=5000,
+    n_epochs=6,
+    gamma=0.99,
+    gae_lambda=0.98,
+    critic_warmup=2,
+    learning_rate=LinearSchedule(3e-4, 1.5e-5, 1.0),
+    policy_kwargs={"log_std_init": -2.6},
+    seed=0,
+    device="cpu",
+)
+transfer_policy(pretrained("itm-imitation"), calm)  # policy and critic
+calm.learn(REINFORCEMENT)
+calm.save("calm")
+
+# %% [markdown]
+# The new reward on fresh flights, before and after, and where it comes from: the squared change of the action over time.
+
+
+# %%
+def mean_reward(controller):
+    """Mean reward of the first 5 s of fresh flights."""
+    env = make_env(EPISODES, seed=1_000_000)
+    observations, total = env.reset(), np.zeros(EPISODES)
+    for _ in range(500):
+        observations, rewards, _, _ = env.step(controller.predict(observations, deterministic=True)[0])
+        total += rewards
+    return total.mean()
+
+
+_, axes = plt.subplots(figsize=(7, 3.2))
+before_and_after = {"before": load_pretrained("itm-imitation"), "after": calm}
+for (name, controller), colour in zip(before_and_after.items(), COLOURS, strict=False):
+    flights = recorded(controller, n=EPISODES, seed=1_000_000)
+    change = np.square(np.diff(flights["action"], axis=1)).mean(axis=(0, 2))
+    print(f"{name:6} mean reward {mean_reward(controller):6.2f}, mean squared change {np.nanmean(change):.6f}")
+    axes.semilogy(flights["time"][1:], change, color=colour, label=name)
+axes.set(xlabel="time (s)", ylabel="mean squared change", xlim=(0, 5), title="How restless the rotors are")
+axes.yaxis.set_major_formatter("{x:g}")
+axes.legend()
+plt.show()
+
+# %% [markdown]
+# ## Further
+#
+# In a module of yours, `my_module.py`, the expert also works in every command: `sb3-quad train --algo dagger --expert
+# my_module:UnhurriedExpert`, `sb3-quad evaluate pid my_module:UnhurriedExpert`. A coefficient of the reward can be
+# given there too: `--env-kwargs "task_kwargs:dict(tilt_cost=0.004)"`.

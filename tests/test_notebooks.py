@@ -1,0 +1,46 @@
+"""The notebooks of docs/notebooks run from top to bottom, with few episodes and one rollout of each training."""
+
+import re
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "notebooks"
+NOTEBOOKS = {path.stem: path for path in sorted(FOLDER.glob("*.py"))}
+PARAMETERS = re.compile(r'(?<=^# %% tags=\["parameters"\]\n).*?(?=^# %%)', flags=re.DOTALL | re.MULTILINE)
+
+
+def shortened(text):
+    """The code with 2 for each number of its cell of parameters, which is that of papermill."""
+    (cell,) = PARAMETERS.findall(text)
+    return text.replace(cell, re.sub(r"(?m)^([A-Z]+) = [\d_]+", r"\1 = 2", cell))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_runs(name, tmp_path, monkeypatch):
+    text, drawn = NOTEBOOKS[name].read_text(encoding="utf-8"), []
+
+    def show():
+        plt.gcf().draw_without_rendering()
+        drawn.append(plt.gcf())
+        plt.close("all")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(plt, "show", show)
+    monkeypatch.setattr("sb3_quad.training.trim.trim", lambda model: None)  # which needs an agent that flies
+    with plt.rc_context():
+        exec(compile(shortened(text), str(NOTEBOOKS[name]), "exec"), {"__name__": name})
+    assert drawn and all(figure.axes for figure in drawn)
+
+
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_a_notebook_is_in_jupytexts_form(name):
+    """Its head names the form and the kernel, its first cell is its title, and its numbers are shortened by the test above."""
+    text = NOTEBOOKS[name].read_text(encoding="utf-8")
+    _, head, cells = text.split("# ---\n", 2)
+    assert "format_name: percent" in head and "name: python3" in head
+    assert cells.startswith("\n# %% [markdown]\n# # ")
+    (numbers,) = PARAMETERS.findall(shortened(text))
+    assert re.fullmatch(r"(([A-Z]+) = 2 .*\n)+\n", numbers)
