@@ -90,7 +90,7 @@ transfer-files: $(INSTALLED)
 test-extras:
 	PYTHON=$(PYTHON) .ci/extras $(ARGS)
 
-# -n: what a page or a docstring refers to must be there.
+# -n: what a page or a docstring refers to must be there. SB3_QUAD_NOTEBOOKS=run: notebooks are shown with their outputs, in minutes.
 SPHINX := $(DOCS_VENV)/bin/python -m sphinx -E -n -W --keep-going -q -d build/doctrees
 
 docs: $(DOCS_INSTALLED)

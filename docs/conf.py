@@ -15,7 +15,9 @@ from sphinx.util import logging
 from sphinx.util.docutils import SphinxDirective
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "docs")]
+
+from notebook_pages import append_notebook  # noqa: E402
 
 import sb3_quad  # noqa: E402
 
@@ -105,6 +107,7 @@ def setup(app: Sphinx) -> None:
     """Connect the above."""
     app.add_directive("manual", Manual)
     app.connect("builder-inited", write_demo)
+    app.connect("source-read", append_notebook)
     app.connect("source-read", link_cards)
     app.connect("autodoc-process-docstring", describe_fields)
     app.connect("env-check-consistency", check_coverage)
