@@ -1,10 +1,12 @@
-"""The notebooks of docs/notebooks run from top to bottom, with few episodes and one rollout of each training."""
+"""The notebooks of docs/notebooks run from top to bottom, with few and short episodes and one rollout of each training."""
 
 import re
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import pytest
+
+from sb3_quad.simulation.settings import FlightSettings
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "notebooks"
 NOTEBOOKS = {path.stem: path for path in sorted(FOLDER.glob("*.py"))}
@@ -29,6 +31,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", show)
+    monkeypatch.setattr(FlightSettings, "longest_episode", 100)
     monkeypatch.setattr("sb3_quad.training.trim.trim", lambda model: None)  # which needs an agent that flies
     with plt.rc_context():
         exec(compile(shortened(text), str(NOTEBOOKS[name]), "exec"), {"__name__": name})

@@ -114,14 +114,14 @@ def plot_grid(results):
 plot_grid(results)
 
 # %% [markdown]
-# A success survives and ends within 0.1 m of its target. The PID and `itm-recovery` hang low under more mass and beside
-# the target under a force, since nothing in them adds up the error. `itm-robust` has an integral and remembers its last
+# A success survives and ends within 0.1 m of its target. Under another mass or a force the PID and `itm-recovery` come to
+# rest beside the target, since nothing in them adds up the error. `itm-robust` has an integral and remembers its last
 # observations, so that it finds out what it flies. A delay of six control steps is too much for all three.
 #
 # ## Two things at once
 #
 # A grid over two keys is a map: recoveries by how far the quadcopter is tilted and how fast it tumbles when it is let
-# go.
+# go, at 6 m/s in a random direction.
 
 # %%
 tumbling = parse_suite(
