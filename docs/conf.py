@@ -24,7 +24,6 @@ import sb3_quad  # noqa: E402
 project, version, author = "sb3_quad", sb3_quad.__version__, "the sb3_quad developers"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton"]
 myst_enable_extensions = ["colon_fence", "dollarmath"]
-exclude_patterns = ["projects_entry.md"]  # a text for elsewhere
 myst_heading_anchors = 4
 html_theme, html_title = "furo", f"sb3_quad {version}"
 html_show_copyright = False
