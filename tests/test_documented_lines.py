@@ -30,13 +30,14 @@ ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
     "$RUNS": "agents of a sweep of an hour and a half",
     "…": "a line in short",
 }
+EVALUATED = ["--eval-env-kwargs", "max_episode_steps:100", "--no-progress"]
 SHORTER = {  # flags that a command is given beside those that stand there
     "evaluate": ["--episodes", "2", "--overwrite", "--no-report"],  # a report is written for the lines of report
     "enjoy": ["-n", "20", "--overwrite"],
     "export": ["--overwrite"],
     "sweep": ["--dry-run"],
-    "train": ["--eval-episodes", "2", "--no-progress"],
-    "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", "--no-progress"],
+    "train": ["--eval-episodes", "2", *EVALUATED],
+    "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", *EVALUATED],
     "demo": ["--overwrite"],
     "benchmark": ["--seconds", "0.02", "--sizes", "8", "--n-envs", "1"],
     "check-vehicle": ["-n", "2"],
@@ -115,6 +116,8 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
     monkeypatch.setattr(load, "parse_yaml", lambda text, where: shorter(parse_yaml(text, where)))
     monkeypatch.setattr(evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1))  # processes would fly longer
     monkeypatch.setattr(FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN)))
+    monkeypatch.setattr("sb3_quad.show.film.HOLD", 0.1)
+    monkeypatch.setattr("sb3_quad.training.transfer.CLONE_STEPS", 100)
     monkeypatch.setattr(pipeline, "is_pipeline_run", lambda path: False)
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(folder)

@@ -14,7 +14,7 @@
 # # Fly and train in five minutes
 #
 # First you fly an agent that comes with the package. Then you train one of your own: it imitates a PID controller, and
-# PPO takes it further than its teacher. Everything runs on one core of a CPU.
+# PPO takes it further than its expert. Everything runs on one core of a CPU.
 
 # %%
 import matplotlib.pyplot as plt
@@ -108,8 +108,8 @@ imitation.save("imitation")
 # ## Stage two: go beyond the expert
 #
 # `PPOBC` is PPO with a cloning term that keeps the policy near the expert. `bc_filter="agreement"` leaves out the
-# states in which the agent recovers and the PID would do otherwise. The callback is one of Stable-Baselines3, and notes
-# the mean reward of the last episodes.
+# states in which the agent recovers and the PID would do otherwise. The callback notes the mean reward of
+# the last episodes, as any callback of Stable-Baselines3 can.
 
 
 # %%
@@ -164,6 +164,9 @@ axes.set(xlabel="million timesteps of stage two", ylabel="mean reward of an epis
 plt.show()
 
 # %% [markdown]
+# The first points are those of few and short episodes. After two rollouts, in which only the critic learns, the policy
+# gets better.
+#
 # A policy that hovers beside its target is corrected without training: `trim` measures the offset and takes it out of
 # the first layer.
 

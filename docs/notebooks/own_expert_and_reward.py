@@ -224,6 +224,8 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
+# The price is one of squares: the large changes on the way fell, the small ones at the target matter little and rose.
+#
 # ## Further
 #
 # In a module of yours, `my_module.py`, the expert also works in every command: `sb3-quad train --algo dagger --expert
