@@ -174,9 +174,9 @@ def test_links_lead_to_files_and_headings(page):
 
 def test_the_pages_for_users_are_short():
     """With 900 words of README, 20,000; thesis, changelog, notes and reference are apart."""
-    apart = {"thesis.md", "choices.md", "changelog.md", "projects_entry.md"}
+    apart = {"thesis.md", "choices.md", "changelog.md"}
     pages = [path for path in ROOT.glob("docs/*.md") if path.name not in apart]
-    assert sum(len(path.read_text(encoding="utf-8").split()) for path in pages) <= 19_000
+    assert sum(len(path.read_text(encoding="utf-8").split()) for path in pages) <= 19_100
 
 
 @pytest.mark.parametrize("page", PAGES)
