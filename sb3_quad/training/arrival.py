@@ -7,40 +7,25 @@ method: candidates fly the same episodes, and the next ones are sampled around t
 since W (s - μ) / (α σ) = (W / α) (s - μ) / σ: the zip stays stock.
 """
 
-from typing import Any, NamedTuple
-
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.evaluation.flights import NEAR, Flights, fly_settings
+from sb3_quad.evaluation.flights import NEAR, fly_settings
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.trim import Trim, first_layer
 from sb3_quad.vehicles.vehicle import first_vehicle
 
-GROUPS = (
-    ("position_x", "position_y"),
-    ("position_z",),
-    tuple(name for name in FEATURE_NAMES if name.startswith("rotation")),
-    ("velocity_x", "velocity_y"),
-    ("velocity_z",),
-    ("body_rate_x", "body_rate_y"),
-    ("body_rate_z",),
-)
-"""Features that share an α."""
-_MEMBERS = np.array([[name in group for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
+GROUPS = ("position_x position_y", "position_z", "rotation", "velocity_x velocity_y", "velocity_z", "body_rate_x body_rate_y")
+"""Features that share an α; the yaw rate's stays 1."""
+_MEMBERS = np.array([[name in group or name[:-3] == group for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
 FIRST_SPREAD, KEPT = 0.1, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 60, 480  # of a candidate in each set of flights; of the agent before and after
 LEFT, LOST = 0.5, 10.0  # s that a flight costs that leaves its target again, and one that is lost
-
-
-class _Set(NamedTuple):
-    settings: FlightSettings
-    weight: float  # of its times
 
 
 def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trained: FlightSettings) -> Trim:
@@ -50,16 +35,16 @@ def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trai
     :param settings: how evaluations fly it.
     :param trained: how it was trained: its vehicles and disturbances count, too.
     :return: the cost before and after, s: the mean time to stay within 0.1 m of targets 10 m away, 0.3 times the same in the
-        worlds of the training, and what lost flights cost.
+        worlds of the training, and what flights cost there that are lost, targets and recoveries.
     :raises ConfigError: an agent whose first layer does not read these observations.
     """
     layer, rng = first_layer(model, settings.size), np.random.default_rng(seed)
     worlds = trained.with_changes(position_integral=settings.position_integral, task_kwargs=None)
-    sets = (
-        _Set(settings.with_changes(task="target_tracking", task_kwargs=None, max_episode_steps=500), 1.0),
-        _Set(worlds.with_changes(task="target_tracking", max_episode_steps=600), 0.3),
-        _Set(worlds.with_changes(task="state_recovery", max_episode_steps=300), 0.0),
-    )
+    sets = [
+        (settings.with_changes(task="target_tracking", task_kwargs=None, max_episode_steps=500), 1.0),
+        (worlds.with_changes(task="target_tracking", max_episode_steps=600), 0.3),
+        (worlds.with_changes(task="state_recovery", max_episode_steps=300), 0.0),
+    ]
     mean, spread = np.zeros(len(GROUPS)), np.full(len(GROUPS), FIRST_SPREAD)
     for each in row_seeds(seed, ROUNDS):
         tried = mean + spread * rng.standard_normal((CANDIDATES, len(GROUPS)))
@@ -67,25 +52,23 @@ def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trai
         mean, spread = KEPT * mean + (1 - KEPT) * best.mean(axis=0), (spread + best.std(axis=0)) / 2
     before, after = _costs(model, np.stack([0.0 * mean, mean]), sets, seed, N_CHECKED)
     if after < before:
-        frames = np.tile(np.append(np.exp(mean @ _MEMBERS), np.ones(settings.frame_size - OBSERVATION_SIZE)), len(settings.ages))
+        frame = np.append(np.exp(mean @ _MEMBERS), np.ones(settings.frame_size - OBSERVATION_SIZE))
         with th.no_grad():
-            layer.weight.div_(th.as_tensor(frames, dtype=layer.weight.dtype, device=layer.weight.device))
+            layer.weight.div_(th.as_tensor(np.tile(frame, len(settings.ages))).to(layer.weight))
     return Trim(float(before), float(min(after, before)))
 
 
-def _costs(model: Any, log_scales: FloatArray, sets: tuple[_Set, ...], seed: int, n: int) -> FloatArray:
-    """What ``trim_arrival`` minimises, for each of (m, groups) candidates, on the same n flights of each set; (m,)."""
-    std = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
-    total = np.zeros(len(log_scales))
-    for part, episodes in zip(sets, row_seeds(seed, len(sets)), strict=True):
-        own = DEFAULT_STD if part.settings.observation_std is None else np.asarray(part.settings.observation_std)
-        seeds = [*row_seeds(episodes, n)] * len(log_scales)
-        flights = fly_settings(model, part.settings.with_changes(observation_std=own * std), seeds, tolerances=(NEAR,))
-        total += _cost(flights, part).reshape(len(log_scales), n).mean(axis=1)
-    return total
-
-
-def _cost(flights: Flights, part: _Set) -> FloatArray:
-    never = 2.0 * part.settings.longest_episode * first_vehicle(part.settings.vehicle).control_step
-    stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=never)
-    return part.weight * (stay + LEFT * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival
+def _costs(
+    model: BaseAlgorithm, log_scales: FloatArray, sets: list[tuple[FlightSettings, float]], seed: int, n: int
+) -> FloatArray:
+    """What :func:`trim_arrival` minimises for each of m candidates, on the same n flights of each set, (m,)."""
+    scales = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
+    total = np.zeros(len(scales))
+    for (settings, weight), episodes in zip(sets, row_seeds(seed, len(sets)), strict=True):
+        own = DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
+        seeds = row_seeds(episodes, n) * len(log_scales)
+        flights = fly_settings(model, settings.with_changes(observation_std=own * scales), seeds, tolerances=(NEAR,))
+        never = 2.0 * settings.longest_episode * first_vehicle(settings.vehicle).control_step
+        stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=never)
+        total += weight * (stay + LEFT * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival
+    return total.reshape(len(log_scales), n).mean(axis=1)
