@@ -22,8 +22,8 @@ from sb3_quad.vehicles.vehicle import first_vehicle
 GROUPS = ("position_x position_y", "position_z", "rotation", "velocity_x velocity_y", "velocity_z", "body_rate_x body_rate_y")
 """Features that share an α; the yaw rate's stays 1."""
 _MEMBERS = np.array([[name in group or name[:-3] == group for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
-ROUNDS, CANDIDATES, BEST = 8, 16, 4
-FIRST_SPREAD, KEPT = 0.1, 0.3  # of log α at first; share of the last round's mean in the next
+ROUNDS, CANDIDATES, BEST = 10, 16, 4
+FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 60, 480  # of a candidate in each set of flights; of the agent before and after
 LEFT, LOST = 0.5, 10.0  # s that a flight costs that leaves its target again, and one that is lost
 
