@@ -169,7 +169,7 @@ def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
 
 def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_cautious`, by a half and with 0.1 weights, by each vehicle's derived gains: for vehicles unlike this one."""
+    """As :func:`told_cautious`, by a half and 0.1 weights, with each vehicle's derived gains: for vehicles unlike this one."""
     return _cautious(vehicle, derived_gains(load_vehicle(vehicle)), 0.5, 0.1)
 
 
