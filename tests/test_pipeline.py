@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+import torch as th
 import yaml
 from stable_baselines3 import PPO
 
@@ -16,6 +17,8 @@ from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
+from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.training import arrival
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs, with_settings
 from sb3_quad.training.trainer import train
@@ -119,6 +122,35 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
     result = trim(model)
     assert result.before > 0.4 and result.after < 0.05
+
+
+@pytest.mark.slow
+def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_overshoot_again(monkeypatch):
+    monkeypatch.setattr(arrival, "N_FLIGHTS", 24)
+    monkeypatch.setattr(arrival, "N_CHECKED", 120)
+    model, settings = load_pretrained("itm-recovery"), FlightSettings()
+    layer = model.policy.mlp_extractor.policy_net[0]
+    with th.no_grad():
+        layer.weight[:, 12:15] *= 0.7
+    before = layer.weight.detach().clone()
+    result = arrival.trim_arrival(model, 1, settings, settings)
+    assert result.after < result.before - 0.2
+    factors = (layer.weight / before).detach().numpy()
+    np.testing.assert_allclose(factors, np.broadcast_to(factors[0], factors.shape), rtol=1e-4)
+    assert factors[0, 12] == pytest.approx(factors[0, 13]) and factors[0, 12] > 1.1  # more braking
+    np.testing.assert_allclose(factors[:, -1], 1.0)
+
+
+def test_scales_that_do_not_help_are_not_kept(monkeypatch):
+    for name, value in (("ROUNDS", 1), ("CANDIDATES", 2), ("BEST", 1), ("N_FLIGHTS", 2), ("N_CHECKED", 2)):
+        monkeypatch.setattr(arrival, name, value)
+    env = QuadcopterVecEnv(4, seed=1, last_action=True, history=[0, 2])
+    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")  # loses every flight, however it is scaled
+    before = model.policy.mlp_extractor.policy_net[0].weight.detach().clone()
+    result = arrival.trim_arrival(model, 1, *[FlightSettings(last_action=True, history=[0, 2])] * 2)
+    assert result.after == result.before and th.equal(model.policy.mlp_extractor.policy_net[0].weight, before)
+    with pytest.raises(ConfigError, match="reads the 18 features"):
+        arrival.trim_arrival(model, 1, FlightSettings(), FlightSettings())
 
 
 def small_file(tmp_path):

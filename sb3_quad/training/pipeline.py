@@ -33,6 +33,7 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.algorithms import get_algorithm
+from sb3_quad.training.arrival import trim_arrival
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
@@ -63,7 +64,9 @@ class Stage(Frozen):
     pass_on: Literal["best", "last"] = Field(
         default="best", description="the best evaluation, as best_by of its settings says"
     )
-    trim: Literal["position", "hover"] | None = Field(default=None, description="how to trim the agent, see training.trim")
+    trim: Literal["position", "hover", "arrival"] | None = Field(
+        default=None, description="how to trim the agent, see training.trim and training.arrival"
+    )
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
     eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
@@ -188,7 +191,7 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
-        if stage.trim and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
+        if stage.trim in ("position", "hover") and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
             raise ConfigError(f"{where}: trim {stage.trim} is for agents that see the 18 features alone")
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
@@ -270,6 +273,9 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
     if stage.trim == "hover":
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
+    elif stage.trim == "arrival":
+        did = trim_arrival(model, seed, job.flight_settings, job.config.flight_settings)
+        words = f"slow arrivals and losses cost {did.before:.2f} s, now {did.after:.2f} s"
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
         words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"

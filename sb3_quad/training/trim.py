@@ -62,7 +62,7 @@ def trim(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = 
     :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not read the 18 features.
     """
     own = settings or FlightSettings()
-    _first_layer(model)
+    first_layer(model)
     _, std = _scaling(own)
     before = hover_offset(model, seed=seed, settings=own)
     scale_position(model, scale)
@@ -96,7 +96,7 @@ def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) ->
 
     :param std: σ of the position features, shape (3,).
     """
-    layer = _first_layer(model)
+    layer = first_layer(model)
     with th.no_grad():
         shift = th.as_tensor(offset / std, dtype=layer.weight.dtype, device=layer.weight.device)
         layer.bias.add_(layer.weight[:, _POSITION] @ shift)
@@ -105,7 +105,7 @@ def shift_position(model: BaseAlgorithm, offset: FloatArray, std: FloatArray) ->
 def scale_position(model: BaseAlgorithm, scale: float) -> None:
     """Let the actor see its distance from the target divided by ``scale`` (α)."""
     with th.no_grad():
-        _first_layer(model).weight[:, _POSITION] /= scale
+        first_layer(model).weight[:, _POSITION] /= scale
 
 
 def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
@@ -138,12 +138,16 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
     return Trim(*(float(action.square().mean().sqrt()) for action in (before, after)))
 
 
-def _first_layer(model: BaseAlgorithm) -> th.nn.Linear:
+def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Linear:
+    """The layer of an agent's actor that reads ``size`` numbers.
+
+    :raises ConfigError: it has none.
+    """
     owner = getattr(model.policy, "actor", None) or getattr(model.policy, "mlp_extractor", None)  # an actor: of SAC or TD3
     found = [getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)]
     layer = next(iter(found[0]), None) if found else None
-    if not isinstance(layer, th.nn.Linear) or layer.in_features != OBSERVATION_SIZE:
-        raise ConfigError("trimming needs an MlpPolicy whose first layer reads the 18 features")
+    if not isinstance(layer, th.nn.Linear) or layer.in_features != size:
+        raise ConfigError(f"trimming needs an MlpPolicy whose first layer reads the {size} features")
     return layer
 
 

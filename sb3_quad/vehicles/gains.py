@@ -3,7 +3,7 @@
 from typing import Any
 
 import numpy as np
-from pydantic import Field, PositiveFloat, field_validator
+from pydantic import Field, PositiveFloat
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.validate import Frozen
@@ -30,11 +30,6 @@ class GeometricGains(Frozen):
     measured: dict[str, Any] | None = Field(
         default=None, description="what these gains reached, as ``evaluation.metrics.measure_expert`` gives it"
     )
-
-    @field_validator("measured", mode="before")
-    @classmethod
-    def _former_names(cls, data: Any) -> Any:  # of the zips of policies that come with the package
-        return data and {str(key).replace("_success", "_survival"): value for key, value in dict(data).items()}
 
     def values(self) -> FloatArray:
         """The gains alone, in the order of the fields."""
