@@ -54,6 +54,7 @@ def recorded(controller, n=24, seed=7):
     return recorder.arrays()
 
 
+# %% tags=["hide-input"]
 def plot_recoveries(controllers):
     """Tilt and distance from the target over time, one column for each controller; a cross where a flight is lost."""
     _, axes = plt.subplots(2, len(controllers), figsize=(4.2 * len(controllers), 4.6), sharex=True, sharey="row")
@@ -74,6 +75,7 @@ def plot_recoveries(controllers):
     plt.show()
 
 
+# %%
 plot_recoveries({"PID expert": PIDExpert(), "itm-recovery, which comes with the package": load_pretrained("itm-recovery")})
 
 # %% [markdown]
@@ -157,7 +159,7 @@ curve = RewardCurve()
 agent.learn(REINFORCEMENT, callback=curve)
 timesteps, rewards = np.array(curve.points).T
 
-# %%
+# %% tags=["hide-input"]
 figure, axes = plt.subplots(figsize=(6.4, 3))
 axes.plot(timesteps / 1e6, rewards, color=COLOURS[0])
 axes.set(xlabel="million timesteps of stage two", ylabel="mean reward of an episode", title="Learning curve")
@@ -187,7 +189,7 @@ for name in stages:
     survival, error = recoveries[name].survival.mean(), np.median(targets[name].final_error)
     print(f"{name:18} {survival:6.1%} of recoveries survive; median final error of targets 10 m away {error:.3f} m")
 
-# %%
+# %% tags=["hide-input"]
 figure, axes = plt.subplots(figsize=(6.4, 3))
 times = np.linspace(0, 6, 301)
 for (name, flights), colour in zip(recoveries.items(), COLOURS, strict=False):

@@ -78,6 +78,7 @@ def recorded(controller, n=24, seed=7):
     return recorder.arrays()
 
 
+# %% tags=["hide-input"]
 def plot_flights(controllers):
     """Distance from the target, speed and tilt over time: the median of the flights, and the range of nine in ten."""
     _, panels = plt.subplots(1, 3, figsize=(11, 3.2))
@@ -99,6 +100,7 @@ def plot_flights(controllers):
     plt.show()
 
 
+# %%
 expert = UnhurriedExpert()
 plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert})
 

@@ -86,7 +86,7 @@ results = evaluate(suite, controllers, f"{folder}/outside")
 print(f"{len(results.entries)} entries of {EPISODES} flights")
 
 
-# %%
+# %% tags=["hide-input"]
 def plot_grid(results):
     """Success with its 95 % interval, and the median final error, over what each group of scenarios varies."""
     groups = list(dict.fromkeys(each.group for each in results.scenarios))
@@ -111,6 +111,7 @@ def plot_grid(results):
     plt.show()
 
 
+# %%
 plot_grid(results)
 
 # %% [markdown]
@@ -140,7 +141,7 @@ scenarios:
 )
 maps = evaluate(tumbling, controllers, f"{folder}/tumbling")
 
-# %%
+# %% tags=["hide-input"]
 figure, panels = plt.subplots(1, len(controllers), figsize=(3.5 * len(controllers), 3.2), sharey=True)
 first, second = (list(dict.fromkeys(each.cell[key] for each in maps.scenarios)) for key in maps.scenarios[0].cell)
 for panel, controller in zip(panels, maps.controllers, strict=True):
