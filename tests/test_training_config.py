@@ -218,7 +218,7 @@ def test_a_value_of_another_type_is_refused(kind, value, message):
         convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
 
 
-PIPELINES = "two_stage.yml", "imitation.yml", THESIS
+PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", THESIS
 
 
 @pytest.mark.parametrize("name", [name for name in SETTINGS.names() if not name.endswith(PIPELINES)])
@@ -237,13 +237,13 @@ def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_id):
     for algo in ("dagger", "ppo_bc"):
-        assert load_config(algo, env_id, f"robust/{algo}.yml").expert == "told_geometric"  # in random worlds
+        assert load_config(algo, env_id, f"robust/{algo}.yml").expert == "told_cautious"  # in random worlds
         assert load_config(algo, env_id, f"nominal/{algo}.yml").expert == "geometric"
         assert load_config(algo, env_id).expert == load_config("sac_bc", env_id).expert == DEFAULT_EXPERT == "pid"
         assert build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT
         assert build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT  # which config.yml then names
         assert load_config(algo, env_id, f"thesis/{algo}.yml").expert == "pid"
-    robust = {DEFAULT_PIPELINE: "told_geometric", "robust/two_stage.yml": "told_cautious"}
+    robust = dict.fromkeys((DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "told_cautious")
     pipelines = {**robust, "nominal/two_stage.yml": "geometric"}
     for file, expert in {**pipelines, THESIS: "pid", "thesis/two_stage.yml": "pid"}.items():
         stages = load_pipeline(file).stages
