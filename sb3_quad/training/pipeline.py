@@ -64,9 +64,7 @@ class Stage(Frozen):
     pass_on: Literal["best", "last"] = Field(
         default="best", description="the best evaluation, as best_by of its settings says"
     )
-    trim: Literal["position", "hover", "arrival"] | None = Field(
-        default=None, description="how to trim the agent, see training.trim and training.arrival"
-    )
+    trim: Literal["position", "hover", "arrival"] | None = Field(default=None, description="training.trim, .arrival say how")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
     eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")

@@ -182,16 +182,11 @@ class Scenario(Frozen):
 
     @property
     def physical_limit(self) -> float | None:
-        """The least mean time, s, after which the vehicle could stay within 0.1 m of its targets; None: it is not known.
-
-        It is that of the vehicle's file, also for agents whose zips are older: from the tasks' own start, in still air.
-        """
-        if self.start != Start() or self.wrenches or self.randomize or self.vehicles or 0.1 not in self.tolerances:
+        """The least mean time, s, after which the vehicle could stay within 0.1 m of its targets; None: it is not known."""
+        changed = self.start != Start() or self.vehicle_changes != VehicleChanges()
+        if changed or self.wrenches or self.randomize or self.vehicles or 0.1 not in self.tolerances:
             return None
-        vehicle = self.flown_vehicle()
-        if vehicle.name in VEHICLES.names() and vehicle.flies_as(_by_name(vehicle.name)):
-            vehicle = _by_name(vehicle.name)
-        return (vehicle.time_optimal or {}).get(self.target.distance or 0.0)
+        return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
 
     def _is_flown_to(self) -> bool:
         """Whether the target lies elsewhere than the start."""
