@@ -28,6 +28,10 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 _DRAG_LEFT = 0.5  # of the drag of its own motion, uncompensated: it damps
+_GENTLE = {"attitude": 0.7, "tilt": 0.5, "descent": 0.6, "deceleration": 0.7, "height_deceleration": 0.7} | {
+    **dict.fromkeys(("position", "height_position"), 0.85),
+    **dict.fromkeys(("velocity", "height_velocity"), 0.9),
+}  # shares of the derived gains
 _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
 
@@ -165,17 +169,20 @@ def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
     It teaches agents that must find out what their rotors lift before they fall too fast to stop.
     """
-    return _cautious(vehicle, GeometricExpert(vehicle).gains, 0.7, 0.05)
+    return _gentle(vehicle, GeometricExpert(vehicle).gains, {"descent": 0.7, "tilt": 0.7})
 
 
 def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_cautious`, by a half and 0.1 weights, with each vehicle's derived gains: for vehicles unlike this one."""
-    return _cautious(vehicle, derived_gains(load_vehicle(vehicle)), 0.5, 0.1)
+    """As :func:`told_cautious`, gentler yet, with each vehicle's derived gains: for vehicles unlike this one.
+
+    Slow motors and weak rotors forgive an agent least where it turns as fast as it can.
+    """
+    return _gentle(vehicle, derived_gains(load_vehicle(vehicle)), _GENTLE)
 
 
-def _cautious(vehicle: str | Vehicle, gains: GeometricGains, share: float, reserve: float) -> GeometricExpert:
-    gentle = gains.model_copy(update={"descent": share * gains.descent, "tilt": share * gains.tilt})
-    return GeometricExpert(vehicle, gentle, told=True, reserve=reserve)
+def _gentle(vehicle: str | Vehicle, gains: GeometricGains, shares: dict[str, float]) -> GeometricExpert:
+    less = {name: share * getattr(gains, name) for name, share in shares.items()}
+    return GeometricExpert(vehicle, gains.model_copy(update=less), told=True, reserve=0.05)
 
 
 @compiled
