@@ -25,7 +25,7 @@ _MEMBERS = np.array([[name in group or name[:-3] == group for name in FEATURE_NA
 ROUNDS, CANDIDATES, BEST = 10, 16, 4
 FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 60, 480  # of a candidate to targets, a third of its recoveries; of the agent before and after
-LEFT, LOST = 0.5, 50.0  # s that a flight costs that leaves its target again, and one that is lost
+LEFT, LOST = 0.5, 10.0  # s that a flight costs that leaves its target again, and one that is lost
 
 
 def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trained: FlightSettings) -> Trim:
