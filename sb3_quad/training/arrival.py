@@ -17,10 +17,8 @@ from sb3_quad.evaluation.flights import NEAR, fly_settings
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.trim import Trim, first_layer
-from sb3_quad.vehicles.vehicle import first_vehicle
 
 GROUPS = ("position_x position_y", "position_z", "rotation", "velocity_x velocity_y", "velocity_z", "body_rate_x body_rate_y")
-"""Features that share an α; the yaw rate's stays 1."""
 _MEMBERS = np.array([[name in group or name[:-3] == group for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
 ROUNDS, CANDIDATES, BEST = 10, 16, 4
 FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
@@ -69,7 +67,6 @@ def _costs(
         own = DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
         seeds = row_seeds(episodes, n) * len(log_scales)
         flights = fly_settings(model, settings.with_changes(observation_std=own * scales), seeds, tolerances=(NEAR,))
-        never = 2.0 * settings.longest_episode * first_vehicle(settings.vehicle).control_step
-        stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=never)
+        stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=2.0 * flights.flown.max())
         total += weight * (stay + LEFT * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival
-    return total.reshape(len(log_scales), n).mean(axis=1)
+    return np.asarray(total.reshape(len(log_scales), n).mean(axis=1))

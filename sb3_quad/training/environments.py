@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -13,6 +14,7 @@ import sb3_quad  # noqa: F401  (registers the environments, also in a worker pro
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
+from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.config import TrainingConfig
 from sb3_quad.training.values import instance
 
@@ -95,17 +97,10 @@ def _make_one(config: TrainingConfig, row: int, phases: int) -> gymnasium.Env[An
     return env
 
 
-class _FirstEpisode(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Truncates the first episode after so many steps."""
+class _FirstEpisode(TimeLimit):
+    """Truncates the first episode after so many steps, and no other."""
 
-    def __init__(self, env: gymnasium.Env[Any, Any], steps: int) -> None:
-        super().__init__(env)
-        self._left = steps
-
-    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        self._left -= 1
-        truncated = truncated or self._left == 0
-        if terminated or truncated:
-            self._left = 0
-        return observation, reward, terminated, truncated, info
+    def reset(self, **kwargs: Any) -> Any:
+        if self._elapsed_steps:
+            self._max_episode_steps = ENDLESS
+        return super().reset(**kwargs)

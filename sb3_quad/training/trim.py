@@ -139,10 +139,7 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
 
 
 def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Linear:
-    """The layer of an agent's actor that reads ``size`` numbers.
-
-    :raises ConfigError: it has none.
-    """
+    """The layer of an agent's actor that reads ``size`` numbers; ConfigError: it has none."""
     owner = getattr(model.policy, "actor", None) or getattr(model.policy, "mlp_extractor", None)  # an actor: of SAC or TD3
     found = [getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)]
     layer = next(iter(found[0]), None) if found else None
