@@ -101,6 +101,7 @@ class _FirstEpisode(TimeLimit):
     """Truncates the first episode after so many steps, and no other."""
 
     def reset(self, **kwargs: Any) -> Any:
-        if self._elapsed_steps:
+        elapsed: Any = self._elapsed_steps
+        if elapsed:
             self._max_episode_steps = ENDLESS
         return super().reset(**kwargs)
