@@ -28,8 +28,7 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 _DRAG_LEFT = 0.5  # of the drag of its own motion, uncompensated: it damps
-_GENTLE = dict.fromkeys(("deceleration", "height_deceleration", "attitude"), 0.7) | {"tilt": 0.5, "descent": 0.6}
-_GENTLE |= {"position": 0.85, "height_position": 0.85, "velocity": 0.9, "height_velocity": 0.9}  # shares of the derived gains
+_GENTLE = dict.fromkeys(("attitude", "deceleration", "height_deceleration"), 0.8) | {"tilt": 0.6, "descent": 0.6}
 _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
 
