@@ -28,7 +28,6 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 _DRAG_LEFT = 0.5  # of the drag of its own motion, uncompensated: it damps
-_GENTLE = dict.fromkeys(("attitude", "deceleration", "height_deceleration"), 0.8) | {"tilt": 0.6, "descent": 0.6}
 _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
 
@@ -161,25 +160,19 @@ def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     return GeometricExpert(vehicle, told=True)
 
 
+def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of vehicles unlike this one."""
+    return GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True)
+
+
 def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     """As :func:`told_geometric`, with 0.7 of the ``descent`` and of the ``tilt``, and 0.05 weights of thrust in reserve.
 
     It teaches agents that must find out what their rotors lift before they fall too fast to stop.
     """
-    return _gentle(vehicle, GeometricExpert(vehicle).gains, {"descent": 0.7, "tilt": 0.7})
-
-
-def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_cautious`, gentler yet, with each vehicle's derived gains: for vehicles unlike this one.
-
-    Slow motors and weak rotors forgive an agent least where it turns as fast as it can.
-    """
-    return _gentle(vehicle, derived_gains(load_vehicle(vehicle)), _GENTLE)
-
-
-def _gentle(vehicle: str | Vehicle, gains: GeometricGains, shares: dict[str, float]) -> GeometricExpert:
-    less = {name: share * getattr(gains, name) for name, share in shares.items()}
-    return GeometricExpert(vehicle, gains.model_copy(update=less), told=True, reserve=0.05)
+    gains = GeometricExpert(vehicle).gains
+    gentle = gains.model_copy(update={"descent": 0.7 * gains.descent, "tilt": 0.7 * gains.tilt})
+    return GeometricExpert(vehicle, gentle, told=True, reserve=0.05)
 
 
 @compiled

@@ -23,7 +23,7 @@ _MEMBERS = np.array([[name in group or name[:-3] == group for name in FEATURE_NA
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
 FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 60, 480  # of a candidate to targets, half of its recoveries; of the agent before and after
-LEFT, LOST = 0.5, 10.0  # s that a flight costs that leaves its target again, and one that is lost
+LEFT, FAILED, LOST = 0.5, 10.0, 10.0  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
 
 
 def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trained: FlightSettings) -> Trim:
@@ -38,7 +38,7 @@ def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trai
     """
     layer, rng = first_layer(model, settings.size), np.random.default_rng(seed)
     worlds = trained.with_changes(position_integral=settings.position_integral, task_kwargs=None)
-    recoveries = (worlds.with_changes(task="state_recovery", max_episode_steps=300), 0.0)
+    recoveries = (worlds.with_changes(task="state_recovery", max_episode_steps=500), 0.0)
     sets = [
         (settings.with_changes(task="target_tracking", task_kwargs=None, max_episode_steps=500), 1.0),
         (worlds.with_changes(task="target_tracking", max_episode_steps=600), 0.3),
@@ -68,5 +68,5 @@ def _costs(
         seeds = row_seeds(episodes, n) * len(log_scales)
         flights = fly_settings(model, settings.with_changes(observation_std=own * scales), seeds, tolerances=(NEAR,))
         stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=2.0 * flights.flown.max())
-        total += weight * (stay + LEFT * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival
+        total += weight * (stay + LEFT * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival + FAILED * ~flights.success
     return np.asarray(total.reshape(len(log_scales), n).mean(axis=1))
