@@ -249,7 +249,7 @@ def default_page():
 def test_the_default_page_is_small():
     page, _, rounded = default_page()
     assert len(page.encode()) <= LIMIT
-    assert set(rounded) <= {"itm-robust", "any-quadcopter"} and all(f"{label}" in page for label in rounded)
+    assert "itm-robust" in rounded and f"Weights of {' and '.join(rounded)} are rounded" in page
 
 
 @pytest.mark.slow
