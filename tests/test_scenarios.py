@@ -128,6 +128,8 @@ def test_the_physical_limit_is_told_where_it_is_that_of_the_flights(entry, limit
         expected = None if limit is None else vehicle.time_optimal[limit]
         each = scenario(f"vehicle: {name}, {entry}")
         assert each.physical_limit == expected
+        other = vehicle.model_copy(update={"mass": 1.01 * vehicle.mass})
+        assert each.model_copy(update={"vehicle": other}).physical_limit is None
 
 
 @pytest.mark.parametrize("name", ["itm", "crazyflie"])

@@ -20,7 +20,7 @@ from sb3_quad.vehicles.layout import Turn
 from sb3_quad.vehicles.vehicle import Vehicle
 
 N_OBSERVATIONS = 10_000
-SHORT, LONG = 2, 500  # control steps of the flights of a policy of the present features, and of one with a state
+SHORT, LONG = 2, 1000  # control steps of the flights of a policy of the present features, and of one with a state
 TOLERANCE = 1e-4  # of the range between least and greatest output: far above rounding, far below any mistake
 _WIDE = {"target_distance": 30.0, "nearest_target": 0.0, "velocity_std": 4.0, "body_rates_std": 8.0}
 _NEAR = Task(name="near", target_distance=1.0, nearest_target=0.0)  # where a position integral is at work at once

@@ -7,6 +7,8 @@ method: candidates fly the same episodes, and the next ones are sampled around t
 since W (s - μ) / (α σ) = (W / α) (s - μ) / σ: the zip stays stock.
 """
 
+from fnmatch import fnmatchcase
+
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
@@ -14,12 +16,13 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import NEAR, fly_settings
-from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, OBSERVATION_SIZE
+from sb3_quad.simulation.observation import FEATURE_NAMES, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.trim import Trim, first_layer
+from sb3_quad.training.trim import Trim, first_layer, scaling
 
-GROUPS = ("position_x position_y", "position_z", "rotation", "velocity_x velocity_y", "velocity_z", "body_rate_x body_rate_y")
-_MEMBERS = np.array([[name in group or name[:-3] == group for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
+GROUPS = ("position_[xy]", "position_z", "rotation_*", "velocity_[xy]", "velocity_z", "body_rate_[xy]")
+"""Features that share an α, by their names; the yaw rate has none."""
+_MEMBERS = np.array([[fnmatchcase(name, group) for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
 FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 60, 480  # of a candidate to targets, half of its recoveries; of the agent before and after
@@ -33,7 +36,7 @@ def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trai
     :param settings: how evaluations fly it.
     :param trained: how it was trained: its vehicles and disturbances count, too.
     :return: the cost before and after, s: the mean time to stay within 0.1 m of targets 10 m away, 0.3 times the same in the
-        worlds of the training, and what lost flights cost there, on the way to targets and in twice as many recoveries.
+        worlds of the training, and what it costs to leave a target, to fail and to be lost, also in twice as many recoveries.
     :raises ConfigError: an agent whose first layer does not read these observations.
     """
     layer, rng = first_layer(model, settings.size), np.random.default_rng(seed)
@@ -64,7 +67,7 @@ def _costs(
     scales = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
     total = np.zeros(len(scales))
     for (settings, weight), episodes in zip(sets, row_seeds(seed, len(sets)), strict=True):
-        own = DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
+        _, own = scaling(settings)
         seeds = row_seeds(episodes, n) * len(log_scales)
         flights = fly_settings(model, settings.with_changes(observation_std=own * scales), seeds, tolerances=(NEAR,))
         stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=2.0 * flights.flown.max())

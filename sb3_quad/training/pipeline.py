@@ -267,13 +267,14 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
     if run.trimmed_model.is_file():
         return run.trimmed_model
     model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, job, run), device=job.device)
+    report(f"trimming the agent ({stage.trim}), which may take a minute")
     seed = seed_for("trim", job.seed)
     if stage.trim == "hover":
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     elif stage.trim == "arrival":
         did = trim_arrival(model, seed, job.flight_settings, job.config.flight_settings)
-        words = f"slow arrivals and losses cost {did.before:.2f} s, now {did.after:.2f} s"
+        words = f"slow arrivals, failures and losses cost {did.before:.2f} s, now {did.after:.2f} s"
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
         words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"

@@ -63,7 +63,7 @@ def trim(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = 
     """
     own = settings or FlightSettings()
     first_layer(model)
-    _, std = _scaling(own)
+    _, std = scaling(own)
     before = hover_offset(model, seed=seed, settings=own)
     scale_position(model, scale)
     after = before if scale == 1.0 else hover_offset(model, seed=seed, settings=own)
@@ -139,7 +139,10 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
 
 
 def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Linear:
-    """The layer of an agent's actor that reads ``size`` numbers; ConfigError: it has none."""
+    """The layer of an agent's actor that reads ``size`` numbers.
+
+    :raises ConfigError: it has none.
+    """
     owner = getattr(model.policy, "actor", None) or getattr(model.policy, "mlp_extractor", None)  # an actor: of SAC or TD3
     found = [getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)]
     layer = next(iter(found[0]), None) if found else None
@@ -174,14 +177,14 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     features = np.zeros((heading.size, OBSERVATION_SIZE))
     cosine, sine, zero = np.cos(heading), np.sin(heading), np.zeros(heading.size)
     features[:, GROUPS["rotation"]] = np.stack([cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1], axis=1)
-    mean, std = _scaling(settings)
+    mean, std = scaling(settings)
     relative, additive = levels(settings.noise)
     features *= 1.0 + relative * rng.standard_normal(features.shape)
     features += additive * std * rng.standard_normal(features.shape)
     return np.asarray((features - mean) / std, dtype=np.float32)
 
 
-def _scaling(settings: FlightSettings) -> tuple[FloatArray, FloatArray]:
+def scaling(settings: FlightSettings) -> tuple[FloatArray, FloatArray]:
     """μ and σ of Eq. 3.16, (18,) both."""
     mean = DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
     return mean, DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)

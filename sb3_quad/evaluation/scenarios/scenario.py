@@ -183,8 +183,7 @@ class Scenario(Frozen):
     @property
     def physical_limit(self) -> float | None:
         """The least mean time, s, after which the vehicle could stay within 0.1 m of its targets; None: it is not known."""
-        changed = self.start != Start() or self.vehicle_changes != VehicleChanges()
-        if changed or self.wrenches or self.randomize or self.vehicles or 0.1 not in self.tolerances:
+        if self.start != Start() or self.wrenches or self.randomize or self.vehicles or 0.1 not in self.tolerances:
             return None
         return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
 
