@@ -37,7 +37,7 @@ json.dump([actions, [model.num_timesteps for model in models]], sys.stdout)
 """
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "load_in_plain_sb3.py"
 RUN = "import runpy, sys; sys.modules['sb3_quad'] = None; runpy.run_path(sys.argv.pop(1), run_name='__main__')"
-BESIDE = {"thesis-ppo": 1.5, "thesis-printed-recovery": 1.0}  # m: who hovers beside its target, as the thesis's agents do
+BESIDE = {"thesis-ppo": 1.5, "thesis-printed-recovery": 1.0, "thesis-printed-ppo": 9.0}  # m: who ends beside its target
 SMALL = {"n_steps": 32, "batch_size": 128, "learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "seed": 0, "device": "cpu"}
 
 

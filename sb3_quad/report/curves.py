@@ -58,8 +58,8 @@ def plot_curves(
             if value in at:
                 style = ("--", ":", "-.")[number % 3]
                 panel.axhline(at[value] * factor, color="0.3", linestyle=style, linewidth=1.2, label=line)
+    panels[0, 0].set_title(title, loc="left")  # a suptitle would lie on the legend
     legend(figure)
-    figure.suptitle(title)
     return figure
 
 
