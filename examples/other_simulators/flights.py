@@ -145,21 +145,26 @@ def observe(state: State, target: Array) -> Array:
 
 
 def check_rotors(make: Callable[[int], Simulator]) -> None:
-    """Speed up one rotor at a time in hover: the body must turn as the rotor's place and direction say.
+    """Speed up one rotor at a time in hover: the body must turn as the rotor's place and direction say, beside what wind does.
 
     :raises SystemExit: it does not.
     """
     simulator = make(4)
+    still, state = _after_hover(simulator, 0.0), _after_hover(make(4), 0.2)
+    x, y, yaw = simulator.rotors.T
+    rates, climb = state.body_rates - still.body_rates, (state.velocity - still.velocity)[:, 2]
+    if not np.array_equal(np.sign(rates), np.sign(np.stack([y, -x, yaw], axis=1))):
+        raise SystemExit(f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {rates.tolist()} rad/s")
+    if not (climb > 0.0).all():
+        raise SystemExit(f"{simulator}: 5 % more thrust than in hover, and it climbs by {climb.tolist()} m/s")
+
+
+def _after_hover(simulator: Simulator, share: float) -> State:
+    """The state after 0.03 s, vehicle i with rotor i at ``share`` more than hover."""
     simulator.reset(sample_starts("targets", 4, 0)[0])
     for _ in range(3):
-        simulator.step(simulator.hover * (1.0 + 0.2 * np.eye(4)))
-    state, (x, y, yaw) = simulator.state(), simulator.rotors.T
-    if not np.array_equal(np.sign(state.body_rates), np.sign(np.stack([y, -x, yaw], axis=1))):
-        raise SystemExit(
-            f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {state.body_rates.tolist()} rad/s"
-        )
-    if not (state.velocity[:, 2] > 0.0).all():
-        raise SystemExit(f"{simulator}: 5 % more thrust than in hover, and it climbs by {state.velocity[:, 2].tolist()} m/s")
+        simulator.step(simulator.hover * (1.0 + share * np.eye(4)))
+    return simulator.state()
 
 
 @dataclass

@@ -12,7 +12,7 @@ from in_rotorpy import CELLS as ROTORPY
 
 FILES = Path(os.environ["TRANSFER_FILES"])
 MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {"l2f": L2F["crazyflie"].make}
-MAKERS |= {f"rotorpy {name}": ROTORPY[name].make for name in ("crazyflie", "hummingbird")}
+MAKERS |= {f"rotorpy {name}": ROTORPY[name].make for name in ("crazyflie", "crazyflie_gusts", "hummingbird")}
 
 
 @pytest.mark.parametrize("name", MAKERS)
