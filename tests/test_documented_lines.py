@@ -101,7 +101,11 @@ def shorter(content):
     """Settings with one small rollout and small grids; no requirement and no trim, which an agent of one rollout fails."""
     if not isinstance(content, dict):
         return [shorter(each) for each in content] if isinstance(content, list) else content
-    kept = {key: shorter(value) for key, value in content.items() if key not in ("require", "trim", "position_scale")}
+    kept = {
+        key: shorter(value)
+        for key, value in content.items()
+        if key not in ("require", "trim", "position_scale", "leaving_cost")
+    }
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}
     return kept | {key: min(kept[key], most) for key, most in SMALL.items() if isinstance(kept.get(key), int)}

@@ -79,6 +79,7 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
         ([{**STAGES[0], "trim": "hover", "conf_file": "robust/dagger.yml"}], "see the 18 features alone"),
         ([{**STAGES[0], "position_scale": 0.6}], "position_scale goes with trim: position"),
+        ([{**STAGES[0], "trim": "hover", "leaving_cost": 2.0}], "leaving_cost goes with trim: arrival"),
         ([], "at least 1"),
     ],
 )

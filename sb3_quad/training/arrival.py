@@ -2,7 +2,7 @@
 
 An agent that learns from noisy observations of vehicles that it is not told learns the mean of its teacher's actions. That
 answers to each feature less than the teacher does (regression dilution): it brakes late, overshoots and comes back. The thesis
-divides the position's σ by an α found by trial (Eq. 4.10). Here each group of features has an α, found by the cross-entropy
+divides the position's σ by an α found by trial (Eq. 4.10). Here each of GROUPS has an α, found by the cross-entropy
 method: candidates fly the same episodes, and the next ones are sampled around the best. The α go into the actor's first layer,
 since W (s - μ) / (α σ) = (W / α) (s - μ) / σ: the zip stays stock.
 """
@@ -21,7 +21,6 @@ from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training.trim import Trim, first_layer, scaling
 
 GROUPS = ("position_[xy]", "position_z", "rotation_*", "velocity_[xy]", "velocity_z", "body_rate_[xy]")
-"""Features that share an α, by their names; the yaw rate has none."""
 _MEMBERS = np.array([[fnmatchcase(name, group) for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
 FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
@@ -29,30 +28,32 @@ N_FLIGHTS, N_CHECKED = 60, 480  # of a candidate to targets, half of its recover
 LEFT, FAILED, LOST = 0.5, 10.0, 10.0  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
 
 
-def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trained: FlightSettings) -> Trim:
+def trim_arrival(
+    model: BaseAlgorithm, seed: int, settings: FlightSettings, trained: FlightSettings, left: float = LEFT
+) -> Trim:
     """Find the scales of an agent and fold them into its first layer, unless fresh flights say that they make it worse.
 
     :param seed: of the flights.
     :param settings: how evaluations fly it.
     :param trained: how it was trained: its vehicles and disturbances count, too.
+    :param left: s that it costs to leave a target again.
     :return: the cost before and after, s: the mean time to stay within 0.1 m of targets 10 m away, 0.3 times the same in the
         worlds of the training, and what it costs to leave a target, to fail and to be lost, also in twice as many recoveries.
     :raises ConfigError: an agent whose first layer does not read these observations.
     """
     layer, rng = first_layer(model, settings.size), np.random.default_rng(seed)
     worlds = trained.with_changes(position_integral=settings.position_integral, task_kwargs=None)
-    recoveries = (worlds.with_changes(task="state_recovery", max_episode_steps=500), 0.0)
     sets = [
         (settings.with_changes(task="target_tracking", task_kwargs=None, max_episode_steps=500), 1.0),
         (worlds.with_changes(task="target_tracking", max_episode_steps=600), 0.3),
-        *[recoveries] * 2,
+        *[(worlds.with_changes(task="state_recovery", max_episode_steps=500), 0.0)] * 2,
     ]
     mean, spread = np.zeros(len(GROUPS)), np.full(len(GROUPS), FIRST_SPREAD)
     for each in row_seeds(seed, ROUNDS):
         tried = mean + spread * rng.standard_normal((CANDIDATES, len(GROUPS)))
-        best = tried[np.argsort(_costs(model, tried, sets, each, N_FLIGHTS))[:BEST]]
+        best = tried[np.argsort(_costs(model, tried, sets, each, N_FLIGHTS, left))[:BEST]]
         mean, spread = KEPT * mean + (1 - KEPT) * best.mean(axis=0), (spread + best.std(axis=0)) / 2
-    before, after = _costs(model, np.stack([0.0 * mean, mean]), sets, seed, N_CHECKED)
+    before, after = _costs(model, np.stack([0.0 * mean, mean]), sets, seed, N_CHECKED, left)
     if after < before:
         frame = np.append(np.exp(mean @ _MEMBERS), np.ones(settings.frame_size - OBSERVATION_SIZE))
         with th.no_grad():
@@ -61,15 +62,14 @@ def trim_arrival(model: BaseAlgorithm, seed: int, settings: FlightSettings, trai
 
 
 def _costs(
-    model: BaseAlgorithm, log_scales: FloatArray, sets: list[tuple[FlightSettings, float]], seed: int, n: int
+    model: BaseAlgorithm, log_scales: FloatArray, sets: list[tuple[FlightSettings, float]], seed: int, n: int, left: float
 ) -> FloatArray:
     """What :func:`trim_arrival` minimises for each of m candidates, on the same n flights of each set, (m,)."""
     scales = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
     total = np.zeros(len(scales))
     for (settings, weight), episodes in zip(sets, row_seeds(seed, len(sets)), strict=True):
-        _, own = scaling(settings)
-        seeds = row_seeds(episodes, n) * len(log_scales)
-        flights = fly_settings(model, settings.with_changes(observation_std=own * scales), seeds, tolerances=(NEAR,))
+        scaled = settings.with_changes(observation_std=scaling(settings)[1] * scales)
+        flights = fly_settings(model, scaled, row_seeds(episodes, n) * len(log_scales), tolerances=(NEAR,))
         stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=2.0 * flights.flown.max())
-        total += weight * (stay + LEFT * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival + FAILED * ~flights.success
+        total += weight * (stay + left * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival + FAILED * ~flights.success
     return np.asarray(total.reshape(len(log_scales), n).mean(axis=1))

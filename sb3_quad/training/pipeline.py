@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import Field, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
@@ -33,7 +33,7 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.algorithms import get_algorithm
-from sb3_quad.training.arrival import trim_arrival
+from sb3_quad.training.arrival import LEFT, trim_arrival
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
@@ -66,14 +66,16 @@ class Stage(Frozen):
     )
     trim: Literal["position", "hover", "arrival"] | None = Field(default=None, description="training.trim, .arrival say how")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
+    leaving_cost: NonNegativeFloat = Field(default=LEFT, description="s that trim: arrival counts for a target left again")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
     eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
     @model_validator(mode="after")
-    def _scale_with_trim(self) -> "Stage":
-        if self.position_scale != 1.0 and self.trim != "position":
-            raise ValueError("position_scale goes with trim: position")
+    def _of_its_trim(self) -> "Stage":
+        for name, trimmed in (("position_scale", "position"), ("leaving_cost", "arrival")):
+            if name in self.model_fields_set and self.trim != trimmed:
+                raise ValueError(f"{name} goes with trim: {trimmed}")
         return self
 
 
@@ -273,7 +275,7 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     elif stage.trim == "arrival":
-        did = trim_arrival(model, seed, job.flight_settings, job.config.flight_settings)
+        did = trim_arrival(model, seed, job.flight_settings, job.config.flight_settings, stage.leaving_cost)
         words = f"slow arrivals, failures and losses cost {did.before:.2f} s, now {did.after:.2f} s"
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
