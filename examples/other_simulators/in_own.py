@@ -26,7 +26,7 @@ class Own:
         self.n, self._vehicle = n, load_vehicle(vehicle).model_copy(update={"delay": 0})
         self.hover, self.ground = self._vehicle.hover_thrust, self._vehicle.collision_radius
         self.rotors = np.column_stack([self._vehicle.rotor_positions, self._vehicle.rotor_directions])
-        randomize = {"wind": {"low": wind, "high": wind, "direction": [1.0, 0.0, 0.0]}} if wind else None
+        randomize = {"wind": {"magnitude": wind, "direction": [1.0, 0.0, 0.0]}} if wind else None
         endless: dict[str, Any] = {"max_episode_steps": NEVER, "task_kwargs": {"max_distance": 1e6}}
         settings = FlightSettings(vehicle=self._vehicle, randomize=randomize, noise=0.0, **endless)
         self._batch = QuadcopterBatch(n, settings, seed=0, autoreset=False)
