@@ -74,7 +74,7 @@ class Stage(Frozen):
     @model_validator(mode="after")
     def _of_its_trim(self) -> "Stage":
         for name, trimmed in (("position_scale", "position"), ("leaving_cost", "arrival")):
-            if name in self.model_fields_set and self.trim != trimmed:
+            if getattr(self, name) != type(self).model_fields[name].default and self.trim != trimmed:
                 raise ValueError(f"{name} goes with trim: {trimmed}")
         return self
 
