@@ -28,7 +28,7 @@ class GeometricGains(Frozen):
         description="the same from above: less, so that an agent that imitates it imprecisely does not overshoot, m/s²"
     )
     measured: dict[str, Any] | None = Field(
-        default=None, description="what these gains reached, as ``evaluation.metrics.measure_expert`` gives it"
+        default=None, description="what these gains reached, as ``measure_expert`` in examples/tune_expert.py gives it"
     )
 
     def values(self) -> FloatArray:
