@@ -89,10 +89,7 @@ class RayExecutor:
 
 
 def _check_address(address: str) -> None:
-    """See that somebody answers at an address, since Ray itself would wait for minutes, and then end the process.
-
-    :raises ConfigError: nobody answers.
-    """
+    """See that somebody answers at an address, since Ray itself would wait for minutes, and then end the process."""
     if address == "auto":  # Ray looks for one on this machine, and says at once that there is none
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")

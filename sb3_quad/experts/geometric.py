@@ -28,6 +28,9 @@ G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
 _ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 _DRAG_LEFT = 0.5  # of the drag of its own motion, uncompensated: it damps
+_SLOWER = dict.fromkeys(("position", "velocity", "height_position", "height_velocity", "attitude"), 0.85)
+_LATE = {**_SLOWER, "descent": 0.5, "body_rates": 1.25}  # what told_derived multiplies where commands act late
+_LATE_FROM, _LATE_TO = 0.085, 0.125  # s of command lag: not yet, fully
 _TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
 
 
@@ -73,12 +76,16 @@ def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:
 
 
 class _TrueConstants:
-    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed."""
+    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed.
 
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains) -> None:
+    :param late: times the gains of that name, the more the later commands act.
+    """
+
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float] | None = None) -> None:
         self._control_step, self._seen = vehicle.control_step, np.empty(0)
         self._scale = gains.values()[:, None] / self._gains(vehicle.parameters()[:, None])
         self._scale[G.yaw_rate] *= _TOLD_YAW
+        self._late = np.array([[(late or {}).get(name, 1.0)] for name in GAIN_NAMES])
 
     def _gains(self, v: FloatArray) -> FloatArray:
         return np.stack([*_derived_gains(v, self._control_step).values()])
@@ -93,8 +100,9 @@ class _TrueConstants:
         if new.size:
             v = self._seen[:, new] = vehicles[:, new]
             gains, body, inverses, ranges = self._all
-            gains[:, new] = self._scale * self._gains(v)
             body[:, new] = *v[[P.mass, P.gravity, P.ixx, P.iyy, P.izz]], _command_lag(v, self._control_step)
+            late = np.clip((body[-1, new] - _LATE_FROM) / (_LATE_TO - _LATE_FROM), 0.0, 1.0)
+            gains[:, new] = self._scale * self._gains(v) * (1.0 + (self._late - 1.0) * late)
             arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
             inverses[new] = np.linalg.inv(np.concatenate([np.ones((1, *arms.shape[1:])), arms]).transpose(2, 0, 1))
             ranges[:, new] = v[P.thrust_middle] - v[P.thrust_half_range], v[P.thrust_middle] + v[P.thrust_half_range]
@@ -161,8 +169,13 @@ def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
 
 def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of vehicles unlike this one."""
-    return GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True)
+    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of vehicles unlike this one.
+
+    Where commands act late, its outer loop is slower and its inner one faster: agents that learn from it bear slow motors.
+    """
+    expert = GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True)
+    expert._told = _TrueConstants(expert.vehicle, expert.gains, _LATE)
+    return expert
 
 
 def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:

@@ -246,10 +246,7 @@ def _train_stages(
 
 
 def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
-    """The zip that a stage passes on, before it is trimmed.
-
-    :raises TrainingError: its best evaluation misses the stage's requirement.
-    """
+    """The zip that a stage passes on, before it is trimmed; TrainingError if it misses what the stage requires."""
     if run.evaluations.is_file():
         curve = read_curve(run.path)
         share, success = (np.nan_to_num(curve.values(name)) for name in (job.config.best_by, "success"))

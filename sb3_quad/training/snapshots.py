@@ -205,10 +205,7 @@ def _counters(model: Any) -> Arrays:
 
 
 def _filled(store: Any) -> Arrays:
-    """Views of the rows that a dataset or a replay buffer holds, by name.
-
-    :raises ConfigError: observations that are a Dict.
-    """
+    """Views of the rows that a dataset or a replay buffer holds, by name."""
     if not isinstance(store, ReplayBuffer):
         return store.filled  # type: ignore[no-any-return]
     if isinstance(store.observations, dict):

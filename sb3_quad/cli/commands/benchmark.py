@@ -104,10 +104,7 @@ def _rates(envs: dict[str, Any], shape: tuple[int, ...], seconds: float) -> Rate
 
 
 def _loop(config: Any) -> Rates:
-    """A whole training loop with the settings' own sizes; the first rollout and update, which compile, are left out.
-
-    :raises ConfigError: an off-policy algorithm, whose loop has no rollouts and updates to tell apart.
-    """
+    """A whole training loop with the settings' own sizes; the first rollout and update, which compile, are left out."""
     import numpy as np
     from stable_baselines3.common.callbacks import BaseCallback
 

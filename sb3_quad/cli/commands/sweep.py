@@ -107,11 +107,7 @@ def _with_defaults(data: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
-    """Do what is left of a sweep. Returns the exit code.
-
-    :param plan: a :class:`~sb3_quad.sweep.folder.Plan`.
-    :param place: the :class:`~sb3_quad.sweep.folder.SweepFolder`; None: a new one.
-    """
+    """Do what is left of a sweep's Plan, in its SweepFolder (None: a new one). Returns the exit code."""
     from sb3_quad.base.cores import available_cpus
     from sb3_quad.base.files import locked
     from sb3_quad.base.signals import StopSignals
