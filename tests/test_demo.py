@@ -249,7 +249,7 @@ def default_page():
 def test_the_default_page_is_small():
     page, _, rounded = default_page()
     assert len(page.encode()) <= LIMIT
-    assert set(rounded) == {"itm-robust", "any-quadcopter", "stage one", "stage two"}
+    assert set(rounded) == {"any-quadcopter"}
     assert f"Weights of {' and '.join(rounded)} are rounded" in page
 
 

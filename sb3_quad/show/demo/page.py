@@ -26,7 +26,7 @@ from sb3_quad.export.network import Network, build_network
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
-DEFAULT_AGENTS = ("pid", "geometric", "stage two=itm-recovery", "any-quadcopter", "itm-robust", "stage one=itm-imitation")
+DEFAULT_AGENTS = ("pid", "geometric", "stage two=itm-recovery", "any-quadcopter", "stage one=itm-imitation")
 LIMIT = 500_000  # bytes of a page, above which the largest networks are rounded to half precision
 MODEL = ("vehicle", "dynamics", "observation", "network", "experts", "flight", "weights")  # without a browser, in this order
 VIEW = ("fleet", "camera", "airframe", "scene", "plots", "hand", "player", "board", "controls", "app")
