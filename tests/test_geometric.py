@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains
+from sb3_quad.experts.geometric import GeometricExpert, derived_gains, told_derived
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -131,3 +131,15 @@ def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(expert: G
     recovery = fly(expert, "state_recovery", 150, 3, vehicle=vehicle, max_steps=400, noise=0.0)
     assert tracking.success.all() and tracking.final_error.max() < 0.02
     assert recovery.survival.mean() > 0.9
+
+
+@pytest.mark.parametrize(("name", "late"), [("hummingbird", False), ("cf2x_L250", True)])
+def test_told_derived_is_gentler_where_commands_act_late(name: str, late: bool) -> None:
+    """A quick vehicle flies by its derived gains; a slow one comes to rest within 0.1 m, too, but by other ones."""
+    vehicle = load_vehicle(name)
+    bold = GeometricExpert(vehicle, derived_gains(vehicle), told=True)
+    gentle, plain = (
+        fly(expert, seed=3, n_episodes=24, vehicle=vehicle, max_steps=900) for expert in (told_derived(name), bold)
+    )
+    assert gentle.success.all() and not np.isnan(gentle.time_to_stay[0.1]).any()
+    assert (np.abs(gentle.reward - plain.reward) > 1e-9).any() == late
