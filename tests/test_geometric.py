@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains, told_derived
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
@@ -143,3 +144,9 @@ def test_told_derived_is_gentler_where_commands_act_late(name: str, late: bool) 
     )
     assert gentle.success.all() and not np.isnan(gentle.time_to_stay[0.1]).any()
     assert (np.abs(gentle.reward - plain.reward) > 1e-9).any() == late
+
+
+@pytest.mark.parametrize(("told", "name"), [(False, "attitude"), (True, "atitude")])
+def test_gains_where_commands_act_late_are_known_ones_of_a_told_expert(told: bool, name: str) -> None:
+    with pytest.raises(ConfigError, match=f"late {name}"):
+        GeometricExpert(told=told, late={name: 0.5})

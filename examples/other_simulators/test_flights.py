@@ -43,8 +43,8 @@ def test_a_file_for_other_rotors_is_refused():
         (MAKERS["crazyflow cf21B_500"], "any-quadcopter@cf21B_500", 0.97),
         (MAKERS["crazyflow cf2x_L250"], "any-quadcopter@cf2x_L250", 0.7),
         (MAKERS["rotorpy crazyflie"], "any-quadcopter@rotorpy_crazyflie", 0.97),
-        (MAKERS["rotorpy hummingbird"], "any-quadcopter@rotorpy_hummingbird", 0.9),
-        (MAKERS["l2f"], "any-quadcopter@crazyflie", 0.75),
+        (MAKERS["rotorpy hummingbird"], "any-quadcopter@rotorpy_hummingbird", 0.97),
+        (MAKERS["l2f"], "any-quadcopter@crazyflie", 0.9),
     ],
 )
 @pytest.mark.parametrize("task", ["targets", "recoveries"])

@@ -76,16 +76,13 @@ def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:
 
 
 class _TrueConstants:
-    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed.
+    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed."""
 
-    :param late: times the gains of that name, the more the later commands act.
-    """
-
-    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float] | None = None) -> None:
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float]) -> None:
         self._control_step, self._seen = vehicle.control_step, np.empty(0)
         self._scale = gains.values()[:, None] / self._gains(vehicle.parameters()[:, None])
         self._scale[G.yaw_rate] *= _TOLD_YAW
-        self._late = np.array([[(late or {}).get(name, 1.0)] for name in GAIN_NAMES])
+        self._late = np.array([[late.get(name, 1.0)] for name in GAIN_NAMES])
 
     def _gains(self, v: FloatArray) -> FloatArray:
         return np.stack([*_derived_gains(v, self._control_step).values()])
@@ -126,7 +123,8 @@ class GeometricExpert(Expert):
     :param told: whether it uses each vehicle's true parameters and compensates the external wrench, as far as a state holds
         them (``state.vehicles``, ``state.wrench``). Its gains then scale with the vehicle as :func:`derived_gains` do.
     :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent.
-    :raises ConfigError: a negative reserve, or one without ``told``.
+    :param late: times the gains of that name, the more the later commands act: fully from a command lag of 0.125 s on.
+    :raises ConfigError: a negative reserve, an unknown gain, or either parameter without ``told``.
     """
 
     def __init__(
@@ -137,16 +135,19 @@ class GeometricExpert(Expert):
         observation_std: npt.ArrayLike | None = None,
         told: bool = False,
         reserve: float = 0.0,
+        late: dict[str, float] | None = None,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
         if reserve < 0.0 or (reserve and not told):
             raise ConfigError(f"reserve {reserve:g}: must not be negative, and needs told=True")
+        if late and (not told or set(late) - set(GAIN_NAMES)):
+            raise ConfigError(f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, and needs told=True")
         self.reserve = reserve
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
         body = np.array([v.mass, v.gravity, *v.inertia, v.command_lag])
         self._constants = self.gains.values()[:, None], body[:, None], v.mixer_inverse[None], np.array(v.thrust_range)[:, None]
-        self._told = _TrueConstants(v, self.gains) if told else None
+        self._told = _TrueConstants(v, self.gains, late or {}) if told else None
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
@@ -173,9 +174,7 @@ def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
     Where commands act late, its outer loop is slower and its inner one faster: agents that learn from it bear slow motors.
     """
-    expert = GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True)
-    expert._told = _TrueConstants(expert.vehicle, expert.gains, _LATE)
-    return expert
+    return GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True, late=_LATE)
 
 
 def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
