@@ -108,6 +108,8 @@ class BestModel(EveryTimesteps):
         for group, path in self._paths.items():
             if path.is_file():
                 self._rows[group] = {name: list(array) for name, array in read_arrays(path).items()}
+                if not self._rows[group].get("results"):
+                    raise ConfigError(f"{path}: cannot be read (results: no such array, or an empty one)")
                 flown = len(self._rows[group]["results"][-1])
                 if flown != self._n_episodes:
                     raise ConfigError(f"{path}: evaluations of {flown} episodes; n_episodes (--eval-episodes) must be {flown}")

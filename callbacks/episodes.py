@@ -39,8 +39,9 @@ class EpisodeLog(BaseCallback):
         header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
         rows = read_text(self._path).splitlines()[2:] if self._path.exists() else []
         self._writer = ResultsWriter(str(self._path), header, ("is_success",), override_existing=not self._path.exists())
-        if rows:
-            self._start -= float(rows[-1].split(",")[2])
+        whole = [row for row in (line.split(",") for line in rows) if len(row) == 4]  # a crash may have cut the last one
+        if whole:
+            self._start -= float(whole[-1][2])
 
     def _on_step(self) -> bool:
         infos, seconds = self.locals["infos"], round(time.time() - self._start, 3)

@@ -80,7 +80,7 @@ class BatchEnv:
 
     @property
     def wrench(self) -> FloatArray:
-        """What :meth:`set_wrench` has set, (n, 12): force world, force body, torque world, torque body; N, N m."""
+        """What was set or sampled, without gusts, (n, 12): force world, force body, torque world, torque body; N, N m."""
         return self._by_row(self.batch.wrench)
 
     @property

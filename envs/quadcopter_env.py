@@ -169,8 +169,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
         # One row of the batched environment, whose body PyBullet moves; Gymnasium's TimeLimit truncates.
-        keywords = {"task": task, "task_kwargs": task_kwargs, "max_episode_steps": ENDLESS, **keywords}
-        self._make_batch(1, seed, n_threads=1, autoreset=False, **keywords)
+        if keywords.setdefault("max_episode_steps", ENDLESS) != ENDLESS:
+            steps = keywords["max_episode_steps"]
+            raise ConfigError(f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates")
+        self._make_batch(1, seed, n_threads=1, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords)
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
@@ -259,7 +261,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
 
     @property
     def wrench(self) -> FloatArray:
-        """What :meth:`set_wrench` has set, (12,), a live view: force world, force body, torque world, torque body; N, N m."""
+        """Set or sampled, without gusts, (12,), a live view: force world, force body, torque world, torque body; N, N m."""
         return self.batch.wrench[:, 0]
 
     def _by_row(self, columns: FloatArray) -> FloatArray:

@@ -115,19 +115,11 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
     def close(self) -> None:
         """There is nothing to give back."""
 
-    @property
-    def max_episode_steps(self) -> int | list[int]:
-        """Control steps after which an episode is truncated; where rows differ, of each."""
-        each: list[int] = self.batch.max_steps.tolist()
-        return each if len({*each}) > 1 else each[0]
-
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """One value per requested row."""
         rows = self.batch.rows(indices)
         if attr_name == "vehicle":
             return [self.batch.vehicle_list[row] for row in rows]
-        if attr_name == "max_episode_steps":
-            return [*self.batch.max_steps[rows].tolist()]
         value = getattr(self, attr_name)
         return [value[row] if attr_name in _OF_ROWS else value for row in rows]
 

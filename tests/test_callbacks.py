@@ -160,7 +160,16 @@ def test_the_episode_log_is_a_monitor_file(tmp_path):
     assert len(results) == 2 * 80 / 10
     assert (results.l == 10).all()
     assert set(results.is_success) <= {True, False}
-    assert (tmp_path / "0.monitor.csv").read_text().count("#") == 1
+    log = tmp_path / "0.monitor.csv"
+    assert log.read_text().count("#") == 1
+    log.write_text(log.read_text() + "1.0,2")  # as a crash may leave it
+    make_model().learn(80, callback=EpisodeLog(log, "Walk-v0"))
+
+
+def test_evaluations_that_are_none_are_named(tmp_path):
+    np.savez(tmp_path / "evaluations.npz", other=np.zeros(2))
+    with pytest.raises(ConfigError, match=r"evaluations\.npz: cannot be read"):
+        make_model().learn(80, callback=make_best(tmp_path, 40))
 
 
 class Signal(BaseCallback):

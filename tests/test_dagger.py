@@ -293,6 +293,8 @@ def test_a_loss_that_is_not_finite_stops_training_and_spares_the_parameters():
         ({"beta": 0.1}, "beta_final"),
         ({"bc_loss": "mae"}, "did you mean"),
         ({"dataset_capacity": 10}, "dataset_capacity"),
+        ({"beta_decay": -1.0}, "beta_decay"),
+        ({"gradient_steps": 0}, "gradient_steps"),
     ],
 )
 def test_bad_arguments_are_named(arguments, message):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch as th
 from stable_baselines3 import PPO
+from stable_baselines3.common.buffers import RolloutBuffer
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.utils import LinearSchedule
@@ -200,9 +201,21 @@ def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_parameters(l2_co
     assert th.equal(before, parameters(model))
 
 
+def test_a_policy_that_diverges_stops_training_whatever_computes_its_gradients():
+    changes = {**SMALL, "policy_kwargs": {"activation_fn": th.nn.ELU}, "learning_rate": 1e30}
+    with pytest.raises(TrainingError, match="not finite"):
+        PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=0.0, **changes).learn(640)
+
+
 @pytest.mark.parametrize(
     "arguments",
-    [{"bc_filter": "advantage"}, {"expert": swing_back, "use_sde": True}],
+    [
+        {"bc_filter": "advantage"},
+        {"expert": swing_back, "use_sde": True},
+        {"rollout_buffer_class": RolloutBuffer},
+        {"bc_coef": -1.0},
+        {"critic_warmup": -5},
+    ],
 )
 def test_bad_arguments_are_named(arguments):
     with pytest.raises(ConfigError, match=[*arguments][-1]):

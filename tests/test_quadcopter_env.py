@@ -228,6 +228,7 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: env.set_wrench(force=(1, 2, 3), force_frame="wrld"), "force_frame 'wrld'"),
         (lambda env: env.set_noise(-1), "noise"),
         (lambda env: QuadcopterEnv(observation_std=np.zeros(18)), "observation_std"),
+        (lambda env: QuadcopterEnv(max_episode_steps=5), "max_episode_steps 5: give it to gymnasium.make"),
         (lambda env: QuadcopterEnv(task="target_trackin"), "did you mean 'target_tracking'"),
         (lambda env: QuadcopterEnv(noize=0), "QuadcopterEnv: unknown keyword 'noize': did you mean 'noise'"),
         (

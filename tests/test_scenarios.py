@@ -58,6 +58,7 @@ def test_the_thesis_suite_holds_all_of_chapter_four():
         ("start: {position: [0, 0, 0.1]}", "touches the ground"),
         ("target: [0, 0, -3]", "touches the ground"),
         ("target: {distance: 31}", "max_distance"),
+        ("start: {velocity: {std: 5000}}", "velocity_std"),
         ("target: {distance: 10, position: [1, 2, 3]}", "exactly one of"),
         ("vehicle: itn", "did you mean 'itm'"),
         ("vehicle_changes: {mass: 1.7}", "no such vehicle can fly"),

@@ -87,6 +87,15 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
     np.testing.assert_array_equal(hit.targets, [[3, 0, 16]])
 
 
+def test_what_randomize_pushes_with_is_recorded():
+    setting = fixed_setting(
+        FlightSettings(task="target_tracking", randomize={"force": {"magnitude": [3, 3]}, "gusts": {"std": 1}})
+    )
+    recording = flown(setting, 20)
+    np.testing.assert_allclose(recording.wrench[1:], recording.state.wrench[:, :-1].T)
+    assert recording.wrench[1:, :3].any() and recording.pushes == [1]
+
+
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
     setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=20))
     episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50))

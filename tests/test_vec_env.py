@@ -365,7 +365,7 @@ def test_staggered_episodes_end_at_times_spread_evenly():
 
 def test_rows_can_have_limits_of_their_own():
     env = QuadcopterVecEnv(5, seed=0, max_episode_steps=[10, 25], staggered=True)
-    assert env.max_episode_steps == env.get_attr("max_episode_steps") == [10, 25, 10, 25, 10]
+    assert env.batch.max_steps.tolist() == [10, 25, 10, 25, 10]
     env.reset()
     lengths = {row: [] for row in range(5)}
     for _ in range(80):

@@ -47,9 +47,8 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
     rays /= np.linalg.norm(rays, axis=2, keepdims=True)
     sky = SKY_HORIZON + np.clip(1.6 * rays[..., 2:], 0.0, 1.0) * (SKY_ZENITH - SKY_HORIZON)
     eye = camera.eye.astype(np.float32)
-    distance = np.maximum(eye[2], 0.0) / np.maximum(
-        -rays[..., 2], 1e-6
-    )  # so far away where there is no ground that haze hides it
+    # So far away where there is no ground that haze hides it.
+    distance = np.maximum(eye[2], 0.0) / np.maximum(-rays[..., 2], 1e-6)
     east, north = (eye[:2] + distance[..., None] * rays[..., :2]).transpose(2, 0, 1)
     # What a pixel covers of the ground, in squares; finer squares blur into their mean instead of flickering.
     footprint = distance * distance * np.float32(2.0 * slope / height / max(eye[2], 0.1) / SQUARE)

@@ -16,6 +16,12 @@ from sb3_quad.algorithms.networks.perceptron import one_torch_thread
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.controller import Controller
 
+LIMITS = {
+    "learning_rate": (0, 1),
+    **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)),
+    **dict.fromkeys(("bc_coef", "l2_coef", "clip_range_vf", "beta_decay", "critic_warmup"), (0, 2**40)),
+}
+"""Of arguments of the algorithms: the least, and the greatest that a settings file may have."""
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # names of the critic's own parameters
 
 
@@ -30,6 +36,11 @@ class ExpertMixin:
         self.expert = expert
 
     def _setup_model(self) -> None:
+        for name, (least, _) in LIMITS.items():
+            given = getattr(self, name, None)
+            value = given(1.0) if callable(given) else given  # at the start of a schedule
+            if value is not None and not value >= least:
+                raise ConfigError(f"{name} {value:g}: must be at least {least}")
         with one_torch_thread(compiled=True):  # the orthogonal weights of a network depend on how many threads make them
             super()._setup_model()  # type: ignore[misc]
 

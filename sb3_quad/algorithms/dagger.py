@@ -147,6 +147,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         rollout = self.n_steps * self.n_envs
         if self.dataset_capacity != 0 and self.dataset_capacity < rollout:
             raise ConfigError(f"dataset_capacity {self.dataset_capacity}: must be 0 or at least n_steps * n_envs = {rollout}")
+        if self.gradient_steps is not None and self.gradient_steps < 1:
+            raise ConfigError(f"gradient_steps {self.gradient_steps}: must be at least 1, or None")
         self._refuse_dict_observations()
         super()._setup_model()
         if not isinstance(self.policy.action_dist, DiagGaussianDistribution):

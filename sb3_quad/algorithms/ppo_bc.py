@@ -119,6 +119,8 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
 
     def _setup_model(self) -> None:
         self._refuse_dict_observations()
+        if not issubclass(self.rollout_buffer_class or RolloutBuffer, ExpertRolloutBuffer):
+            raise ConfigError(f"rollout_buffer_class {self.rollout_buffer_class}: must be an ExpertRolloutBuffer")
         super()._setup_model()
         if not isinstance(self.action_space, spaces.Box) and self.expert is not None:
             raise ConfigError(f"PPOBC clones into a Box action space only, this environment has {self.action_space}")

@@ -67,9 +67,11 @@ def interrupts_leave() -> Iterator[None]:
     """
     main = threading.current_thread() is threading.main_thread()
     before = signal.signal(signal.SIGINT, signal.SIG_DFL) if main else None
-    yield
-    if main:
-        signal.signal(signal.SIGINT, before)
+    try:
+        yield
+    finally:
+        if main:
+            signal.signal(signal.SIGINT, before)
 
 
 def ignore_interrupts() -> None:

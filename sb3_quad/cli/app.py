@@ -27,7 +27,7 @@ EPILOG = """examples:
 
 exit codes:
   0    done
-  1    some controllers of an evaluation failed (one line each on stderr), or a vehicle cannot hover
+  1    some controllers of an evaluation or runs of a sweep failed (one line each on stderr), or a vehicle cannot hover
   2    bad input, a training that cannot continue, or any other error: one line on stderr says what
   129  the terminal was closed (SIGHUP), after saving
   130  interrupted by Ctrl-C, after saving

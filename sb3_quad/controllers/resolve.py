@@ -18,7 +18,7 @@ EXPERTS = {
     "told_cautious": "sb3_quad.experts.geometric:told_cautious",
 }
 DEFAULT_EXPERT = "pid"
-"""Whose actions are learnt where nothing else is asked for; it also recovers, which the thesis's PID mostly does not."""
+"""Whose actions are learnt where nothing else is asked for: the thesis's."""
 
 
 def resolve_expert(

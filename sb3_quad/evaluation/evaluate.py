@@ -37,7 +37,7 @@ from sb3_quad.evaluation.results import (
 from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import DEFAULT_VEHICLE, Scenario, Suite
 from sb3_quad.executors import Executor, start_executor
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 PART_SIZES = {"batch": 4096, "pybullet": 240}  # episodes side by side
 RECORDED_FIXED, RECORDED_RANDOM = 24, 8  # flights whose trajectories are kept, at most
@@ -150,7 +150,7 @@ def fly_scenario(
 
     :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param recorded: flights to sample; None: all of a scenario that is the same each time, the first few of others.
-    :param own: changes to how it is flown that go with the controller: ``observation_mean``, ``observation_std``.
+    :param own: changes to how it is flown that go with the controller: its ``FlightSettings.observed``.
     :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
     :raises ConfigError: an unknown backend, or a controller that cannot be asked.
     :raises ControllerError: a controller that fails in flight.
@@ -211,7 +211,7 @@ def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tupl
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
     """What a controller flies in a scenario: the scenario's vehicle, else its own."""
     own = spec.own.vehicle if spec.own else DEFAULT_VEHICLE
-    return load_vehicle(own) if scenario.vehicle is None else scenario.nominal_vehicle()
+    return first_vehicle(own) if scenario.vehicle is None else scenario.nominal_vehicle()
 
 
 def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]) -> None:

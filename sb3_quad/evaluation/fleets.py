@@ -54,6 +54,11 @@ class BatchFleet:
         """The wrench from now on, (n, WRENCH_SIZE), see :mod:`sb3_quad.simulation.state`."""
         self._batch.wrench[:] = wrench.T
 
+    @property
+    def wrench(self) -> FloatArray:
+        """What pushes all rows in this control step, drag excepted, (n, WRENCH_SIZE)."""
+        return self._batch.total_wrench().T
+
     def true_state(self) -> QuadcopterState:
         """The true state of all rows, fresh or live."""
         return self._batch.true_state()
@@ -98,6 +103,10 @@ class PyBulletFleet:
     def set_wrench(self, wrench: FloatArray) -> None:
         for env, values in zip(self._envs, wrench, strict=True):
             env.wrench[:] = values
+
+    @property
+    def wrench(self) -> FloatArray:
+        return np.stack([env.batch.total_wrench()[:, 0] for env in self._envs])
 
     def true_state(self) -> QuadcopterState:
         return QuadcopterState.concatenate([env.true_state() for env in self._envs])

@@ -21,7 +21,7 @@ from sb3_quad.evaluation.fleets import FLEETS, Fleet
 from sb3_quad.evaluation.scenarios.sample import Plan
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 from sb3_quad.simulation.settings import FlightSettings, known_layout
-from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
@@ -159,7 +159,7 @@ def _fly_fleet(
     state = fleet.true_state()
     position, error = state.position.copy(), state.distance
     motion = Motion(state, control_step)
-    wrench, limits = np.zeros((n, WRENCH_SIZE)), np.array(tolerances)[:, None]
+    limits = np.array(tolerances)[:, None]
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     stays = times.copy()
@@ -189,14 +189,13 @@ def _fly_fleet(
 
     for step in range(1, max_steps + 1):
         if step - 1 in plan.wrenches:
-            wrench = plan.wrenches[step - 1]
-            fleet.set_wrench(wrench)
+            fleet.set_wrench(plan.wrenches[step - 1])
         try:
             actions = controller.actions(observation, flying)
         except ControllerError as failed:
             raise ControllerError(f"{failed}, after {(step - 1) * control_step:.2f} s") from failed
         for hook in hooks:
-            hook.before_step(state, observation, wrench, flying)
+            hook.before_step(state, observation, fleet.wrench, flying)
         observation, step_reward, lost, collided, error, arrived = fleet.step(actions, flying)
         state = fleet.true_state()
         flights.reward[flying] += step_reward[flying]
@@ -257,7 +256,9 @@ class Motion:
     def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
         """The state after control step ``step``; only flights (n,) that go on count."""
         time, before = step * self._control_step, self._stable
-        self._stable = _upright(state) & (np.hypot(*state.body_rates.T[:2]) < RATE)
+        x, y = state.quaternion.T[1:3]
+        upright = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
+        self._stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
         self._since[self._stable & ~before] = time
         held = flying & self._stable & (time - self._since > HOLD - 0.5 * self._control_step)
         new = held & np.isnan(self.stabilised)
@@ -265,9 +266,3 @@ class Motion:
         flown = state.position - self._start
         beside = np.linalg.norm(flown - (flown * self._direction).sum(axis=1, keepdims=True) * self._direction, axis=1)
         self.sideways[flying] = np.maximum(self.sideways, beside)[flying]
-
-
-def _upright(state: QuadcopterState) -> BoolArray:
-    x, y = state.quaternion.T[1:3]
-    upright: BoolArray = 1.0 - 2.0 * (x * x + y * y) > np.cos(TILT)
-    return upright

@@ -120,11 +120,7 @@ class Table:
 
 
 def text_table(
-    title: str,
-    heads: Sequence[str],
-    rows: Iterable[Sequence[str]],
-    align: Literal["left", "right"] = "right",
-    caption: str = "",
+    title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], align: Literal["left", "right"] = "right"
 ) -> Table:
     """A table of words.
 
@@ -133,4 +129,4 @@ def text_table(
     """
     columns = [Column(head, align=align) for head in heads[1:]]
     filled = [Row(name, "", [Cell(words=text) for text in texts]) for name, *texts in rows]
-    return Table(columns, filled, heads[0], title, caption)
+    return Table(columns, filled, heads[0], title)

@@ -5,13 +5,13 @@ from abc import ABC, abstractmethod
 import numpy as np
 import numpy.typing as npt
 
-from sb3_quad.base.arrays import FloatArray
+from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
-Actions = npt.NDArray[np.float32]
+Actions = Float32Array
 
 
 class Expert(ABC):
@@ -62,9 +62,7 @@ class Expert(ABC):
         return (actions[0] if array.ndim == 1 else actions), state
 
 
-def observed_state(
-    observation: npt.NDArray[np.float64], mean: npt.NDArray[np.float64], std: npt.NDArray[np.float64]
-) -> QuadcopterState:
+def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:
     """The state that observations of shape (n, 18) describe, with the target as origin (Eq. 3.16 undone).
 
     Noise leaves ᴮRᴵ no rotation; the nearest one is taken. Rotor speeds cannot be observed and are zero.

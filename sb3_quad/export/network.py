@@ -180,7 +180,7 @@ def check_policy(policy: Any, where: str) -> None:
     if tuple(map(type, parts)) != (ActorCriticPolicy, FlattenExtractor, MlpExtractor):
         names = " with ".join(type(part).__name__ for part in parts if part is not None)
         raise ConfigError(
-            f"{where}: its policy is {names}; only MlpPolicy of an on-policy algorithm (PPO, A2C, DAgger, PPOBC) will do, "
+            f"{where}: its policy is {names}; only MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC, TD3) will do, "
             "without a features extractor of its own"
         )
 

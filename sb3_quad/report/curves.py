@@ -18,10 +18,7 @@ _LABELS = {SUCCESS: "success in %", SURVIVAL: "survival in %", REWARD: "mean rew
 
 @styled
 def plot_curves(
-    groups: Mapping[str, Sequence[Curve]],
-    lines: Mapping[str, Mapping[str, float]],
-    title: str = "",
-    show: Sequence[str] = (),
+    groups: Mapping[str, Sequence[Curve]], lines: Mapping[str, Mapping[str, float]], title: str = "", show: Sequence[str] = ()
 ) -> Figure:
     """Two panels, over timesteps and over wall-clock time, for each of ``show``; a marker at each evaluation.
 

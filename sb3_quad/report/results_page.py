@@ -16,7 +16,7 @@ from sb3_quad.evaluation.metric_tables import (
     reference_cells,
     scenario_groups,
 )
-from sb3_quad.evaluation.results import ControllerRecord, Results, load_results
+from sb3_quad.evaluation.results import Results, load_results
 from sb3_quad.evaluation.scenarios.load import axis_label
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
@@ -91,17 +91,14 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             f"observation noise {in_words(first.noise)}; seed {first.seed}."
         )
         parts.append(Section(first.group or first.name, heading, first.description, tables, plots, how))
-    parts.append(Section("controllers", "Controllers", tables=[_controller_table(results.controllers)]))
+    known = [(each.label, each.spec, each.algorithm or "", (each.content or "")[:12]) for each in results.controllers]
+    table = text_table("", ("name", "controller", "algorithm", "SHA-256"), known, align="left")
+    parts.append(Section("controllers", "Controllers", tables=[table]))
     if results.failures:
         failures = [(each.controller, each.scenario or "", each.message) for each in results.failures]
         table = text_table("", ("controller", "scenario", "what happened"), failures, align="left")
         parts.append(Section("failures", "Failures", tables=[table]))
     return parts
-
-
-def _controller_table(records: Sequence[ControllerRecord]) -> Table:
-    rows = [(each.label, each.spec, each.algorithm or "", (each.content or "")[:12]) for each in records]
-    return text_table("", ("name", "controller", "algorithm", "SHA-256"), rows, align="left")
 
 
 def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:

@@ -18,7 +18,7 @@ from sb3_quad.evaluation.scenarios.sample import Plan, sample_plan
 from sb3_quad.simulation.checks import per_row
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import WRENCH_SIZE, QuadcopterState
-from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = Non
     :param target: of all of them, r_T, (3,), m; None: each episode's own.
     :raises ConfigError: an unknown vehicle, a target below ground.
     """
-    start, least = {}, load_vehicle(settings.vehicle).collision_radius
+    start, least = {}, first_vehicle(settings.vehicle).collision_radius
     if target is not None:
         start["target"] = per_row("--target", target, 1, 3).T
         if target[2] <= least:
@@ -154,26 +154,27 @@ def _record(
 ) -> Recording:
     every = _EveryStep()
     flights = fly_settings(controller, settings, [seed], "pybullet", (), [every], plan, deterministic)
-    wrench = np.zeros((len(every.states), WRENCH_SIZE))
-    for first, values in sorted(plan.wrenches.items()):
-        wrench[first + 1 :] = values
     return Recording(
         name=name,
         colour=colour,
         vehicle=every.vehicle,
         times=np.arange(len(every.states), dtype=np.float64) * every.vehicle.control_step,
         state=QuadcopterState.concatenate(every.states),
-        wrench=wrench,
+        wrench=np.stack([np.zeros(WRENCH_SIZE), *every.wrenches]),
         reward=float(flights.reward[0]),
         lost="" if flights.survival[0] else "collision" if flights.collision[0] else "out of range",
     )
 
 
 class _EveryStep(Hook):
-    """Keeps the state after every control step of a flight, and before the first."""
+    """Keeps the state after every control step of a flight, and before the first, and the wrench in each."""
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         self.vehicle, self.states = vehicle, [state.copy()]
+        self.wrenches: list[FloatArray] = []
+
+    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
+        self.wrenches.append(wrench[0].copy())
 
     def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
         self.states.append(state.copy())

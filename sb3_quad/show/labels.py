@@ -1,4 +1,4 @@
-"""Words in pictures, in the font that comes with matplotlib, and the colours that tell controllers apart."""
+"""Words in pictures, in the font that comes with matplotlib."""
 
 from collections.abc import Sequence
 from functools import cache

@@ -8,7 +8,7 @@ counter: the key names the row, the counter is ``(block, step, episode, purpose)
 
 Normals are Box-Muller in float32, lane by lane. The logarithm, sine and cosine are short polynomials instead of library
 calls, so that the loops vectorise; their error (1e-7) is far below what any test of the numbers could see. The largest
-number there can be is 6.6.
+number there can be is 6.7.
 """
 
 import math

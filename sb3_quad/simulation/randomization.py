@@ -70,6 +70,8 @@ class Range(Frozen):
             raise ValueError(f"[{self.low:g}, {self.high:g}]: the first number exceeds the second")
         if self.distribution == "log_uniform" and self.low <= 0.0:
             raise ValueError(f"[{self.low:g}, {self.high:g}]: log_uniform numbers are greater than 0")
+        if self.distribution == "uniform_cube_root" and self.low < 0.0:
+            raise ValueError(f"[{self.low:g}, {self.high:g}]: uniform_cube_root numbers are not negative")
         return self
 
     def numbers(self) -> list[float]:
@@ -236,12 +238,17 @@ class Randomization(Frozen):
 
         :raises ConfigError: it could not hover, or its motors would overshoot.
         """
-        mass, thrust = self.mass.high if self.mass else 1.0, self.thrust.low if self.thrust else 1.0
-        if thrust * vehicle.thrust_limits[1] <= mass:
-            raise ConfigError(
-                f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
-                f" its rotors lift {vehicle.thrust_limits[1]:g} times its weight"
-            )
+        masses, thrusts = ((each.low, each.high) if each else (1.0, 1.0) for each in (self.mass, self.thrust))
+        least, most = vehicle.thrust_limits
+        for mass, thrust, why in (
+            (masses[1], thrusts[0], f"lift {most:g}" if thrusts[0] * most <= masses[1] else ""),
+            (masses[0], thrusts[1], f"give at least {least:g}" if thrusts[1] * least > masses[0] else ""),
+        ):
+            if why:
+                raise ConfigError(
+                    f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
+                    f" its rotors {why} times its weight"
+                )
         both, up, down = ((each and each.high) or 1.0 for each in self._motor_gains)
         gain = both * max(vehicle.motor_gain_up * up, vehicle.motor_gain_down * down)
         if gain * vehicle.physics_step > 1.0:

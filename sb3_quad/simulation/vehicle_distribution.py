@@ -18,7 +18,7 @@ from sb3_quad.base.validate import Frozen, explain
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.random import DISTRIBUTION, uniforms
-from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, NonNegativeRange, PositiveRange, Range, between
+from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, NonNegativeRange, PositiveRange, between
 from sb3_quad.simulation.state import P, first_rows
 from sb3_quad.vehicles.vehicle import Vehicle
 
@@ -51,7 +51,9 @@ class VehicleDistribution(Frozen):
         default=None, description="of a rotor that slows down, s; left out: the same"
     )
     moment_thrust_ratio: PositiveRange = Field(description="kM / kF, m")
-    least_thrust: Range = Field(default=Range(low=0.0, high=0.0), description="of a rotor, in hover thrusts")
+    least_thrust: NonNegativeRange = Field(
+        default=NonNegativeRange(low=0.0, high=0.0), description="of a rotor, in hover thrusts"
+    )
     inertia_ratios: tuple[Ratio, Ratio, Ratio] | None = Field(
         default=None, description="of Ixx, Iyy and Izz; left out: the base vehicle's"
     )

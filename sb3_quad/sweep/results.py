@@ -21,7 +21,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_csv, write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
-from sb3_quad.evaluation.statistics import Estimate
+from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
@@ -37,7 +37,6 @@ ROWS = {  # by measure: its row, factor and decimals
 }
 STATISTICS = {measure: np.nanmedian if measure == ERROR else np.nanmean for measure in MEASURES}
 COMPARED = (SUCCESS, REWARD)
-RESAMPLES = 1000
 CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over seeds and episodes"
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Any, Literal, TypeAlias, get_args
 import gymnasium
 from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, ValidationInfo, field_validator, model_validator
 
+from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
 from sb3_quad.base.literals import parse_mapping, parse_number
 from sb3_quad.base.validate import Frozen, validate
@@ -23,22 +24,12 @@ from sb3_quad.training.algorithms import constructor_parameters, get_algorithm, 
 from sb3_quad.training.values import BASES, as_list, check, convert, import_class, qualified_classes
 from sb3_quad.vehicles.vehicle import VEHICLES
 
-SETTINGS = YamlFolder(
-    "settings file",
-    "sb3_quad.zoo_configs",
-    ".yml",
-    folders=("any_quadcopter", "nominal", "robust", "thesis", "value_based"),
-)
+_FOLDERS = "any_quadcopter", "nominal", "robust", "thesis", "value_based"
+SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
 VEC_ENVS = get_args(VecEnvKind)
 MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as many in a process
-LIMITS = {
-    "learning_rate": (0, 1),
-    **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)),
-    **dict.fromkeys(("bc_coef", "l2_coef", "clip_range_vf", "beta_decay", "critic_warmup"), (0, 2**40)),
-}
-"""Of keywords of the algorithms: the least and the greatest."""
 
 
 def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:

@@ -134,7 +134,8 @@ def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attribu
         further = f"; to train its model further use -i {run.result}" if run.result.is_file() else ""
         raise ConfigError(f"run folder {run.path}: holds no interrupted run{further}")
     state, batch = read_arrays(path), getattr(env.unwrapped, "batch", None)
-    environment, algorithm = _part(state, ENVIRONMENT), get_algorithm(algo)
+    environment = {name.removeprefix(ENVIRONMENT): each for name, each in state.items() if name.startswith(ENVIRONMENT)}
+    algorithm = get_algorithm(algo)
     _check(state, {"model": NO_BYTES}, path)
     zip_file, where = io.BytesIO(state["model"].tobytes()), f"{path}: model"
     model: Any = load_zip(algorithm, zip_file, where=where, env=env, device=device, force_reset=batch is None, **attributes)
@@ -187,10 +188,6 @@ def _require(fits: bool, otherwise: str, path: Path) -> None:
 
 def _with_prefix(prefix: str, arrays: Arrays) -> Arrays:
     return {f"{prefix}{name}": array for name, array in arrays.items()}
-
-
-def _part(state: Arrays, prefix: str) -> Arrays:
-    return {name.removeprefix(prefix): array for name, array in state.items() if name.startswith(prefix)}
 
 
 def _stores(model: Any) -> dict[str, Any]:

@@ -178,7 +178,7 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     cosine, sine, zero = np.cos(heading), np.sin(heading), np.zeros(heading.size)
     features[:, GROUPS["rotation"]] = np.stack([cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1], axis=1)
     mean, std = scaling(settings)
-    relative, additive = levels(settings.noise)
+    relative, additive = (level.mean() for level in levels(settings.noise))
     features *= 1.0 + relative * rng.standard_normal(features.shape)
     features += additive * std * rng.standard_normal(features.shape)
     return np.asarray((features - mean) / std, dtype=np.float32)

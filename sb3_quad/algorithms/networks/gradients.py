@@ -138,7 +138,7 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
             if critic is not None:
                 values = policy.predict_values(critic.tensors(policy.device)[0])
     except ValueError:  # of a distribution whose mean is not finite
-        return dict.fromkeys(COEFFICIENTS, np.nan)
+        return dict.fromkeys((*COEFFICIENTS, "approx_kl"), np.nan)
 
     if loss.policy_coef != 0.0 and log_prob is not None:
         advantages = raw_advantages

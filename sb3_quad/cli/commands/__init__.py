@@ -1,1 +1,1 @@
-"""What each command does, a module each; only the one that was called is imported."""
+"""What each command does, a module each; what is heavy is imported when it runs."""

@@ -2,7 +2,7 @@
 
 examples:
   sb3-quad check-vehicle my.yaml            your own vehicle
-  sb3-quad check-vehicle crazyflie          one that comes with the package: crazyflie, hummingbird, itm
+  sb3-quad check-vehicle crazyflie          one that comes with the package, such as itm or x500
   sb3-quad check-vehicle my.yaml -n 0       from its parameters alone, without flying
 
 Exit code 1: the rotors cannot produce hover thrust. The contents of a vehicle file: docs/vehicles.md
@@ -89,10 +89,7 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
         ("inertia", f"{ixx:.4g}, {iyy:.4g}, {izz:.4g} kg m²"),
         ("", f"{share}, at most 1 (triangle inequality)"),
         ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
-        (
-            "motors",
-            f"{_time_constants(vehicle)}; from command to thrust {1000 * vehicle.command_lag:.1f} ms",
-        ),
+        ("motors", f"{_time_constants(vehicle)}; from command to thrust {1000 * vehicle.command_lag:.1f} ms"),
     ]
 
 

@@ -37,7 +37,7 @@ def add_arguments(parser: Parser) -> None:
     add("--algo", help="algorithm of a trained agent, looked up in the log folder")
     task = parser.add_mutually_exclusive_group()
     task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
-    task.add_argument("--task", metavar="NAME", help="target_tracking or state_recovery, instead of --env")
+    task.add_argument("--task", metavar="NAME", help="a task such as target_tracking, instead of --env")
     task.add_argument("--scenario", metavar="SUITE:NAME", help="a scenario, such as thesis:side_hit, instead of --env")
     add("-f", "--folder", "--log-folder", default="logs", metavar="DIR", help="folder that holds the run folders (logs)")
     add("--exp-id", type=int, default=0, metavar="N", help="number of the run; 0: the latest with an agent (0)")

@@ -25,7 +25,7 @@ from sb3_quad.controllers.pretrained import agent_path
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    model = "an agent with MlpPolicy (PPO, A2C, DAgger, PPOBC): a zip, a run folder, or a name like itm-recovery"
+    model = "an MlpPolicy (of PPO, A2C, DAgger, PPOBC, SAC, SACBC, TD3): a zip, a run folder, or a name like itm-recovery"
     add("model", type=agent_path, metavar="MODEL", help=model)
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
     file = "file to write, or a folder for it (here, named as the zip, .onnx, .pt or .h)"

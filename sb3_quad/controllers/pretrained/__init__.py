@@ -39,7 +39,7 @@ def pretrained(name: str) -> Path:
 def load_pretrained(name: str, **kwargs: Any) -> "PPO":
     """A policy that comes with the package, as a stock PPO model.
 
-    It reads the 18 features of :class:`~sb3_quad.envs.QuadcopterEnv`, scaled as there, and gives 4 actions in [-1, 1].
+    It reads what an environment with :func:`env_kwargs` of that name observes, and gives 4 actions in [-1, 1].
 
     :param kwargs: of ``PPO.load``, such as ``env`` and ``device`` (here "cpu" unless told otherwise).
     :raises ConfigError: an unknown name.

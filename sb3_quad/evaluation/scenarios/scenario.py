@@ -16,7 +16,7 @@ from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.simulation.settings import FlightSettings, Noise
 from sb3_quad.simulation.tasks import RECOVERED, Task
 from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
-from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, load_vehicle
+from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle, first_vehicle, load_vehicle
 
 TOLERANCES = (0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)  # m: Figs. 4.6 and 4.7, and below
 NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]*$"  # is part of file names
@@ -83,9 +83,8 @@ class Scenario(Frozen):
     @field_validator("vehicle")
     @classmethod
     def _read(cls, value: str | Vehicle | None) -> str | Vehicle | None:
-        return (
-            load_vehicle(value) if isinstance(value, str) and VEHICLES.is_path(value) else value
-        )  # from here on, no file matters
+        # From here on, no file matters.
+        return load_vehicle(value) if isinstance(value, str) and VEHICLES.is_path(value) else value
 
     @field_validator("tolerances")
     @classmethod
@@ -97,6 +96,10 @@ class Scenario(Frozen):
         vehicle = self.flown_vehicle()
         vehicle = self.vehicles.weakest(vehicle) if self.vehicles is not None else vehicle
         self._check_way(vehicle)
+        try:
+            _ = self.task
+        except ValidationError as error:
+            raise ValueError(explain(error, Task)) from None
         if self.randomize is not None:
             self.randomize.check(vehicle)
             if self.randomize.sets_wrench and self.wrenches:
@@ -126,7 +129,7 @@ class Scenario(Frozen):
         """
         if own is None or self.vehicle is not None:
             return self
-        vehicle = load_vehicle(own)
+        vehicle = first_vehicle(own)
         return validate(Scenario, {**self.model_dump(), "vehicle": vehicle}, f"scenario {self.name}, flown by {vehicle.name}")
 
     def flown_vehicle(self) -> Vehicle:
@@ -140,9 +143,9 @@ class Scenario(Frozen):
         except ValidationError as error:
             raise ValueError(f"vehicle_changes: no such vehicle can fly ({explain(error, Vehicle)})") from None
 
-    def episode_seeds(self, n: int | None = None) -> list[int]:
-        """The seeds of the first n episodes, for ``reset(seed=…)`` of one environment; None: of those that are judged."""
-        return row_seeds(seed_for("suite", self.seed), self.episodes if n is None else n)
+    def episode_seeds(self) -> list[int]:
+        """The seeds of the episodes, for ``reset(seed=…)`` of one environment."""
+        return row_seeds(seed_for("suite", self.seed), self.episodes)
 
     @property
     def heading(self) -> str:
