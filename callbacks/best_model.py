@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Mapping
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -184,7 +185,8 @@ class BestModel(EveryTimesteps):
         if "successes" in values:
             values["successes"] = np.nan_to_num(successes)  # some environments report no failures
         if group == "eval":  # of the latest update, which the log still holds
-            values |= {name: float(value) for name, value in self.logger.name_to_value.items() if _is_loss(name)}
+            logged = self.logger.name_to_value
+            values |= {name: float(logged[name]) for name in logged if fnmatchcase(name, "train/*loss")}
         _append(self._rows[group], values)
         write_arrays(self._paths[group], **self._rows[group])
         for name, value in self._latest(group).items():
@@ -225,10 +227,6 @@ def _append(rows: dict[str, Any], values: dict[str, Any]) -> None:
         example = values[name] if name in values else rows[name][-1]
         nothing = np.full(np.shape(example), np.nan)
         rows.setdefault(name, [nothing] * before).append(values.get(name, nothing))
-
-
-def _is_loss(name: str) -> bool:
-    return name.startswith("train/") and name.endswith("loss")
 
 
 def _score(successes: Any, rewards: Any) -> Score:

@@ -169,8 +169,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
         # One row of the batched environment, whose body PyBullet moves; Gymnasium's TimeLimit truncates.
-        if keywords.setdefault("max_episode_steps", ENDLESS) != ENDLESS:
-            steps = keywords["max_episode_steps"]
+        if (steps := keywords.setdefault("max_episode_steps", ENDLESS)) != ENDLESS:
             raise ConfigError(f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates")
         self._make_batch(1, seed, n_threads=1, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords)
         self._ready = False

@@ -145,6 +145,12 @@ def test_table_results_and_episodes_agree(here, capsys):
     assert [row["waypoints_reached"] for row in episodes if row["scenario"] == "course"] == ["2", "2", "0", "0"]
 
 
+def test_files_that_are_no_results_are_kept(here, capsys):
+    (here / "out").mkdir()
+    (here / "out" / "report.md").write_text("mine")
+    assert evaluate("a=pid", "--scenario", "tracking") == 2 and "report.md: exists already" in capsys.readouterr().err
+
+
 def test_a_folder_of_results_is_kept_or_written_anew(here, capsys):
     assert evaluate("a=pid", "b=pid", "--scenario", "tracking", "starts") == 0
     before, shown = times_of_change(here), capsys.readouterr().out

@@ -1,5 +1,6 @@
 """Pipelines: stages hand their agents on, interruptions go on where they were, and trimming cancels an offset."""
 
+import argparse
 import os
 import signal
 from functools import partial
@@ -14,6 +15,7 @@ from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
 from sb3_quad.cli import main
+from sb3_quad.cli.parser import PAIRS
 from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
@@ -81,6 +83,7 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "position_scale": 0.6}], "position_scale goes with trim: position"),
         ([{**STAGES[0], "trim": "hover", "leaving_cost": 2.0}], "leaving_cost goes with trim: arrival"),
         ([], "at least 1"),
+        ([STAGES[0], STAGES[0]], "one, one: give each a name of its own"),
     ],
 )
 def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, message, capsys):
@@ -90,8 +93,23 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
     assert not (tmp_path / "logs").exists()
 
 
-def test_flags_of_a_single_run_are_refused(capsys):
-    assert main(["train", "-n", "100"]) == 2 and "-n goes with a single run" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["-n", "100"], "--n-timesteps goes with a single run"),
+        (["--conf-file", "two_stage.yml", "--algo", "dagger"], "--algo goes with a single run"),
+        (["--thesis", "--conf-file", "two_stage.yml"], "--thesis is --conf-file"),
+        (["--algo", "dagger", "--env-kwargs", "noise:0", "--env-kwargs", "noise:1"], "noise is given twice"),
+    ],
+)
+def test_flags_that_would_be_ignored_are_refused(flags, message, capsys):
+    assert main(["train", *flags]) == 2 and message in capsys.readouterr().err
+
+
+def test_flags_of_pairs_add_up():
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--pairs", **PAIRS)
+    assert parser.parse_args(["--pairs", "a:1", "--pairs", "b:2", "c:3"]).pairs == {"a": 1, "b": 2, "c": 3}
 
 
 def test_moved_and_scaled_positions_are_part_of_the_actor():

@@ -92,6 +92,7 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
         (["agent"], "or NAME=PATTERN"),
         (["agent={runs}/Env_1", "agent={runs}/Env_2"], "'agent': two are called so"),
         (["agent={runs}/Env_1", "-o", "curves.gif"], "must end in"),
+        (["agent={runs}/Env_1", "-o", "{runs}/mine.svg"], "exists already"),
         (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
         (["agent={runs}"], "no such file"),
         (["agent={runs}/Env_1", "--thesis", "state_recovery"], "survival: the runs' evaluations hold none"),
@@ -100,6 +101,7 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
     ],
 )
 def test_bad_input_is_one_line(runs, arguments, message, capsys):
+    (runs / "mine.svg").touch()
     assert main(["plot", *(argument.format(runs=runs) for argument in arguments)]) == 2
     error = capsys.readouterr().err
     assert message in error and error.count("\n") == 1

@@ -19,9 +19,10 @@ from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import WorkerDied
+from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
-from sb3_quad.executors import start_executor
+from sb3_quad.executors import as_they_end, start_executor
 from sb3_quad.sweep.expand import expand
 from sb3_quad.sweep.folder import Plan, SweepFolder
 from sb3_quad.sweep.results import over_seeds, verdict
@@ -232,6 +233,15 @@ def test_a_worker_that_dies_fails_its_own_call_alone():
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
+def test_calls_that_were_cancelled_are_not_waited_for():
+    with start_executor("local", 1) as executor:
+        calls = {executor.submit(time.sleep, 0.5 * (k == 0)): k for k in range(3)}
+        [waiting] = [future for future, k in calls.items() if k == 2]
+        assert waiting.cancel()
+        ended = [k for k, _ in as_they_end(executor, calls, StopSignals(), print)]
+    assert sorted(ended) == [0, 1]
+
+
 def test_a_sweep_gives_what_train_gives(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     keys = {"env_kwargs": {"noise": 0.05}, "seed": [0, 1]}

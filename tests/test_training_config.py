@@ -89,6 +89,8 @@ def test_any_text_on_the_command_line_is_a_value(text):
     [
         ({"n_setps": 100}, "did you mean 'n_steps'"),
         ({"n_envs": 0}, "n_envs is 0, must be at least 1"),
+        ({"gamma": 2}, "gamma is 2, must be at most 1"),
+        ({"vf_coef": -1}, "vf_coef is -1, must be at least 0"),
         ({"n_timesteps": "many"}, "must be a whole number"),
         ({"n_steps": 2.5}, "n_steps is 2.5, must be a whole number"),
         ({"n_steps": "lin_100"}, "takes no schedule"),

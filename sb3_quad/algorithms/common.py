@@ -17,9 +17,11 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.controllers.controller import Controller
 
 LIMITS = {
-    "learning_rate": (0, 1),
+    **dict.fromkeys(("learning_rate", "gamma", "gae_lambda", "tau"), (0, 1)),
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)),
-    **dict.fromkeys(("bc_coef", "l2_coef", "clip_range_vf", "beta_decay", "critic_warmup"), (0, 2**40)),
+    **dict.fromkeys(("train_freq", "target_update_interval"), (1, 2**40)),
+    **dict.fromkeys(("max_grad_norm", "clip_range", "target_kl"), (1e-12, 2**40)),
+    **dict.fromkeys(("bc_coef", "l2_coef", "vf_coef", "clip_range_vf", "beta_decay", "critic_warmup"), (0, 2**40)),
 }
 """Of arguments of the algorithms: the least, and the greatest that a settings file may have."""
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # names of the critic's own parameters
@@ -39,7 +41,7 @@ class ExpertMixin:
         for name, (least, _) in LIMITS.items():
             given = getattr(self, name, None)
             value = given(1.0) if callable(given) else given  # at the start of a schedule
-            if value is not None and not value >= least:
+            if isinstance(value, (int, float)) and not value >= least:
                 raise ConfigError(f"{name} {value:g}: must be at least {least}")
         with one_torch_thread(compiled=True):  # the orthogonal weights of a network depend on how many threads make them
             super()._setup_model()  # type: ignore[misc]

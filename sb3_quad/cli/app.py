@@ -16,7 +16,7 @@ from sb3_quad.cli import commands
 from sb3_quad.cli.parser import Parser
 
 EPILOG = """examples:
-  sb3-quad train                                                          imitation in random worlds
+  sb3-quad train                                                          imitation, then PPO, in random worlds
   sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          a single training
   sb3-quad tune --algo dagger -n 250000 --n-trials 30                     a search for its hyperparameters
   sb3-quad evaluate pid agent.zip --suite quick                           an agent and an expert in one table

@@ -61,11 +61,13 @@ class Pairs(argparse.Action):
 
     def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
         """:raises ConfigError: an entry without a colon."""
-        found = {}
+        found = dict(getattr(namespace, self.dest) or {})
         for entry in values:
             key, colon, value = entry.partition(":")
             if not colon or not key:
                 raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
+            if key.strip() in found:
+                raise ConfigError(f"{option} {entry!r}: {key.strip()} is given twice")
             found[key.strip()] = parse_value(value)
         setattr(namespace, self.dest, found)
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from sb3_quad.base.arrays import Arrays
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied, unknown
-from sb3_quad.base.files import locked, make_folder, write_arrays, write_text
+from sb3_quad.base.files import locked, make_folder, refuse_existing, write_arrays, write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import registration
@@ -233,6 +233,8 @@ def _begin(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> d
     :raises ConfigError: the folder holds other results, and they are not to be overwritten; or damaged ones.
     """
     if not (folder / RESULTS).is_file():
+        for name in WRITTEN:
+            refuse_existing(folder / name, overwrite)
         return {}
     before = load_results(folder)
     certain = {job.name for job in jobs if job.record.kind != "factory"}

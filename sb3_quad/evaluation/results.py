@@ -129,12 +129,9 @@ def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
     columns |= {f"waypoint_{number}": values for number, values in enumerate(arrays["episode_waypoints"].T, 1)}
     return [
         {"controller": entry.controller, "scenario": entry.scenario, "episode": episode}
-        | {name: _text(value) for name, value in zip(columns, row, strict=True)}
+        | {
+            name: str(value) if not isinstance(value, np.floating) else f"{value:.9g}" if np.isfinite(value) else ""
+            for name, value in zip(columns, row, strict=True)
+        }
         for episode, row in enumerate(zip(*columns.values(), strict=True))
     ]
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, np.floating):
-        return str(value)
-    return f"{value:.9g}" if np.isfinite(value) else ""

@@ -57,7 +57,8 @@ def as_they_end(
     """
     stopped = False
     while calls:
-        for future in wait(calls, TICK, FIRST_COMPLETED).done:
+        wait(calls, TICK, FIRST_COMPLETED)
+        for future in [each for each in calls if each.done()]:  # those cancelled, too, which wait() does not see
             key = calls.pop(future)
             if not future.cancelled():
                 yield key, future

@@ -266,12 +266,11 @@ class Randomization(Frozen):
         for vector, frame in ((self.force, "world"), (self.torque, "body"), (self.wind, "world")):
             numbers += [*FIXED_NUMBERS, *[0.0] * 8] if vector is None else vector.numbers(frame)
         by_weight = float(self.gusts is not None and self.gusts.unit == "weight")
-        gusts, wind_gusts = (_gust_numbers(each, control_step) for each in (self.gusts, self.wind_gusts))
+        gusts, wind_gusts = (
+            [*each.std.numbers(), math.exp(-control_step / each.time_constant)] if each else [*FIXED_NUMBERS, 0.0]
+            for each in (self.gusts, self.wind_gusts)
+        )
         return np.array([*numbers, *gusts, by_weight, *wind_gusts])
-
-
-def _gust_numbers(gusts: Gusts | None, control_step: float) -> list[float]:
-    return [*FIXED_NUMBERS, 0.0] if gusts is None else [*gusts.std.numbers(), math.exp(-control_step / gusts.time_constant)]
 
 
 def _check_push(numbers: Range, unit: str) -> None:

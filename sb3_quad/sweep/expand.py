@@ -49,7 +49,9 @@ def expand(spec: SweepSpec) -> list[Run]:
     runs: dict[str, list[Run]] = {}
     for varied, data in _cells(spec):
         configuration = validate(Configuration, data, f"configuration {_name(varied)!r}" if varied else "sweep")
-        name = _file_name(configuration.name or _name(varied) or _plain_name(configuration))
+        file = Path(configuration.conf_file).with_suffix("").as_posix() if configuration.conf_file else ""
+        called = configuration.name or _name(varied) or "-".join(filter(None, [configuration.algo, file]))
+        name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", called).strip("-.,")[:LONGEST] or "run"
         if name in runs:
             raise ConfigError(f"two configurations are called {name!r}; give them names, or values that differ")
         try:
@@ -141,11 +143,6 @@ def _run(configuration: Configuration, name: str, gym_packages: tuple[str, ...])
     return Run(name=name, configuration=name, seed=0, job=job, stages=tuple(stages), gym_packages=gym_packages)
 
 
-def _plain_name(configuration: Configuration) -> str:
-    file = Path(configuration.conf_file).with_suffix("").as_posix() if configuration.conf_file else ""
-    return "-".join(filter(None, [configuration.algo or "", file])) or "run"
-
-
 def _name(varied: Mapping[str, Any]) -> str:
     """What tells a configuration apart, in words: ``pid,learning_rate=0.001``."""
     parts = []
@@ -155,7 +152,3 @@ def _name(varied: Mapping[str, Any]) -> str:
         if key not in NAMED_ALONE:
             parts[-1] = f"{key.rpartition('.')[2]}={parts[-1]}"
     return ",".join(parts)
-
-
-def _file_name(text: str) -> str:
-    return re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", text).strip("-.,")[:LONGEST] or "run"

@@ -21,7 +21,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, model_validator
+from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, field_validator, model_validator
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
@@ -83,6 +83,13 @@ class Pipeline(Frozen):
     """The stages, in order."""
 
     stages: tuple[Stage, ...] = Field(min_length=1)
+
+    @field_validator("stages")
+    @classmethod
+    def _of_their_own_names(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
+        if len({stage.name for stage in stages}) < len(stages):
+            raise ValueError(f"{', '.join(stage.name for stage in stages)}: give each a name of its own")
+        return stages
 
 
 class Status(Pipeline):

@@ -74,6 +74,8 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
     up, down, sideways = (vehicle.gravity * share for share in (most - 1.0, 1.0 - least, math.sqrt(most**2 - 1.0)))
     moments = vehicle.greatest_moments
     turns = ", ".join(f"{each:.1f}" for each in moments / vehicle.inertia)
+    up, down = 1000.0 / vehicle.motor_gain_up, 1000.0 / vehicle.motor_gain_down
+    times = f"{up:.1f} ms up, {down:.1f} ms down" if up != down else f"{up:.1f} ms"
     return [
         ("can hover", f"yes: thrust-to-weight ratio {most:.2f}, least {least:.2f}"),
         ("mass, weight", f"{vehicle.mass:g} kg, {vehicle.mass * vehicle.gravity:.4g} N"),
@@ -89,13 +91,8 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
         ("inertia", f"{ixx:.4g}, {iyy:.4g}, {izz:.4g} kg m²"),
         ("", f"{share}, at most 1 (triangle inequality)"),
         ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
-        ("motors", f"{_time_constants(vehicle)}; from command to thrust {1000 * vehicle.command_lag:.1f} ms"),
+        ("motors", f"time constant {times}; from command to thrust {1000 * vehicle.command_lag:.1f} ms"),
     ]
-
-
-def _time_constants(vehicle: "Vehicle") -> str:
-    up, down = 1000.0 / vehicle.motor_gain_up, 1000.0 / vehicle.motor_gain_down
-    return f"time constant {up:.1f} ms" + (f" up, {down:.1f} ms down" if up != down else "")
 
 
 def _check_rotor_speed(vehicle: "Vehicle", where: str) -> None:

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import write_bytes
-from sb3_quad.cli.parser import Parser
+from sb3_quad.base.files import refuse_existing, write_bytes
+from sb3_quad.cli.parser import Parser, add_common
 
 PANELS = ("success", "survival", "reward", "losses")
 THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}  # its scenarios by task
@@ -31,6 +31,7 @@ def add_arguments(parser: Parser) -> None:
     add("--task", help="show the evaluations on this one of the runs' eval_tasks instead of on their own task")
     add("--title", default="", help="title of the picture")
     add("-o", "--output", default="curves.png", metavar="FILE", help="picture to write: .png, .svg or .pdf (curves.png)")
+    add_common(parser, "overwrite")
 
 
 def _line(text: str) -> tuple[str, dict[str, float]]:
@@ -67,6 +68,7 @@ def run(options: argparse.Namespace) -> int:
             lines[f"thesis: {name}"] = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
     show = options.show or (["survival", "reward"] if options.thesis else [])
     curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
+    refuse_existing(options.output, options.overwrite)
     write_bytes(options.output, picture(curves, kind, dpi=130))
     print(f"saved {options.output}")
     return 0

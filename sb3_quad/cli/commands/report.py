@@ -2,7 +2,7 @@
 
 examples:
   sb3-quad report evaluations/thesis
-  sb3-quad report evaluations/thesis --overwrite      again, after adding controllers
+  sb3-quad report evaluations/thesis --overwrite      again
 """
 
 import argparse

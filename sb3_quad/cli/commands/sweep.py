@@ -3,7 +3,7 @@
 examples:
   sb3-quad sweep my_sweep.yaml --dry-run                   lists the runs
   sb3-quad sweep my_sweep.yaml --workers 4                 four worker processes, one core each
-  sb3-quad sweep pid                                       a sweep of the package: nominal, pid, random_worlds, recovery
+  sb3-quad sweep pid                                       a sweep of the package, such as nominal or random_worlds
   sb3-quad sweep --seed 0 1 2 --conf-file two_stage.yml thesis.yml
   sb3-quad sweep --seed 0 1 2 --algo dagger --env QuadStateRecovery-v0 -n 240000 --suite quick
   sb3-quad sweep my_sweep.yaml --executor ray --address auto
@@ -54,7 +54,7 @@ def run(options: argparse.Namespace) -> int:
 
     if options.resume is not None:
         for name in given(options, "sweep", *SweepSpec.model_fields, "suite", "episodes"):
-            raise ConfigError(f"--resume keeps the sweep's own settings; leave --{name.replace('_', '-')} away")
+            raise ConfigError(f"--resume keeps the sweep's own settings; leave {name.replace('_', '-')} away")
         place = SweepFolder(options.resume)
         return _go_on(options, place.read(), place)
     spec = _spec(options)

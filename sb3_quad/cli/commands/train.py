@@ -54,7 +54,7 @@ def add_arguments(parser: Parser) -> None:
     """Add the flags of rl-zoo's ``train.py``, with their meanings."""
     add_settings(parser)
     add = parser.add_argument
-    add("--thesis", action="store_const", const=THESIS, dest="conf_file", help=f"the thesis's method: --conf-file {THESIS}")
+    add("--thesis", action="store_true", help=f"the thesis's method: --conf-file {THESIS}")
     add("--seed", type=seed, metavar="N", help="seed (0); negative: a random one, recorded in args.yml")
     add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
     add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose", "track", "wandb_project_name")
@@ -71,6 +71,9 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.training.job import TrainingJob, describe
     from sb3_quad.training.trainer import resume, train
 
+    if options.thesis and (options.conf_file or options.resume):
+        raise ConfigError(f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume")
+    options.conf_file = THESIS if options.thesis else options.conf_file
     prepare(options)
     start = time.perf_counter()
     arguments = {**given(options, *JobOptions.model_fields), "progress": shows_progress(options.progress)}
@@ -83,10 +86,9 @@ def run(options: argparse.Namespace) -> int:
         return close_run(resume(options.resume, **arguments))
     conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
     if conf_file is not None and stages.is_pipeline(conf_file):
-        for flag, value in (("-n", options.n_timesteps), ("-i", options.trained_agent)):
-            if value is not None:
-                own = f"a pipeline's stages have their own in {conf_file}"
-                raise ConfigError(f"{flag} goes with a single run (--algo, --env); {own}")
+        for name in given(options, "algo", "env", "n_timesteps", "trained_agent"):
+            own = f"a pipeline's stages have their own in {conf_file}"
+            raise ConfigError(f"--{name.replace('_', '-')} goes with a single run (--algo, --env); {own}")
         pipeline = stages.with_settings(stages.load_pipeline(conf_file), changed_settings(options))
         finished = stages.run_pipeline(pipeline, arguments, Path(conf_file).stem)
         return close_pipeline(finished, time.perf_counter() - start)
