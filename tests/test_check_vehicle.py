@@ -42,6 +42,13 @@ def test_the_environment_accelerates_as_the_parameters_say(name):
         assert 0.85 * greatest[axis] < turning.max() <= greatest[axis] * (1 + 1e-9)
 
 
+def test_the_table_says_what_the_parameters_give(capsys):
+    assert main(["check-vehicle", "cf2x_L250", "-n", "0"]) == 0
+    vehicle, text = load_vehicle("cf2x_L250"), capsys.readouterr().out
+    assert f"up {vehicle.gravity * (vehicle.thrust_limits[1] - 1.0):.1f}, down while level" in text
+    assert f"{1000 / vehicle.motor_gain_up:.1f} ms up, {1000 / vehicle.motor_gain_down:.1f} ms down" in text
+
+
 def accelerations(batch, action, row, steps):
     """Of one number of the state under a constant action, from hover."""
     batch.reset()

@@ -308,7 +308,7 @@ class Vehicle(Frozen):
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
 
-    An inertia that no rigid body has, but within ``INACCURACY``, is said once on stderr.
+    An inertia of a user's file that no rigid body has, but within ``INACCURACY``, is said once on stderr.
 
     :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
     :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
@@ -317,7 +317,7 @@ def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
         return source
     data, where = VEHICLES.read(source if isinstance(source, Path) else str(source))
     vehicle = validate(Vehicle, data, where)
-    if vehicle.inertia_fault:
+    if vehicle.inertia_fault and VEHICLES.is_path(source):
         tell(f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; it is flown as it is")
     return vehicle
 

@@ -74,8 +74,8 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
     up, down, sideways = (vehicle.gravity * share for share in (most - 1.0, 1.0 - least, math.sqrt(most**2 - 1.0)))
     moments = vehicle.greatest_moments
     turns = ", ".join(f"{each:.1f}" for each in moments / vehicle.inertia)
-    up, down = 1000.0 / vehicle.motor_gain_up, 1000.0 / vehicle.motor_gain_down
-    times = f"{up:.1f} ms up, {down:.1f} ms down" if up != down else f"{up:.1f} ms"
+    faster, slower = 1000.0 / vehicle.motor_gain_up, 1000.0 / vehicle.motor_gain_down
+    times = f"{faster:.1f} ms up, {slower:.1f} ms down" if faster != slower else f"{faster:.1f} ms"
     return [
         ("can hover", f"yes: thrust-to-weight ratio {most:.2f}, least {least:.2f}"),
         ("mass, weight", f"{vehicle.mass:g} kg, {vehicle.mass * vehicle.gravity:.4g} N"),
