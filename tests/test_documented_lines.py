@@ -39,6 +39,7 @@ SHORTER = {  # flags that a command is given beside those that stand there
     "train": ["--eval-episodes", "2", *EVALUATED],
     "tune": ["-n", "960", "--n-trials", "1", "--max-total-trials", "1", *EVALUATED],
     "demo": ["--overwrite"],
+    "plot": ["--overwrite"],
     "benchmark": ["--seconds", "0.02", "--sizes", "8", "--n-envs", "1"],
     "check-vehicle": ["-n", "2"],
 }
