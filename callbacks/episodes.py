@@ -37,11 +37,13 @@ class EpisodeLog(BaseCallback):
     def _on_training_start(self) -> None:
         self._start = time.time()
         header: dict[str, float | str] = {"t_start": self._start, "env_id": self._env_id}
+        if self._path.exists():
+            with self._path.open("rb+") as file:
+                file.truncate(file.read().rfind(b"\n") + 1)  # a crash may have cut the last row
         rows = read_text(self._path).splitlines()[2:] if self._path.exists() else []
         self._writer = ResultsWriter(str(self._path), header, ("is_success",), override_existing=not self._path.exists())
-        whole = [row for row in (line.split(",") for line in rows) if len(row) == 4]  # a crash may have cut the last one
-        if whole:
-            self._start -= float(whole[-1][2])
+        if rows:
+            self._start -= float(rows[-1].split(",")[2])
 
     def _on_step(self) -> bool:
         infos, seconds = self.locals["infos"], round(time.time() - self._start, 3)

@@ -164,6 +164,7 @@ def test_the_episode_log_is_a_monitor_file(tmp_path):
     assert log.read_text().count("#") == 1
     log.write_text(log.read_text() + "1.0,2")  # as a crash may leave it
     make_model().learn(80, callback=EpisodeLog(log, "Walk-v0"))
+    assert len(load_results(str(tmp_path))) == 3 * 80 / 10
 
 
 def test_evaluations_that_are_none_are_named(tmp_path):

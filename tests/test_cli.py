@@ -27,6 +27,7 @@ from sb3_quad.simulation.tasks import TASKS
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import resume, train
+from sb3_quad.training.transfer import as_agent
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ENV = "QuadTargetTracking-v0"
@@ -291,6 +292,14 @@ def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo)
     model = PPO.load(saved)
     assert model.num_timesteps == 400
     assert all(torch.isfinite(parameter).all() for parameter in model.policy.parameters())
+
+
+@pytest.mark.parametrize(
+    ("agent", "other"), [("crazyflie-recovery", True), ("itm-recovery", False), ("any-quadcopter", False)]
+)
+def test_an_agent_that_goes_on_with_another_vehicle_is_said(agent, other, capsys):
+    as_agent(agent_path(agent), build_config("dagger", ENV, {"n_timesteps": 1}), {})
+    assert ("was trained on the vehicle crazyflie and flies itm" in capsys.readouterr().err) == other
 
 
 def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):

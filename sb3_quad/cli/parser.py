@@ -66,9 +66,9 @@ class Pairs(argparse.Action):
             key, colon, value = entry.partition(":")
             if not colon or not key:
                 raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
-            if key.strip() in found:
-                raise ConfigError(f"{option} {entry!r}: {key.strip()} is given twice")
-            found[key.strip()] = parse_value(value)
+            if (name := key.strip()) in found:
+                raise ConfigError(f"{option} {entry!r}: {name} is given twice")
+            found[name] = parse_value(value)
         setattr(namespace, self.dest, found)
 
 

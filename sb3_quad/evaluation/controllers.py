@@ -57,11 +57,16 @@ class ControllerSpec:
             silent = f"{self.label}: {self.spec} does not say how its agent flies; it flies"
             return f"{silent} {flown.name}, with the scaling of Table A.2" if self.is_zip else ""
         flown.in_layout_of(self.own.layout)
-        known = first_vehicle(self.own.vehicle)
-        if self.own.vehicles is not None or known.flies_as(flown):  # an agent of many vehicles knows none of them
-            return ""
-        same = " of other parameters" if known.name == flown.name else ""
-        return f"{self.label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"
+        return unlike_trained(self.label, self.own, flown)
+
+
+def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
+    """A warning if an agent with ``own`` settings was trained on another vehicle than ``flown``; else empty."""
+    known = first_vehicle(own.vehicle)
+    if own.vehicles is not None or known.flies_as(flown):  # an agent of many vehicles knows none of them
+        return ""
+    same = " of other parameters" if known.name == flown.name else ""
+    return f"{label}: was trained on the vehicle {known.name} and flies {flown.name}{same}"
 
 
 def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:

@@ -12,7 +12,6 @@ EXECUTORS = ("local", "ray")
 TICK = 1.0  # s between two looks for a signal
 Key = TypeVar("Key")
 
-
 if TYPE_CHECKING:
     from sb3_quad.executors.ray import RayExecutor
 

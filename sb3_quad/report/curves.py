@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
+from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.learning_curves import Curve
@@ -43,13 +44,11 @@ def plot_curves(
         panel.set(xlabel=label, ylabel=_LABELS.get(value, value.replace("_", " ")))
         panel.label_outer()
         for group, runs in groups.items():
-            known = [np.isfinite(curve.values(value)) for curve in runs]
-            times = [getattr(curve, axis)[each] for curve, each in zip(runs, known, strict=True)]
-            heights = [curve.values(value)[each] for curve, each in zip(runs, known, strict=True)]
+            times, heights = zip(*(_known(getattr(curve, axis), curve.values(value)) for curve in runs), strict=True)
             if not all(map(len, times)):
                 continue
             grid = np.clip(times[0], max(each[0] for each in times), min(each[-1] for each in times))  # that all runs have
-            rows = [factor * np.interp(grid, *each) for each in zip(times, heights, strict=True)]
+            rows = [factor * np.interp(grid, *known) for known in zip(times, heights, strict=True)]
             ends = np.stack([np.mean(rows, axis=0), np.min(rows, axis=0), np.max(rows, axis=0)])
             seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
             band(panel, colours[group], group + seeds, grid / scale, ends, **POINTS)
@@ -60,3 +59,8 @@ def plot_curves(
     panels[0, 0].set_title(title, loc="left")  # a suptitle would lie on the legend
     legend(figure)
     return figure
+
+
+def _known(times: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    known = np.isfinite(values)
+    return times[known], values[known]

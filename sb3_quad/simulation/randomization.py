@@ -238,17 +238,13 @@ class Randomization(Frozen):
 
         :raises ConfigError: it could not hover, or its motors would overshoot.
         """
-        masses, thrusts = ((each.low, each.high) if each else (1.0, 1.0) for each in (self.mass, self.thrust))
+        mass, thrust = (each or Factor(low=1.0, high=1.0) for each in (self.mass, self.thrust))
         least, most = vehicle.thrust_limits
-        for mass, thrust, why in (
-            (masses[1], thrusts[0], f"lift {most:g}" if thrusts[0] * most <= masses[1] else ""),
-            (masses[0], thrusts[1], f"give at least {least:g}" if thrusts[1] * least > masses[0] else ""),
-        ):
-            if why:
-                raise ConfigError(
-                    f"randomize: with {mass:g} times its mass and {thrust:g} times its thrust {vehicle.name} cannot hover;"
-                    f" its rotors {why} times its weight"
-                )
+        text = "randomize: with {:g} times its mass and {:g} times its thrust {} cannot hover; its rotors {} times its weight"
+        if thrust.low * most <= mass.high:
+            raise ConfigError(text.format(mass.high, thrust.low, vehicle.name, f"lift {most:g}"))
+        if thrust.high * least > mass.low:
+            raise ConfigError(text.format(mass.low, thrust.high, vehicle.name, f"give at least {least:g}"))
         both, up, down = ((each and each.high) or 1.0 for each in self._motor_gains)
         gain = both * max(vehicle.motor_gain_up * up, vehicle.motor_gain_down * down)
         if gain * vehicle.physics_step > 1.0:

@@ -31,8 +31,6 @@ DISTRIBUTION_NUMBERS = {**dict.fromkeys(_RANGES, len(FIXED_NUMBERS)), "inertia_r
 """Numbers of :meth:`VehicleDistribution.numbers`; ratios are 0 if left out."""
 D = first_rows(DISTRIBUTION_NUMBERS)
 NO_DISTRIBUTION = np.array([*FIXED_NUMBERS * len(_RANGES), *np.zeros(4)])
-
-
 Ratio = Annotated[float, Field(ge=1e-6, le=1e6)]
 
 
@@ -51,9 +49,7 @@ class VehicleDistribution(Frozen):
         default=None, description="of a rotor that slows down, s; left out: the same"
     )
     moment_thrust_ratio: PositiveRange = Field(description="kM / kF, m")
-    least_thrust: NonNegativeRange = Field(
-        default=NonNegativeRange(low=0.0, high=0.0), description="of a rotor, in hover thrusts"
-    )
+    least_thrust: NonNegativeRange = Field(default=NonNegativeRange(low=0, high=0), description="of a rotor, in hover thrusts")
     inertia_ratios: tuple[Ratio, Ratio, Ratio] | None = Field(
         default=None, description="of Ixx, Iyy and Izz; left out: the base vehicle's"
     )

@@ -15,6 +15,7 @@ from sb3_quad.base.notices import tell
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.controller import Controller
 from sb3_quad.controllers.zips import load_model
+from sb3_quad.evaluation.controllers import unlike_trained
 from sb3_quad.training.config import TrainingConfig
 from sb3_quad.vehicles.vehicle import first_vehicle
 
@@ -30,11 +31,8 @@ def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) 
     own, source = agent_settings(path)
     if source is None or config.task is None:
         return changes
-    mine, theirs = (first_vehicle(each).name for each in (config.env_kwargs.get("vehicle", "itm"), own.vehicle))
-    if mine != theirs:
-        tell(
-            f"warning: {path}: was trained on the vehicle {theirs} and goes on with {mine}; --env-kwargs vehicle:… says which"
-        )
+    if notice := unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle)):
+        tell(f"warning: {notice}; --env-kwargs vehicle:… says which")
     seen = {name: own.observed[name] for name in ("last_action", "history", "observation_mean", "observation_std")}
     flown = {"position_integral": own.observed["position_integral"]}
     given = {**changes, "env_kwargs": {**seen, **changes.get("env_kwargs", {})}}
