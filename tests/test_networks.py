@@ -122,6 +122,8 @@ LOSSES = [
     *(Loss(policy_coef=1.0, bc_coef=0.5, bc_loss=kind, bc_filter=kind, vf_coef=0.5, clip_range_vf=0.1) for kind in range(3)),
     Loss(policy_coef=1.0, normalize_advantage=True, vf_coef=0.5, clip_range_vf=0.1, max_clipped_value=False, ent_coef=0.01),
     Loss(policy_coef=1.0, bc_coef=1.0, ent_coef=0.01, l2_coef=0.1),
+    Loss(bc_coef=0.7, bc_loss=losses.NLL, aux_coef=0.5, aux_layer=1),
+    Loss(bc_coef=0.7, aux_coef=0.5, aux_layer=2, vf_coef=0.5),
 ]
 
 

@@ -21,8 +21,10 @@ from sb3_quad.algorithms.buffers import AggregatedDataset, sample_rows
 from sb3_quad.algorithms.common import ExpertMixin, arguments_of, parameters_of_both
 from sb3_quad.algorithms.networks.gradients import Batch, gradients, mean_actions, network_of, state_values
 from sb3_quad.algorithms.networks.losses import CLONING_LOSSES, CloningLoss, Loss
+from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
-from sb3_quad.controllers.controller import Controller
+from sb3_quad.controllers.controller import Controller, true_state_of
+from sb3_quad.simulation.unobserved import UNOBSERVED, unobserved
 
 _VALUE_CHUNK = 16384  # observations that the critic evaluates at once after a rollout
 
@@ -74,6 +76,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         where the expert is smooth, and ``"huber_mse"``, that and three times the squared error
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
+    :param aux_coef: Weight of an auxiliary loss, "huber_mse": the first units of the last hidden layer but one learn to say
+        what no observation shows of vehicle and push (:data:`~sb3_quad.simulation.unobserved.UNOBSERVED`), as a told expert
+        knows it. Take tanh, which can say it. 0: none
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis prepares them
         ("chronologically", 4.2.3)
@@ -105,6 +110,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         bc_loss: CloningLoss = "mse",
         log_std_min: float = -3.0,
         l2_coef: float = 0.0,
+        aux_coef: float = 0.0,
         dataset_capacity: int = 1_500_000,
         shuffle: bool = True,
         stats_window_size: int = 100,
@@ -128,6 +134,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         self.bc_loss: CloningLoss = bc_loss
         self.log_std_min = log_std_min
         self.l2_coef = l2_coef
+        self.aux_coef = aux_coef
         self.dataset_capacity = dataset_capacity
         self.shuffle = shuffle
         self.expert: Any = None
@@ -155,11 +162,15 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
             raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
+        hidden = [layer.out_features for layer in self.policy.mlp_extractor.policy_net if isinstance(layer, th.nn.Linear)]
+        self._aux_layer = max(1, len(hidden) - 1) if self.aux_coef else 0
+        if self._aux_layer and (not hidden or hidden[self._aux_layer - 1] < len(UNOBSERVED)):
+            raise ConfigError(f"aux_coef {self.aux_coef:g}: needs a hidden layer of at least {len(UNOBSERVED)} units")
         dtype = self.rollout_buffer.observations.dtype
         self.dataset = AggregatedDataset(
             self.dataset_capacity or rollout,
             self.rollout_buffer.obs_shape,
-            self.rollout_buffer.action_dim,
+            self.rollout_buffer.action_dim + (len(UNOBSERVED) if self._aux_layer else 0),
             np.float32 if np.issubdtype(dtype, np.floating) else dtype,
         )
 
@@ -205,6 +216,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         low, high = self.action_space.low.reshape(-1), self.action_space.high.reshape(-1)  # type: ignore[attr-defined]
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)  # +
+        said: list[Float32Array] = []  # + what the auxiliary loss teaches
+        true_state = true_state_of(env) if self._aux_layer else None
         not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
         timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, last observation
         n_by_expert = 0
@@ -215,6 +228,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
             labels[step] = labeller.labels(observations, self._last_episode_starts)  # + of the state before the step
+            said += [unobserved(true_state())] if true_state is not None else []  # +
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta  # +
@@ -251,7 +265,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
 
         if self.dataset_capacity == 0:  # +
             self.dataset.clear()
-        self.dataset.add(flown, labels.reshape(len(flown), -1))  # +
+        targets = np.concatenate([labels, said], axis=2) if said else labels  # +
+        self.dataset.add(flown, targets.reshape(len(flown), -1))  # +
         self._n_rollouts += 1
 
         self.logger.record("dagger/beta", beta)
@@ -279,6 +294,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
             clip_range_vf=np.inf if clip_range_vf is None else clip_range_vf,
             ent_coef=self.ent_coef,
             l2_coef=self.l2_coef,
+            aux_coef=self.aux_coef,
+            aux_layer=self._aux_layer,
         )
         network, (actor, critic) = network_of(self.policy), parameters_of_both(self.policy)
 
@@ -327,8 +344,10 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
 
     def _prepare_to_learn(self, anew: bool) -> None:
         self.set_expert(self.expert)
+        if self._aux_layer and (self.env is None or true_state_of(self.env) is None):
+            raise ConfigError(f"aux_coef {self.aux_coef:g}: needs environments with a true_state()")
         if anew:  # β begins anew; the dataset stays until ``dataset.clear()``
             self._n_rollouts = 0
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "dataset"]
+        return [*super()._excluded_save_params(), "dataset", "_aux_layer"]

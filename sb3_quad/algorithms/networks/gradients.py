@@ -23,6 +23,7 @@ Terms = dict[str, float]
 COEFFICIENTS = {
     "policy_gradient_loss": "policy_coef",
     "bc_loss": "bc_coef",
+    "aux_loss": "aux_coef",
     "value_loss": "vf_coef",
     "entropy_loss": "ent_coef",
     "l2_loss": "l2_coef",
@@ -160,6 +161,10 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
         elif loss.bc_filter == losses.AGREEMENT:
             errors = errors * losses.agree(mean, labels)
         terms["bc_loss"] = errors.mean()
+    if loss.aux_layer:
+        latent = policy.extract_features(observations, policy.pi_features_extractor)
+        said, right = policy.mlp_extractor.policy_net[: 2 * loss.aux_layer](latent), targets[:, a:]
+        terms["aux_loss"] = losses.cloning_errors("huber_mse", said[:, : right.shape[1]], policy.log_std, right).mean()
     if critic is not None and values is not None:
         old_values, returns = critic.tensors(policy.device)[1].T.contiguous()
         terms["value_loss"] = losses.value_loss(values.flatten(), old_values, returns, loss)
@@ -187,6 +192,8 @@ def _compiled(network: Perceptrons, loss: Loss, actor: Batch, critic: Batch | No
         sums = network.actor.gradient(_flat(actor.observations), actor.rows, actor.targets, loss, network.log_std) / n
         if loss.bc_coef != 0.0:
             terms["bc_loss"] = sums[losses.CLONING]
+        if loss.aux_layer:
+            terms["aux_loss"] = sums[losses.AUXILIARY]
         if loss.policy_coef != 0.0:
             places = {"policy_gradient_loss": losses.POLICY, "approx_kl": losses.KL, "clip_fraction": losses.CLIPPED}
             terms |= {name: sums[place] for name, place in places.items()}

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import float32, uint64
 
-from sb3_quad.algorithms.networks.losses import actor_loss, critic_loss
+from sb3_quad.algorithms.networks.losses import actor_loss, auxiliary_loss, critic_loss
 from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
@@ -172,10 +172,11 @@ def _forward(scratch, x, index, first, count, layers):
 
 
 @compiled
-def _backward(scratch, at, layers, sums):
+def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, terms):
     """Add to ``sums`` the gradient by the parameters of a block whose outputs begin at ``at``.
 
-    The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns.
+    The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns. That of the auxiliary loss,
+    an actor's, is added on the way.
     """
     widths, kinds, _, transposed = layers
     here, there, place = widths.sum() * ROWS, (widths.sum() + widths.max()) * ROWS, len(sums)
@@ -189,6 +190,9 @@ def _backward(scratch, at, layers, sums):
         _add_products(g, _layer(scratch, at, columns), sums[place:middle].reshape(rows, columns))
         if layer > 1:
             _multiply(transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns))
+            if a > 0 and layer - 1 == loss.aux_layer:
+                hidden, its = _layer(scratch, at, columns), _layer(scratch, there, columns)
+                auxiliary_loss(hidden, index, first, count, targets, loss, a, its, terms)
             here, there = there, here
 
 
@@ -240,4 +244,4 @@ def gradient(first_chunk, last_chunk, chunks, scratch, layers, x, index, targets
                 actor_loss(y, index, first, count, targets, loss, log_std, g, sums[chunk, size:], terms[chunk])
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            _backward(scratch, at, layers, sums[chunk, :size])
+            _backward(scratch, at, layers, sums[chunk, :size], index, first, count, targets, loss, len(log_std), terms[chunk])

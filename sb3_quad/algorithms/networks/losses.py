@@ -1,8 +1,9 @@
 """The losses of Eqs. 4.3 and 4.4, each as tensors for PyTorch's autograd and, beside it, compiled with its derivatives.
 
 In shapes, ``b`` is the mini-batch, ``a`` the action dimension. A target is a row of numbers. Of an actor: the expert's action,
-if there is a cloning term; then, if there is a policy term, the action flown, its log-probability then, and its advantage. Of
-a critic: V when the rollout was flown, and the return.
+if there is a cloning term; then, if there is a policy term, the action flown, its log-probability then, and its advantage; or
+then, if there is an auxiliary term, what the first units of a hidden layer are to say. Of a critic: V when the rollout was
+flown, and the return.
 """
 
 import math
@@ -23,7 +24,7 @@ NEGATIVE_ADVANTAGE, AGREEMENT = 1, 2
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
 MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
 NEAR = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
-CLONING, POLICY, KL, CLIPPED, TERMS = range(5)
+CLONING, POLICY, KL, CLIPPED, AUXILIARY, TERMS = range(6)
 """What compiled losses add up: terms of the actor. A critic has one only, ``VALUE``."""
 VALUE = 0
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -33,8 +34,8 @@ class Loss(NamedTuple):
     """Weights and constants of a loss, under the names of the algorithms' arguments.
 
     ``policy_coef`` weighs PPO's clipped surrogate. ``bc_loss`` and ``bc_filter`` are places in ``CLONING_LOSSES`` and
-    ``BC_FILTERS``. An infinite ``clip_range_vf`` clips nothing. Normalised, an advantage is
-    (advantage - ``advantage_shift``) * ``advantage_scale``.
+    ``BC_FILTERS``. ``aux_layer`` counts hidden layers from 1; 0: no auxiliary term. An infinite ``clip_range_vf`` clips
+    nothing. Normalised, an advantage is (advantage - ``advantage_shift``) * ``advantage_scale``.
     """
 
     policy_coef: float = 0.0
@@ -48,6 +49,8 @@ class Loss(NamedTuple):
     max_clipped_value: bool = True
     ent_coef: float = 0.0
     l2_coef: float = 0.0
+    aux_coef: float = 0.0
+    aux_layer: int = 0
     advantage_shift: float = 0.0
     advantage_scale: float = 1.0
 
@@ -168,6 +171,18 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
                     z = (np.float64(target[flown + k]) - mean[k, i]) * math.exp(-log_std[k])
                     g[k, i] += float32(slope * z * math.exp(-log_std[k]))
                     g_log_std[k] += slope * (z * z - 1.0)
+
+
+@compiled
+def auxiliary_loss(hidden, index, first, count, targets, loss, a, g, terms):
+    """As :func:`actor_loss`, for a hidden layer (width, ROWS), whose first units are to say what follows the action."""
+    k = targets.shape[1] - a
+    for i in range(count):
+        target = targets[index[first + i]]
+        for j in range(k):
+            value, slope, _ = cloning_error(HUBER_MSE, np.float64(hidden[j, i]) - target[a + j], 0.0)
+            terms[AUXILIARY] += value / k
+            g[j, i] += float32(loss.aux_coef / len(index) * slope / k)
 
 
 @compiled
