@@ -334,8 +334,8 @@ def test_hidden_units_learn_to_say_what_no_observation_shows(tmp_path):
     assert np.corrcoef(said[:, 0], right[:, 0])[0, 1] > 0.5 and UNOBSERVED[0] == "load"
     model.save(tmp_path / "model.zip")
     PPO.load(tmp_path / "model.zip")
-    with pytest.raises(ConfigError, match="at least 10 units"):
-        DAgger("MlpPolicy", env, "pid", aux_coef=1.0, policy_kwargs={"net_arch": [4, 4]})
+    with pytest.raises(ConfigError, match="at least 4 units"):
+        DAgger("MlpPolicy", env, "pid", aux_coef=1.0, policy_kwargs={"net_arch": [3, 3]})
     with pytest.raises(ConfigError, match="true_state"):
         DAgger("MlpPolicy", "Pendulum-v1", lambda observations: observations[:, :1], aux_coef=1.0).learn(1)
 

@@ -8,7 +8,15 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+    QuadcopterState,
+    rotation_matrices,
+)
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Actions = Float32Array
@@ -69,38 +77,24 @@ def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -
     """
     features = observation * std + mean
     part = {name: features[:, columns] for name, columns in GROUPS.items()}
-    rotation = _nearest_rotation(part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1))
+    quaternion = _nearest_quaternion(part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1))
     array = np.zeros((STATE_SIZE, len(features)))
     array[POSITION] = part["position"].T
-    array[QUATERNION] = _quaternion_from_rotation(rotation).T
-    array[VELOCITY] = np.einsum("nij,nj->in", rotation, part["velocity"])
+    array[QUATERNION] = quaternion.T
+    array[VELOCITY] = np.einsum("nij,nj->in", rotation_matrices(quaternion), part["velocity"])
     array[BODY_RATES] = part["body_rates"].T
     return QuadcopterState(array)
 
 
-def _nearest_rotation(matrices: FloatArray) -> FloatArray:
-    """The rotation nearest to each matrix in the Frobenius norm, shape (n, 3, 3) (orthogonal Procrustes problem)."""
-    u, _, vt = np.linalg.svd(matrices)
-    u[:, :, 2] *= np.linalg.det(u @ vt)[:, None]
-    return np.asarray(u @ vt)
+def _nearest_quaternion(matrices: FloatArray) -> FloatArray:
+    """Unit quaternions (w, x, y, z; body to world), (n, 4), of the rotations nearest to matrices (n, 3, 3); w is not negative.
 
-
-def _quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Unit quaternions (w, x, y, z; body to world), shape (n, 4), of rotation matrices of shape (n, 3, 3); w is not negative.
-
-    Each row is taken from the largest of the four squared components, so no division is by a small number.
+    By Davenport's q-method: of all q, the eigenvector to the greatest eigenvalue has the greatest trace of R(q)ᵀ M.
     """
-    r = rotation
-    trace = np.einsum("nii->n", r)
-    diagonal = np.einsum("nii->ni", r)
-    products = np.empty((len(r), 4, 4))  # 4 q qᵀ
-    products[:, 0, 0] = 1 + trace
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        products[:, i + 1, i + 1] = 1 - trace + 2 * diagonal[:, i]
-        products[:, 0, i + 1] = products[:, i + 1, 0] = r[:, k, j] - r[:, j, k]
-        products[:, j + 1, k + 1] = products[:, k + 1, j + 1] = r[:, k, j] + r[:, j, k]
-    largest = np.argmax(np.einsum("nii->ni", products), axis=1)
-    quaternion = products[np.arange(len(r)), largest]
-    quaternion *= np.where(quaternion[:, :1] < 0, -1.0, 1.0)
-    return np.asarray(quaternion / np.linalg.norm(quaternion, axis=1, keepdims=True))
+    m, transposed = matrices, matrices.transpose(0, 2, 1)
+    profile = np.zeros((len(m), 4, 4))
+    profile[:, 0, 0] = trace = np.einsum("nii->n", m)
+    profile[:, 1:, 1:] = m + transposed - trace[:, None, None] * np.eye(3)
+    profile[:, 1:, 0] = profile[:, 0, 1:] = (m - transposed)[:, [2, 0, 1], [1, 2, 0]]
+    quaternion = np.linalg.eigh(profile).eigenvectors[:, :, -1]
+    return np.asarray(quaternion * np.where(quaternion[:, :1] < 0, -1.0, 1.0))
