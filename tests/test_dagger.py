@@ -74,7 +74,7 @@ class Recorder(BaseCallback):
 
 def test_the_agent_becomes_the_expert():
     model = build(n_epochs=20, learning_rate=1e-2).learn(ROLLOUT * 12)
-    observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
+    observations, labels = map(th.from_numpy, model.dataset.pairs.values())
     error = np.square(mean_actions(model.policy, observations.numpy()) - labels.numpy()).mean()
     assert error < 0.02 * float(labels.square().mean())
 
@@ -83,7 +83,7 @@ def test_the_agent_becomes_the_expert():
 def test_an_sb3_model_teaches(bc_loss):
     teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")
     model = build(expert=teacher, bc_loss=bc_loss).learn(ROLLOUT)
-    observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
+    observations, labels = map(th.from_numpy, model.dataset.pairs.values())
     np.testing.assert_allclose(labels, teacher.predict(observations.numpy(), deterministic=True)[0], atol=1e-5)
 
 
@@ -145,7 +145,7 @@ def flown(beta, **kwargs):
     """One rollout of 32 environments: the share flown by the expert per step and environment, (32, 32)."""
     recorder = Recorder("actions")
     model = build(pendulum(32), beta=beta, beta_final=beta, **kwargs).learn(32 * 32, callback=recorder)
-    labels = model.dataset.pairs(th.arange(len(model.dataset)))[1].view(32, 32, 1).numpy()
+    labels = model.dataset.pairs["actions"].reshape(32, 32, 1)
     return recorder.logged, (np.array([row[0] for row in recorder.rows]) == labels)[..., 0]
 
 
@@ -178,7 +178,7 @@ def test_beta_falls_with_every_rollout_and_survives_a_save(tmp_path):
 
 def test_labels_belong_to_the_state_before_the_step():
     model = build().learn(ROLLOUT * 2)
-    observations, labels = model.dataset.pairs(th.arange(len(model.dataset)))
+    observations, labels = map(th.from_numpy, model.dataset.pairs.values())
     np.testing.assert_allclose(labels, turn_back(observations.numpy()), atol=1e-6)
     np.testing.assert_array_equal(observations[-ROLLOUT:].view(32, N_ENVS, 3), model.rollout_buffer.observations)
 
@@ -225,12 +225,12 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
     settings = {"beta_decay": 0.05, "dataset_capacity": 150, "bc_loss": "nll", "clip_range_vf": 0.2, "seed": None}
     whole = build(**settings).learn(ROLLOUT * 3)
     whole.save(tmp_path / "model")
-    whole.dataset.save(tmp_path / "dataset.npz")
+    np.savez(tmp_path / "dataset.npz", **whole.dataset.pairs)
     whole.set_env(pendulum(seed=7))  # episodes begin anew after an interruption, so they do here too
     whole.learn(ROLLOUT * 3, reset_num_timesteps=False)
 
     resumed = DAgger.load(tmp_path / "model", env=pendulum(seed=7), device="cpu", expert=turn_back)
-    resumed.dataset.load(tmp_path / "dataset.npz")
+    resumed.dataset.add(**np.load(tmp_path / "dataset.npz"))
     assert resumed.current_beta == pytest.approx(0.35)
     resumed.learn(ROLLOUT * 3, reset_num_timesteps=False)
     assert resumed.num_timesteps == whole.num_timesteps == ROLLOUT * 6
@@ -334,8 +334,8 @@ def test_hidden_units_learn_to_say_what_no_observation_shows(tmp_path):
     assert np.corrcoef(said[:, 0], right[:, 0])[0, 1] > 0.5 and UNOBSERVED[0] == "load"
     model.save(tmp_path / "model.zip")
     PPO.load(tmp_path / "model.zip")
-    with pytest.raises(ConfigError, match="at least 4 units"):
-        DAgger("MlpPolicy", env, "pid", aux_coef=1.0, policy_kwargs={"net_arch": [3, 3]})
+    with pytest.raises(ConfigError, match="two hidden layers"):
+        DAgger("MlpPolicy", env, "pid", aux_coef=1.0, policy_kwargs={"net_arch": [8]})
     with pytest.raises(ConfigError, match="true_state"):
         DAgger("MlpPolicy", "Pendulum-v1", lambda observations: observations[:, :1], aux_coef=1.0).learn(1)
 

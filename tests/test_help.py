@@ -91,7 +91,7 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
         ("train 5", "argument '5': see --help"),
         ("train --algo a2c", "algorithm 'a2c': (valid: dagger,"),
         ("train --conf-file nothere.yml", "settings file 'nothere.yml': (valid: any_quadcopter/dagger.yml,"),
-        ("train --hyperparams bc_coef:1 --algo dagger", "key of dagger 'bc_coef': (valid: batch_size,"),
+        ("train --hyperparams bc_coef:1 --algo dagger", "key of dagger 'bc_coef': (valid: aux_coef,"),
         (
             "enjoy pid --task tracking --no-render",
             "did you mean 'far_tracking' or 'recovery_and_tracking' or 'target_tracking'?",

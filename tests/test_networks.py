@@ -119,7 +119,7 @@ def test_what_is_not_finite_stays_so(value, activation):
 N, A = 700, 4  # rows and actions
 LOSSES = [
     *(Loss(bc_coef=2.0, bc_loss=kind, vf_coef=0.5) for kind in range(len(losses.CLONING_LOSSES))),
-    *(Loss(policy_coef=1.0, bc_coef=0.5, bc_loss=kind, bc_filter=kind, vf_coef=0.5, clip_range_vf=0.1) for kind in range(3)),
+    *(Loss(policy_coef=1.0, bc_coef=0.5, bc_loss=kind, bc_filter=kind, vf_coef=0.5, clip_range_vf=0.1) for kind in (0, 1)),
     Loss(policy_coef=1.0, normalize_advantage=True, vf_coef=0.5, clip_range_vf=0.1, max_clipped_value=False, ent_coef=0.01),
     Loss(policy_coef=1.0, bc_coef=1.0, ent_coef=0.01, l2_coef=0.1),
     Loss(bc_coef=0.7, bc_loss=losses.NLL, aux_coef=0.5, aux_layer=1),
@@ -153,7 +153,7 @@ def test_compiled_gradients_are_those_of_autograd(loss, with_critic):
         th.testing.assert_close(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()) + 1e-8)
 
 
-@pytest.mark.parametrize(("bc_filter", "kept"), [("none", [0, 1, 2]), ("negative_advantage", [1]), ("agreement", [0, 1])])
+@pytest.mark.parametrize(("bc_filter", "kept"), [("none", [0, 1, 2]), ("agreement", [0, 1])])
 def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
     policy = PPO("MlpPolicy", "Pendulum-v1", device="cpu").policy
     for parameter in policy.parameters():

@@ -1,7 +1,6 @@
 """What algorithms learn from: SB3's rollout and replay buffers with the expert's actions, and DAgger's dataset."""
 
 from collections.abc import Generator
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,8 +11,6 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
 from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
-from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.files import read_arrays, write_arrays
 
 
 class ExpertRolloutBuffer(RolloutBuffer):
@@ -130,30 +127,10 @@ class AggregatedDataset:
         places = (rows + self.added) % self.capacity if self.added > self.capacity else rows
         return Batch(places, self._arrays["observations"], self._arrays["actions"])
 
-    def pairs(self, rows: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Observations (b, ...) and expert actions (b, action_dim) of rows (b,), counted from the oldest."""
-        return self.batch(rows.numpy()).tensors(th.device("cpu"))
-
-    def save(self, path: str | Path) -> None:
-        """Write every pair, oldest first, to an .npz file, whole or not at all.
-
-        :raises ConfigError: a place that cannot be written to
-        """
-        observations, actions = self.pairs(th.arange(len(self)))
-        write_arrays(path, observations=observations.numpy(), actions=actions.numpy())
-
-    def load(self, path: str | Path) -> None:
-        """Replace the pairs by the last ``capacity`` of those in a file that :meth:`save` wrote.
-
-        :raises ConfigError: a file that is missing, damaged, or of other observations or actions
-        """
-        arrays = read_arrays(path)
-        n, given = len(arrays.get("actions", ())), {name: array.shape for name, array in arrays.items()}
-        needed = {name: (n, *array.shape[1:]) for name, array in self._arrays.items()}
-        if given != needed:
-            raise ConfigError(f"dataset {path}: holds arrays of shape {given}, this model needs {needed}")
-        self.clear()
-        self.add(**arrays)
+    @property
+    def pairs(self) -> Arrays:
+        """Copies of observations (n, ...) and expert actions (n, action_dim), by name, oldest first, as for :meth:`add`."""
+        return {name: array[self.batch(np.arange(len(self))).rows] for name, array in self._arrays.items()}
 
     @property
     def filled(self) -> Arrays:

@@ -162,10 +162,9 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
             raise ConfigError(f"policy {self.policy_class.__name__}: DAgger needs a diagonal Gaussian policy")
         if self.clip_range_vf is not None:
             self.clip_range_vf = FloatSchedule(self.clip_range_vf)
-        hidden = [layer.out_features for layer in self.policy.mlp_extractor.policy_net if isinstance(layer, th.nn.Linear)]
-        self._aux_layer = max(1, len(hidden) - 1) if self.aux_coef else 0
-        if self._aux_layer and (not hidden or hidden[self._aux_layer - 1] < len(UNOBSERVED)):
-            raise ConfigError(f"aux_coef {self.aux_coef:g}: needs a hidden layer of at least {len(UNOBSERVED)} units")
+        self._aux_layer = len(self.policy.mlp_extractor.policy_net) // 2 - 1 if self.aux_coef else 0
+        if self.aux_coef and self._aux_layer < 1:
+            raise ConfigError(f"aux_coef {self.aux_coef:g}: needs at least two hidden layers")
         dtype = self.rollout_buffer.observations.dtype
         self.dataset = AggregatedDataset(
             self.dataset_capacity or rollout,
@@ -217,7 +216,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)  # +
         said: list[Float32Array] = []  # + what the auxiliary loss teaches
-        true_state = true_state_of(env) if self._aux_layer else None
+        true_state = true_state_of(env)
         not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
         timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, last observation
         n_by_expert = 0
@@ -228,7 +227,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         for step in range(n_rollout_steps):
             observations: Any = self._last_obs
             labels[step] = labeller.labels(observations, self._last_episode_starts)  # + of the state before the step
-            said += [unobserved(true_state())] if true_state is not None else []  # +
+            said += [unobserved(true_state and true_state())] if self._aux_layer else []  # +
             means = mean_actions(network, observations)
             sampled = means + std * rng.standard_normal(means.shape, dtype=np.float32)
             by_expert = rng.random(n_envs) < beta  # +
@@ -344,8 +343,6 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
 
     def _prepare_to_learn(self, anew: bool) -> None:
         self.set_expert(self.expert)
-        if self._aux_layer and (self.env is None or true_state_of(self.env) is None):
-            raise ConfigError(f"aux_coef {self.aux_coef:g}: needs environments with a true_state()")
         if anew:  # β begins anew; the dataset stays until ``dataset.clear()``
             self._n_rollouts = 0
 

@@ -42,10 +42,9 @@ class PPOBC(ExpertMixin, PPO):  # type: ignore[misc]
     :param bc_loss: ``"nll"``, the negative log-likelihood of the expert's action (Eq. 3.12), a sum over the action's
         dimensions; ``"mse"``, the squared error of the policy's mean action, which leaves the deviation alone;
         ``"huber"``, that is linear beyond 0.05; or ``"huber_mse"``, that and three times the squared error.
-    :param bc_filter: where to clone: ``"none"``, everywhere; ``"negative_advantage"``, where the flown action did worse than
-        the critic expected; ``"agreement"``, where expert and policy differ by less than 0.3 (root mean square over the
-        action): an expert for small angles, such as the PID, then holds the agent on its way to the target and has no say
-        where the agent has learnt to recover and the expert would crash.
+    :param bc_filter: where to clone: ``"none"``, everywhere; ``"agreement"``, where expert and policy differ by less than 0.3
+        (root mean square over the action): an expert for small angles, such as the PID, then holds the agent on its way to the
+        target and has no say where the agent has learnt to recover and the expert would crash.
     :param l2_coef: c_L2, weight of ½Σw² over the weight matrices (Eq. 2.25); biases and ``log_std`` are left out.
     :param max_clipped_value: the value loss of Eq. 3.8, the larger of the clipped and the unclipped error, where
         ``clip_range_vf`` is given; False for stock PPO's clipped error.

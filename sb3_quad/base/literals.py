@@ -55,6 +55,23 @@ def parse_mapping(value: Any, key: str) -> dict[str, Any]:
     return {name: _named(entry, f"{key}.{name}") for name, entry in given.items()}
 
 
+def put_key(data: dict[str, Any], key: str, value: Any, where: str) -> None:
+    """Set a value at a dotted key, in place; numbers count the entries of a list.
+
+    :raises ConfigError: what the key leads through holds no keys.
+    """
+    *path, last = key.split(".")
+    place: Any = data
+    for part in path:
+        if isinstance(place, list) and part.isdigit() and int(part) < len(place):
+            place = place[int(part)]
+        else:
+            place = place.setdefault(part, {}) if isinstance(place, dict) else None
+    if not isinstance(place, dict):
+        raise ConfigError(f"{where}: {'.'.join(path)} holds no keys here")
+    place[last] = value
+
+
 def _named(value: Any, key: str) -> Any:
     if isinstance(value, dict):
         return {name: _named(entry, f"{key}.{name}") for name, entry in value.items()}

@@ -1,17 +1,16 @@
 """Where lines, tables and progress are shown."""
 
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 FILE_WIDTH = 180  # columns where the output is no terminal: a table there need not wrap
 Show = Callable[[int, "int | None", str], None]
-Item = TypeVar("Item")
 
 
 def console() -> Console:
@@ -50,12 +49,3 @@ def progress_bar(wanted: bool | None) -> Iterator[Show]:
     with Progress(*columns, description, transient=True, redirect_stdout=sys.stdout.isatty(), **options) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total, text: bar.update(task, completed=done, total=total, description=text)
-
-
-def with_progress(items: Iterable[Item], total: int, what: str, wanted: bool | None) -> Iterator[Item]:
-    """The items, counted by a progress bar."""
-    with progress_bar(wanted) as show:
-        show(0, total, what)
-        for number, item in enumerate(items, 1):
-            yield item
-            show(number, total, what)

@@ -11,13 +11,13 @@ UNOBSERVED = ("load", "weight", "push_x", "push_y")
 _MOST = 0.9  # tanh reaches 1 nowhere
 
 
-def unobserved(state: QuadcopterState) -> Float32Array:
+def unobserved(state: QuadcopterState | None) -> Float32Array:
     """The numbers of :data:`UNOBSERVED`, clipped to ±0.9, float32 (n, 4).
 
-    :raises ConfigError: a state that does not hold the vehicles.
+    :raises ConfigError: no state, or one that does not hold the vehicles.
     """
-    if (v := state.vehicles) is None:
-        raise ConfigError("this environment does not say which vehicles fly")
+    if state is None or (v := state.vehicles) is None:
+        raise ConfigError("aux_coef: needs environments whose true_state() says which vehicles fly")
     x, y, z = np.zeros((3, state.n)) if state.wrench is None else state.wrench[FORCE_WORLD]
     weight, middle, half = v[P.mass] * v[P.gravity], 4.0 * v[P.thrust_middle], 4.0 * v[P.thrust_half_range]
     thrusts = np.stack([weight - z - middle, weight - middle, x, y], axis=1)

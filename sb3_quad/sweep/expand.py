@@ -1,5 +1,6 @@
 """From a sweep to its runs: every configuration that its grid and list stand for, by every seed, each checked."""
 
+import copy
 import itertools
 import json
 import math
@@ -11,6 +12,7 @@ from typing import Any
 from pydantic import Field
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.literals import put_key
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.pretrained import agent_path
 from sb3_quad.evaluation.scenarios.load import load_suite
@@ -84,10 +86,10 @@ def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     for own in spec.configurations or ({},):
         for values in itertools.product(*spec.grid.values()):
             cell = dict(zip(spec.grid, values, strict=True))
-            data = _merged(spec.given, own)
+            data = copy.deepcopy(_merged(spec.given, own))
             data.pop("name", None)
             for key, value in cell.items():
-                data = _put(data, key, value)
+                put_key(data, key, value, f"grid: {key}")
             if own.get("name"):
                 data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))
             found.append(({**own, **cell}, data))
@@ -100,16 +102,6 @@ def _merged(shared: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
         if isinstance(value, Mapping) and isinstance(shared.get(key), Mapping):
             both[key] = {**shared[key], **value}
     return both
-
-
-def _put(data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    first, dot, rest = key.partition(".")
-    if not dot:
-        return {**data, key: value}
-    inner = data.get(first) or {}
-    if not isinstance(inner, Mapping):
-        raise ConfigError(f"grid: {key}: {first} holds no keys here")
-    return {**data, first: _put(inner, rest, value)}
 
 
 def _run(configuration: Configuration, name: str, gym_packages: tuple[str, ...]) -> Run:

@@ -127,7 +127,7 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
     kind, a = losses.CLONING_LOSSES[loss.bc_loss], get_action_dim(policy.action_space)
     terms: dict[str, th.Tensor] = {}
     values: th.Tensor | None = None
-    log_prob, raw_advantages = None, targets[:, -1].contiguous()  # as SB3 has it: strided, a sum may round differently
+    log_prob: th.Tensor | None = None
     try:
         if loss.policy_coef != 0.0:
             actions, old_log_prob = targets[:, -a - 2 : -2].contiguous(), targets[:, -2].contiguous()
@@ -142,7 +142,7 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
         return dict.fromkeys((*COEFFICIENTS, "approx_kl"), np.nan)
 
     if loss.policy_coef != 0.0 and log_prob is not None:
-        advantages = raw_advantages
+        advantages = targets[:, -1].contiguous()  # as SB3 has it: strided, a sum may round differently
         if loss.normalize_advantage and len(advantages) > 1:
             advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
         # The clipped surrogate loss; the ratio of new and old policy is one at first.
@@ -156,9 +156,7 @@ def _by_autograd(policy: ActorCriticPolicy, loss: Loss, actor: Batch, critic: Ba
     if loss.bc_coef != 0.0:
         mean, labels = policy.action_dist.mode(), targets[:, :a]
         errors = losses.cloning_errors(kind, mean, policy.log_std, labels)
-        if loss.bc_filter == losses.NEGATIVE_ADVANTAGE:
-            errors = errors * (raw_advantages < 0)
-        elif loss.bc_filter == losses.AGREEMENT:
+        if loss.bc_filter == losses.AGREEMENT:
             errors = errors * losses.agree(mean, labels)
         terms["bc_loss"] = errors.mean()
     if loss.aux_layer:

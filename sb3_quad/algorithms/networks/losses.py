@@ -19,8 +19,8 @@ from sb3_quad.simulation.compiled import compiled
 CloningLoss = Literal["mse", "nll", "huber", "huber_mse"]
 CLONING_LOSSES: tuple[CloningLoss, ...] = ("mse", "nll", "huber", "huber_mse")
 MSE, NLL, HUBER, HUBER_MSE = range(4)
-BC_FILTERS = ("none", "negative_advantage", "agreement")
-NEGATIVE_ADVANTAGE, AGREEMENT = 1, 2
+BC_FILTERS = ("none", "agreement")
+AGREEMENT = 1
 HUBER_DELTA = 0.05  # error of an action from which "huber" grows linearly; the range of an action is 2
 MSE_WEIGHT = 3.0  # of the squared error in "huber_mse"
 NEAR = 0.3  # root mean squared difference of actions up to which "agreement" clones; the range of an action is 2
@@ -141,11 +141,7 @@ def actor_loss(mean, index, first, count, targets, loss, log_std, g, g_log_std, 
             squares = 0.0
             for k in range(a):
                 squares += (mean[k, i] - target[k]) ** 2
-            if loss.bc_filter == NEGATIVE_ADVANTAGE:
-                kept = target[flown + a + 1] < 0.0
-            else:
-                kept = loss.bc_filter != AGREEMENT or squares / a < NEAR**2
-            if kept:
+            if loss.bc_filter != AGREEMENT or squares / a < NEAR**2:
                 share = 1.0 if loss.bc_loss == NLL else float(a)
                 for k in range(a):
                     error = np.float64(mean[k, i]) - target[k]

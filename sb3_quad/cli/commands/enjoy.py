@@ -191,10 +191,14 @@ def _write_sequence(file: str, episode: Sequence[Any], size: tuple[int, int]) ->
 
 
 def _write_film(file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: argparse.Namespace) -> None:
-    from sb3_quad.cli.output import with_progress
+    from rich.console import Console
+    from rich.progress import track
+
+    from sb3_quad.cli.output import shows_progress
     from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
 
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
     frames = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
-    write_film(Path(file), with_progress(frames, total, "frames", options.progress))
+    where: dict[str, Any] = {"console": Console(file=sys.stderr, force_terminal=options.progress or None), "transient": True}
+    write_film(Path(file), track(frames, "frames", total, disable=not shows_progress(options.progress), **where))
     print(f"saved {file}, {total / FPS:.1f} s")

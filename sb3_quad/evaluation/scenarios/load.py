@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.literals import put_key
 from sb3_quad.base.validate import validate
 from sb3_quad.base.yaml_files import YamlFolder, parse_yaml
 from sb3_quad.evaluation.scenarios.scenario import Scenario, Suite
@@ -85,7 +86,7 @@ def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
     for values in itertools.product(*axes.values()):
         cell, varied = copy.deepcopy(plain), dict(zip(axes, values, strict=True))
         for key, value in varied.items():
-            _put(cell, key, value, where)
+            put_key(cell, key, value, f"{where}: vary.{key}")
         title = ", ".join(f"{axis_name(key)} {value:g}" for key, value in varied.items())
         cell["title"] = f"{plain.get('title') or plain.get('name')}: {title}"
         cell["group"] = plain.get("name")
@@ -93,19 +94,6 @@ def expand(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         cell["cell"] = varied
         cells.append(cell)
     return cells
-
-
-def _put(entry: dict[str, Any], key: str, value: Any, where: str) -> None:
-    *path, last = key.split(".")
-    place: Any = entry
-    for part in path:
-        if isinstance(place, list) and part.isdigit() and int(part) < len(place):
-            place = place[int(part)]
-        else:
-            place = place.setdefault(part, {}) if isinstance(place, dict) else None
-    if not isinstance(place, dict):
-        raise ConfigError(f"{where}: vary.{key}: {'.'.join(path)} holds no keys here")
-    place[last] = value
 
 
 def axis_name(key: str) -> str:
