@@ -21,4 +21,4 @@ def unobserved(state: QuadcopterState | None) -> Float32Array:
     x, y, z = np.zeros((3, state.n)) if state.wrench is None else state.wrench[FORCE_WORLD]
     weight, middle, half = v[P.mass] * v[P.gravity], 4.0 * v[P.thrust_middle], 4.0 * v[P.thrust_half_range]
     thrusts = np.stack([weight - z - middle, weight - middle, x, y], axis=1)
-    return (thrusts / half[:, None]).clip(-_MOST, _MOST).astype(np.float32)
+    return np.asarray((thrusts / half[:, None]).clip(-_MOST, _MOST), dtype=np.float32)
