@@ -35,7 +35,7 @@ def trim_arrival(
 
     :param seed: of the flights.
     :param settings: how evaluations fly it.
-    :param trained: how it was trained: its vehicles and disturbances count, too.
+    :param trained: how it was trained, or what else is to count: vehicles and disturbances.
     :param left: s that it costs to leave a target again.
     :return: the cost before and after, s: the mean time to stay within 0.1 m of targets 10 m away, 0.3 times the same in the
         worlds of the training, and what it costs to leave a target, to fail and to be lost, also in twice as many recoveries.

@@ -32,6 +32,7 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
+from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.arrival import LEFT, trim_arrival
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
@@ -67,13 +68,14 @@ class Stage(Frozen):
     trim: Literal["position", "hover", "arrival"] | None = Field(default=None, description="training.trim, .arrival say how")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
     leaving_cost: NonNegativeFloat = Field(default=LEFT, description="s that trim: arrival counts for a target left again")
+    trim_randomize: Randomization | None = Field(default=None, description="of trim: arrival's flights; None: the training's")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
     eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
     @model_validator(mode="after")
     def _of_its_trim(self) -> "Stage":
-        for name, trimmed in (("position_scale", "position"), ("leaving_cost", "arrival")):
+        for name, trimmed in (("position_scale", "position"), ("leaving_cost", "arrival"), ("trim_randomize", "arrival")):
             if getattr(self, name) != type(self).model_fields[name].default and self.trim != trimmed:
                 raise ValueError(f"{name} goes with trim: {trimmed}")
         return self
@@ -279,7 +281,8 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     elif stage.trim == "arrival":
-        did = trim_arrival(model, seed, job.flight_settings, job.config.flight_settings, stage.leaving_cost)
+        flown = job.config.flight_settings.with_changes(**({"randomize": own} if (own := stage.trim_randomize) else {}))
+        did = trim_arrival(model, seed, job.flight_settings, flown, stage.leaving_cost)
         words = f"slow arrivals, failures and losses cost {did.before:.2f} s, now {did.after:.2f} s"
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
