@@ -21,7 +21,7 @@ LIMITS = {
     **dict.fromkeys(("n_steps", "batch_size", "n_epochs", "stats_window_size", "buffer_size"), (1, 2**40)),
     **dict.fromkeys(("train_freq", "target_update_interval"), (1, 2**40)),
     **dict.fromkeys(("max_grad_norm", "clip_range", "clip_range_vf", "target_kl", "critic_warmup"), (0, 2**40)),
-    **dict.fromkeys(("bc_coef", "l2_coef", "vf_coef", "beta_decay"), (0, 2**40)),
+    **dict.fromkeys(("bc_coef", "aux_coef", "l2_coef", "vf_coef", "beta_decay"), (0, 2**40)),
 }
 """Of arguments of the algorithms: the least, and the greatest that a settings file may have."""
 _CRITIC = ("mlp_extractor.value_net.", "value_net.", "vf_features_extractor.")  # names of the critic's own parameters

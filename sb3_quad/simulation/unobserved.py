@@ -7,7 +7,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.simulation.state import FORCE_WORLD, P, QuadcopterState
 
 UNOBSERVED = ("load", "weight", "push_x", "push_y")
-"""The mean action that holds the height, then without push, and the horizontal pushes in the actions' thrusts, world frame."""
+"""As mean actions of the rotors: what holds the height, what would without push, and the horizontal push, world frame."""
 _MOST = 0.9  # tanh reaches 1 nowhere
 
 
