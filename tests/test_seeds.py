@@ -48,7 +48,7 @@ def test_a_training_flies_the_same_episodes_in_either_environment():
     for vec_env in ("batch", "dummy"):
         settings = {"n_timesteps": 64, "n_envs": 3, "vec_env": vec_env, "env_kwargs": {"max_episode_steps": [3, 5]}}
         config = build_config("ppo", "QuadStateRecovery-v0", settings)
-        env = make_environments(config, 3, seed_for("training", 5))
+        env = make_environments(config, 3, seed_for("training", 5), staggered=True)
         env.seed(seed_for("training", 5))
         steps = [(env.reset(), np.zeros(3))] + [env.step(np.zeros((3, 4)))[::2] for _ in range(12)]
         flown.append([np.stack(each) for each in zip(*steps, strict=True)])

@@ -76,9 +76,8 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         where the expert is smooth, and ``"huber_mse"``, that and three times the squared error
     :param log_std_min: log_std never falls below this: under ``"nll"`` alone it collapses
     :param l2_coef: c_L2
-    :param aux_coef: Weight of an auxiliary loss, "huber_mse": the first units of the last hidden layer but one learn to say
-        what no observation shows of vehicle and push (:data:`~sb3_quad.simulation.unobserved.UNOBSERVED`), as a told expert
-        knows it. Take tanh, which can say it. 0: none
+    :param aux_coef: Weight of an auxiliary loss, "huber_mse": the first units of the last hidden layer but one learn, by
+        tanh, to say what no observation shows, :data:`~sb3_quad.simulation.unobserved.UNOBSERVED`. 0: none
     :param dataset_capacity: Most pairs kept, the oldest leave first. 0: the current rollout only, as the thesis trains
     :param shuffle: whether mini-batches are random. False: consecutive in time, as the thesis prepares them
         ("chronologically", 4.2.3)

@@ -1,14 +1,8 @@
 """What a sweep trains: settings that all runs share, a grid or a list of those that differ, and the seeds.
 
 The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted where they lie deeper, to
-lists of values, of which every combination is a configuration; ``configurations`` lists some one by one::
-
-    algo: dagger
-    env: QuadStateRecovery-v0
-    seed: [0, 1, 2]
-    grid:
-      hyperparams.learning_rate: [1e-3, 5e-3]
-      env_kwargs.noise: [0, 0.05]
+lists of values, of which every combination is a configuration, such as ``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``;
+``configurations`` lists some one by one.
 """
 
 from collections.abc import Mapping

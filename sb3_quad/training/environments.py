@@ -6,6 +6,7 @@ from functools import partial
 from typing import Any
 
 import gymnasium
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
@@ -13,6 +14,7 @@ import sb3_quad  # noqa: F401  (registers the environments, also in a worker pro
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.signals import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
+from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.config import TrainingConfig
 from sb3_quad.training.values import instance
 
@@ -45,7 +47,7 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
 
     Each gives ``info["episode"]`` where an episode ends, as SB3's Monitor does.
 
-    :param staggered: of the batch: whether its first episodes end at different times, as of :class:`QuadcopterVecEnv`.
+    :param staggered: whether the first episodes end at different times, as of :class:`QuadcopterVecEnv`.
     :raises ConfigError: keywords that the environment does not take.
     :raises TrainingError: a worker process that ended.
     """
@@ -58,7 +60,9 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
         else:
             if config.task is not None:  # here, where a worker process could not say what is missing
                 importlib.import_module("sb3_quad.base.bullet")
-            makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [partial(_make_one, config, row) for row in range(n_envs)]
+            makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
+                partial(_make_one, config, row, n_envs if staggered else 1) for row in range(n_envs)
+            ]
             env = _Subproc(makers) if config.vec_env == "subproc" else _Dummy(makers)
             env.seed(seed)
     except SB3QuadError:
@@ -72,15 +76,32 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
     return env
 
 
-def _make_one(config: TrainingConfig, row: int) -> gymnasium.Env[Any, Any]:
-    """The environment of a row; where keywords are lists of what rows fly, they are counted round."""
+def _make_one(config: TrainingConfig, row: int, phases: int) -> gymnasium.Env[Any, Any]:
+    """The environment of a row; where keywords are lists of what rows fly, they are counted round.
+
+    :param phases: of this many, evenly spread over an episode, the row begins in its own.
+    """
     if config.vec_env == "subproc":
         ignore_interrupts()
     kwargs = dict(config.env_kwargs)
     for name in ("vehicle", "max_episode_steps"):
         if isinstance(given := kwargs.get(name), (list, tuple)) and given:
             kwargs[name] = given[row % len(given)]
-    env: gymnasium.Env[Any, Any] = Monitor(gymnasium.make(config.env_id, **kwargs))
+    env: gymnasium.Env[Any, Any] = gymnasium.make(config.env_id, **kwargs)
+    limit = env.spec and env.spec.max_episode_steps
+    if limit and row % phases:
+        env = _FirstEpisode(env, limit - row * limit // phases)
+    env = Monitor(env)
     for path, wrapper_kwargs in config.env_wrapper:
         env = instance(path, "env_wrapper", env, **wrapper_kwargs)
     return env
+
+
+class _FirstEpisode(TimeLimit):
+    """Truncates the first episode after so many steps, and no other."""
+
+    def reset(self, **kwargs: Any) -> Any:
+        elapsed: Any = self._elapsed_steps
+        if elapsed:
+            self._max_episode_steps = ENDLESS
+        return super().reset(**kwargs)

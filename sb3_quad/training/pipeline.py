@@ -1,16 +1,6 @@
 """Several training jobs in a row, each starting from the agent of the one before: the two stages of the thesis (4.2).
 
-A pipeline's file names its stages in order; :class:`Stage` lists the keys::
-
-    stages:
-      - name: stage one
-        algo: dagger
-        env: QuadTargetTracking-v0
-      - name: stage two
-        algo: ppo_bc
-        env: QuadStateRecovery-v0
-        pass_on: best
-        require: {success_rate: 0.9}
+A pipeline's file lists its stages in order, as ``zoo_configs/two_stage.yml`` does; :class:`Stage` says the keys.
 """
 
 from collections.abc import Callable, Mapping

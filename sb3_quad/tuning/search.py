@@ -190,9 +190,7 @@ class Search:
 
 
 class NumberedSampler(BaseSampler):
-    """One of :data:`SAMPLERS`, made anew for each trial, from a seed, the trial's number and the trials known.
-
-    The number is that among the trials that do not try another again.
+    """One of :data:`SAMPLERS`, made anew for each trial, from a seed, the trials known and its number, retries not counted.
 
     So processes that share a study propose different trials, and a study that is resumed goes on as if never left.
     """

@@ -60,10 +60,8 @@ def cloning_errors(kind: CloningLoss, mean: th.Tensor, log_std: th.Tensor, actio
 
     ``"nll"``: Eq. 3.12, the negative log-likelihood, a sum over the action's dimensions; it also shrinks the standard
     deviation towards the error that is left. The others are means over the dimensions and leave the deviation alone.
-    ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05. In a tumble, the
-    expert's action cannot be told from a noisy observation: squared errors are large there and take most of the gradient,
-    though nothing can be learnt. Linear ones leave more of it to the approach and the hover, where a hundredth is
-    centimetres. ``"huber_mse"``: that and three times the squared error, for policies that must do both.
+    ``"mse"``: squared. ``"huber"``: half the squared error up to 0.05, linear beyond, in units of 0.05: a tumble,
+    where little can be learnt from noise, takes less of the gradient. ``"huber_mse"``: that and three times the squared error.
     """
     if kind == "nll":
         return gaussian_nll(mean, log_std, actions)
