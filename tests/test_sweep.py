@@ -288,3 +288,9 @@ def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatc
         tables.append((tmp_path / f"logs/sweep/s_{k}/results.json").read_text())
     assert main(["sweep", file, "--no-progress"]) == 0
     assert tables == [(tmp_path / "logs/sweep/s_3/results.json").read_text()] * 2
+
+
+def test_a_grid_fills_what_a_configuration_leaves_empty():
+    data = {"algo": "dagger", "env": "QuadStateRecovery-v0", "configurations": [{"name": "one", "env_kwargs": None}]}
+    runs = expand(SweepSpec(**data, grid={"env_kwargs.noise": [0.0, 0.1]}))
+    assert [run.stages[0].settings["env_kwargs"]["noise"] for run in runs] == [0.0, 0.1]

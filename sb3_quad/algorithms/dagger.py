@@ -215,7 +215,7 @@ class DAgger(ExpertMixin, OnPolicyAlgorithm):  # type: ignore[misc]
         std = np.exp(self.policy.log_std.detach().cpu().numpy())
         labels = np.empty((n_rollout_steps, n_envs, action_dim), dtype=np.float32)  # +
         said: list[Float32Array] = []  # + what the auxiliary loss teaches
-        true_state = true_state_of(env)
+        true_state = true_state_of(env) if self._aux_layer else None
         not_yet = th.zeros(n_envs)  # the values, until the rollout is complete
         timeouts: list[tuple[int, int, npt.NDArray[Any]]] = []  # step, environment, last observation
         n_by_expert = 0

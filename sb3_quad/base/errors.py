@@ -5,7 +5,6 @@ Each message is one line that names the thing and the way out; the command line 
 
 import re
 from collections.abc import Iterable
-from functools import cache
 
 
 class SB3QuadError(Exception):
@@ -74,11 +73,14 @@ def _parts(text: str) -> set[str]:
     return {*re.findall(r"[^\W_]+", text)}
 
 
-@cache
 def _edit_distance(given: str, meant: str) -> int:
     """How many letters left out, added, replaced, or swapped with the next make one text the other."""
-    if not given or not meant or given[0] == meant[0]:
-        return _edit_distance(given[1:], meant[1:]) if given and meant else len(given + meant)
-    edits = [(given[1:], meant), (given, meant[1:]), (given[1:], meant[1:])]
-    edits += [(given[2:], meant[2:])] if given[:2] == meant[1::-1] else []
-    return 1 + min(_edit_distance(*each) for each in edits)
+    rows: list[list[int]] = [[*range(len(meant) + 1)]]
+    for i, letter in enumerate(given):
+        rows.append([i + 1])
+        for j, other in enumerate(meant):
+            least = min(rows[i][j + 1] + 1, rows[i + 1][j] + 1, rows[i][j] + (letter != other))
+            if i > 0 and j > 0 and letter == meant[j - 1] and other == given[i - 1]:
+                least = min(least, rows[i - 1][j - 1] + 1)
+            rows[i + 1].append(least)
+    return rows[-1][-1]

@@ -8,15 +8,7 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.state import (
-    BODY_RATES,
-    POSITION,
-    QUATERNION,
-    STATE_SIZE,
-    VELOCITY,
-    QuadcopterState,
-    rotation_matrices,
-)
+from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Actions = Float32Array
@@ -77,13 +69,13 @@ def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -
     """
     features = observation * std + mean
     part = {name: features[:, columns] for name, columns in GROUPS.items()}
-    quaternion = _nearest_quaternion(part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1))
     array = np.zeros((STATE_SIZE, len(features)))
     array[POSITION] = part["position"].T
-    array[QUATERNION] = quaternion.T
-    array[VELOCITY] = np.einsum("nij,nj->in", rotation_matrices(quaternion), part["velocity"])
+    array[QUATERNION] = _nearest_quaternion(part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1)).T
     array[BODY_RATES] = part["body_rates"].T
-    return QuadcopterState(array)
+    state = QuadcopterState(array)
+    array[VELOCITY] = np.einsum("nij,nj->in", state.rotation, part["velocity"])
+    return state
 
 
 def _nearest_quaternion(matrices: FloatArray) -> FloatArray:

@@ -89,6 +89,8 @@ def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:
             data = copy.deepcopy(_merged(spec.given, own))
             data.pop("name", None)
             for key, value in cell.items():
+                if data.get(outer := key.partition(".")[0]) is None:
+                    data.pop(outer, None)  # null in the file
                 put_key(data, key, value, f"grid: {key}")
             if own.get("name"):
                 data["name"] = ",".join(filter(None, [str(own["name"]), _name(cell)]))

@@ -271,7 +271,8 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     elif stage.trim == "arrival":
-        flown = job.config.flight_settings.with_changes(**({"randomize": own} if (own := stage.trim_randomize) else {}))
+        trained = job.config.flight_settings
+        flown = trained.with_changes(randomize=stage.trim_randomize or trained.randomize)
         did = trim_arrival(model, seed, job.flight_settings, flown, stage.leaving_cost)
         words = f"slow arrivals, failures and losses cost {did.before:.2f} s, now {did.after:.2f} s"
     else:
