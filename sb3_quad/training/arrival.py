@@ -23,9 +23,9 @@ from sb3_quad.training.trim import Trim, first_layer, scaling
 GROUPS = ("position_[xy]", "position_z", "rotation_*", "velocity_[xy]", "velocity_z", "body_rate_[xy]")
 _MEMBERS = np.array([[fnmatchcase(name, group) for name in FEATURE_NAMES] for group in GROUPS], dtype=np.float64)
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
-FIRST_SPREAD, KEPT = 0.15, 0.3  # of log α at first; share of the last round's mean in the next
+FIRST_SPREAD, KEPT = 0.08, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 120, 480  # of a candidate to targets, half of its recoveries; of the agent before and after
-LEFT, FAILED, LOST = 0.25, 0.2, 20.0  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
+LEFT, FAILED, LOST = 0.25, 0.2, 10.0  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
 
 
 def trim_arrival(
