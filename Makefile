@@ -66,7 +66,7 @@ test-zoo: $(ZOO_INSTALLED)
 AGENTS ?= any-quadcopter crazyflie-robust
 OTHERS := examples/other_simulators
 TRANSFER_FILES := build/transfer
-FLOWN := cf2x_L250 cf21B_500 rotorpy_crazyflie rotorpy_hummingbird crazyflie
+FLOWN := cf2x_L250 cf21B_500 rotorpy_crazyflie rotorpy_hummingbird l2f_crazyflie
 TRANSFER_PY := OMP_NUM_THREADS=1 TRANSFER_FILES=. $(abspath $(TRANSFER_VENV))/bin/python -W ignore
 
 test-transfer: $(TRANSFER_INSTALLED) transfer-files

@@ -49,7 +49,8 @@ def write(path: Path, **changes: Any) -> Path:
     return path
 
 
-OF_OTHERS = {"cf2x_L250", "cf21B_500", "rotorpy_crazyflie", "rotorpy_hummingbird", "x500"}  # gains are derived
+# Their gains are derived.
+OF_OTHERS = {"cf2x_L250", "cf21B_500", "rotorpy_crazyflie", "rotorpy_hummingbird", "l2f_crazyflie", "x500"}
 
 
 def test_default_vehicle_is_the_specified_one() -> None:

@@ -1,7 +1,7 @@
 """Fly exported agents in l2f (RAPTOR's and Learning to Fly's simulator), as they are, and RAPTOR's policy beside them.
 
-    sb3-quad export any-quadcopter --format onnx --vehicle crazyflie -o any-quadcopter@crazyflie.onnx
-    python examples/other_simulators/in_l2f.py any-quadcopter@crazyflie.onnx
+    sb3-quad export any-quadcopter --format onnx --vehicle l2f_crazyflie -o any-quadcopter@l2f_crazyflie.onnx
+    python examples/other_simulators/in_l2f.py any-quadcopter@l2f_crazyflie.onnx
 
 l2f: its Crazyflie of 30.6 g, whose rotors spin up with 18/s and down with 4/s, numbered as Bitcraze numbers them; quaternions
 w, x, y, z; an action is linear in a rotor's speed, -1 its least and 1 its greatest; its step is the control step.
@@ -19,7 +19,7 @@ FIELDS = {"position": "position", "quaternion": "orientation", "velocity": "line
 class L2F:
     """n vehicles as n is 4 or 2 to a higher power: l2f has a module for each number."""
 
-    ground = 0.0145  # m, as in crazyflie.yaml
+    ground = 0.0145  # m, as in l2f_crazyflie.yaml
 
     def __init__(self, n: int) -> None:
         self.n, self._vector = n, getattr(l2f, f"vector{n}")
@@ -63,7 +63,7 @@ class L2F:
         return ((-b + np.sqrt(np.maximum(b * b - 4.0 * a * (c - thrusts), 0.0))) / (2.0 * a)).clip(0.0, 1.0)
 
 
-CELLS = {"crazyflie": Cell("crazyflie", "l2f's parameters", L2F)}
+CELLS = {"l2f_crazyflie": Cell("l2f_crazyflie", "no drag", L2F)}
 
 if __name__ == "__main__":
     main(__doc__ or "", CELLS, {"RAPTOR": Raptor})

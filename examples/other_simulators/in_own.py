@@ -49,6 +49,7 @@ class Own:
 
 
 CELLS = {name: Cell(name, "drag", partial(Own, name, 0.0)) for name in ("cf2x_L250", "cf21B_500")}
+CELLS["l2f_crazyflie"] = Cell("l2f_crazyflie", "no drag", partial(Own, "l2f_crazyflie", 0.0))
 for name in ("rotorpy_crazyflie", "rotorpy_hummingbird"):
     CELLS[name] = Cell(name, "drag", partial(Own, name, 0.0))
     CELLS[name + "_wind"] = Cell(name, "drag, wind 4 m/s", partial(Own, name, 4.0))

@@ -11,7 +11,7 @@ from in_l2f import CELLS as L2F
 from in_rotorpy import CELLS as ROTORPY
 
 FILES = Path(os.environ["TRANSFER_FILES"])
-MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {"l2f": L2F["crazyflie"].make}
+MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {"l2f": L2F["l2f_crazyflie"].make}
 MAKERS |= {f"rotorpy {name}": ROTORPY[name].make for name in ("crazyflie", "crazyflie_gusts", "hummingbird")}
 
 
@@ -43,8 +43,8 @@ def test_a_file_for_other_rotors_is_refused():
         (MAKERS["crazyflow cf21B_500"], "any-quadcopter@cf21B_500", 0.97),
         (MAKERS["crazyflow cf2x_L250"], "any-quadcopter@cf2x_L250", 0.7),
         (MAKERS["rotorpy crazyflie"], "any-quadcopter@rotorpy_crazyflie", 0.97),
-        (MAKERS["rotorpy hummingbird"], "any-quadcopter@rotorpy_hummingbird", 0.97),
-        (MAKERS["l2f"], "any-quadcopter@crazyflie", 0.9),
+        (MAKERS["rotorpy hummingbird"], "any-quadcopter@rotorpy_hummingbird", 0.9),
+        (MAKERS["l2f"], "any-quadcopter@l2f_crazyflie", 0.8),
     ],
 )
 @pytest.mark.parametrize("task", ["targets", "recoveries"])
