@@ -105,7 +105,7 @@ def shorter(content):
     kept = {
         key: shorter(value)
         for key, value in content.items()
-        if key not in ("require", "trim", "position_scale", "leaving_cost", "trim_randomize")
+        if key not in ("require", "trim", "position_scale", "leaving_cost", "trim_env_kwargs", "trims")
     }
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}

@@ -82,7 +82,7 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "trim": "hover", "conf_file": "robust/dagger.yml"}], "see the 18 features alone"),
         ([{**STAGES[0], "position_scale": 0.6}], "position_scale goes with trim: position"),
         ([{**STAGES[0], "trim": "hover", "leaving_cost": 2.0}], "leaving_cost goes with trim: arrival"),
-        ([{**STAGES[0], "trim": "arrival", "trim_randomize": {"gust": {}}}], "did you mean 'gusts'"),
+        ([{**STAGES[0], "trim": "arrival", "trim_env_kwargs": {"randomize": {"gust": {}}}}], "did you mean 'gusts'"),
         ([], "at least 1"),
         ([STAGES[0], STAGES[0]], "one, one: give each a name of its own"),
     ],
@@ -144,13 +144,17 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     assert result.before > 0.4 and result.after < 0.05
 
 
-def test_a_stage_says_what_is_random_where_its_agent_is_trimmed(tmp_path, job, monkeypatch):
+def test_a_stage_says_where_and_how_often_its_agent_is_trimmed(tmp_path, job, monkeypatch):
     seen = []
-    monkeypatch.setattr(pipeline_module, "trim_arrival", lambda *given: seen.append(given[3].randomize) or Trim(1.0, 0.5))
-    for own in ({}, {"trim_randomize": {"mass": [0.9, 1.1]}}):
-        stage = {**STAGES[0], "trim": "arrival", "settings": {"env_kwargs": {"randomize": {"share": 0.5}}}, **own}
+    monkeypatch.setattr(pipeline_module, "trim_arrival", lambda *given: seen.append(given) or Trim(1.0, 0.5))
+    for own in ({}, {"trim_env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}, "trims": 2}):
+        settings = {"env_kwargs": {"randomize": {"share": 0.5}, "noise": 0.1}}
+        stage = {**STAGES[0], "trim": "arrival", "settings": settings, **own}
         run_pipeline(tiny(tmp_path, [stage]), job, "stages", quiet)
-    assert [(each.share, each.mass and each.mass.high) for each in seen] == [(0.5, None), (1.0, 1.1)]
+    randomize = [worlds.randomize for _, _, _, worlds, _ in seen]
+    assert [(each.share, each.mass and each.mass.high) for each in randomize] == [(0.5, None), (1.0, 1.1), (1.0, 1.1)]
+    assert {worlds.noise for _, _, _, worlds, _ in seen} == {0.1}
+    assert len({seed for _, seed, *_ in seen}) == 2 and seen[0][1] == seen[1][1]
 
 
 @pytest.mark.slow

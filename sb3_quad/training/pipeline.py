@@ -22,7 +22,6 @@ from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.randomization import Randomization
 from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.arrival import LEFT, trim_arrival
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
@@ -58,14 +57,16 @@ class Stage(Frozen):
     trim: Literal["position", "hover", "arrival"] | None = Field(default=None, description="training.trim, .arrival say how")
     position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
     leaving_cost: NonNegativeFloat = Field(default=LEFT, description="s that trim: arrival counts for a target left again")
-    trim_randomize: Randomization | None = Field(default=None, description="of trim: arrival's flights; None: the training's")
+    trim_env_kwargs: dict[str, Any] = Field(default={}, description="changes to env_kwargs in which trim: arrival counts, too")
+    trims: PositiveInt = Field(default=1, description="how often trim: arrival searches, each time from what it found before")
     require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
     eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
     @model_validator(mode="after")
     def _of_its_trim(self) -> "Stage":
-        for name, trimmed in (("position_scale", "position"), ("leaving_cost", "arrival"), ("trim_randomize", "arrival")):
+        for name in ("position_scale", "leaving_cost", "trim_env_kwargs", "trims"):
+            trimmed = "position" if name == "position_scale" else "arrival"
             if getattr(self, name) != type(self).model_fields[name].default and self.trim != trimmed:
                 raise ValueError(f"{name} goes with trim: {trimmed}")
         return self
@@ -188,6 +189,8 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
+            if stage.trim == "arrival":
+                config.flight_settings.with_changes(**stage.trim_env_kwargs)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         if stage.trim in ("position", "hover") and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
@@ -271,10 +274,10 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     elif stage.trim == "arrival":
-        trained = job.config.flight_settings
-        flown = trained.with_changes(randomize=stage.trim_randomize or trained.randomize)
-        did = trim_arrival(model, seed, job.flight_settings, flown, stage.leaving_cost)
-        words = f"slow arrivals, failures and losses cost {did.before:.2f} s, now {did.after:.2f} s"
+        flown = job.config.flight_settings.with_changes(**stage.trim_env_kwargs)
+        seeds = (seed_for("trim", job.seed + i) for i in range(stage.trims))
+        found = [trim_arrival(model, seed, job.flight_settings, flown, stage.leaving_cost) for seed in seeds]
+        words = "slow arrivals, failures and losses cost " + "; ".join(f"{a:.2f} s, now {b:.2f} s" for a, b in found)
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
         words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"
