@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Callable
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import rl_zoo3.exp_manager
 from rl_zoo3 import ALGOS
@@ -20,7 +20,7 @@ from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.training.algorithms import constructor_parameters, takes_expert
-from sb3_quad.training.config import SETTINGS, VEC_ENVS
+from sb3_quad.training.config import SETTINGS, VecEnvKind
 from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import convert
 
@@ -103,8 +103,8 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         parser.add_argument("--vec-env")
         flag = parser.parse_known_args()[0].vec_env  # rl_zoo3's own default hides whether it was given
         kind = flag or setting or ("batch" if self._env_id in ENVIRONMENTS else "dummy")
-        if kind not in VEC_ENVS:
-            raise ConfigError(f"{self.config}: {unknown('vec_env', kind, VEC_ENVS)}")
+        if kind not in get_args(VecEnvKind):
+            raise ConfigError(f"{self.config}: {unknown('vec_env', kind, get_args(VecEnvKind))}")
         if kind == "batch" and self._env_id not in ENVIRONMENTS:
             raise ConfigError(f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; use dummy or subproc")
         self._batched = kind == "batch"

@@ -8,11 +8,15 @@ since W (s - μ) / (α σ) = (W / α) (s - μ) / σ: the zip stays stock.
 """
 
 from fnmatch import fnmatchcase
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import ActorCriticPolicy
 
+from sb3_quad.algorithms.networks.gradients import mean_actions, network_of
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import NEAR, fly_settings
@@ -25,6 +29,7 @@ _MEMBERS = np.array([[fnmatchcase(name, group) for name in FEATURE_NAMES] for gr
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
 FIRST_SPREAD, KEPT = 0.08, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 120, 480  # of a candidate to targets, half of its recoveries; of the agent before and after
+_Sets = list[tuple[FlightSettings, float]]  # of flights, with the weight of their time
 LEFT, FAILED, LOST = 0.25, 0.2, 10.0  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
 
 
@@ -42,6 +47,7 @@ def trim_arrival(
     :raises ConfigError: an agent whose first layer does not read these observations.
     """
     layer, rng = first_layer(model, settings.size), np.random.default_rng(seed)
+    agent: Any = partial(mean_actions, network_of(model.policy)) if isinstance(model.policy, ActorCriticPolicy) else model
     worlds = trained.with_changes(position_integral=settings.position_integral, task_kwargs=None)
     sets = [
         (settings.with_changes(task="target_tracking", task_kwargs=None, max_episode_steps=500), 1.0),
@@ -51,9 +57,9 @@ def trim_arrival(
     mean, spread = np.zeros(len(GROUPS)), np.full(len(GROUPS), FIRST_SPREAD)
     for each in row_seeds(seed, ROUNDS):
         tried = mean + spread * rng.standard_normal((CANDIDATES, len(GROUPS)))
-        best = tried[np.argsort(_costs(model, tried, sets, each, N_FLIGHTS, left))[:BEST]]
+        best = tried[np.argsort(_costs(agent, tried, sets, each, N_FLIGHTS, left))[:BEST]]
         mean, spread = KEPT * mean + (1 - KEPT) * best.mean(axis=0), (spread + best.std(axis=0)) / 2
-    before, after = _costs(model, np.stack([0.0 * mean, mean]), sets, seed, N_CHECKED, left)
+    before, after = _costs(agent, np.stack([0.0 * mean, mean]), sets, seed, N_CHECKED, left)
     if after < before:
         frame = np.append(np.exp(mean @ _MEMBERS), np.ones(settings.frame_size - OBSERVATION_SIZE))
         with th.no_grad():
@@ -61,15 +67,13 @@ def trim_arrival(
     return Trim(float(before), float(min(after, before)))
 
 
-def _costs(
-    model: BaseAlgorithm, log_scales: FloatArray, sets: list[tuple[FlightSettings, float]], seed: int, n: int, left: float
-) -> FloatArray:
+def _costs(agent: Any, log_scales: FloatArray, sets: _Sets, seed: int, n: int, left: float) -> FloatArray:
     """What :func:`trim_arrival` minimises for each of m candidates, on the same n flights of each set, (m,)."""
     scales = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
     total = np.zeros(len(scales))
     for (settings, weight), episodes in zip(sets, row_seeds(seed, len(sets)), strict=True):
         scaled = settings.with_changes(observation_std=scaling(settings)[1] * scales)
-        flights = fly_settings(model, scaled, row_seeds(episodes, n) * len(log_scales), tolerances=(NEAR,))
+        flights = fly_settings(agent, scaled, row_seeds(episodes, n) * len(log_scales), tolerances=(NEAR,))
         stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=2.0 * flights.flown.max())
         total += weight * (stay + left * (flights.time_to[NEAR] < stay)) + LOST * ~flights.survival + FAILED * ~flights.success
     return np.asarray(total.reshape(len(log_scales), n).mean(axis=1))

@@ -6,7 +6,7 @@ falls linearly to 0 over the training; a learning rate to its n-th part, in the 
 
 from collections.abc import Collection
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias, get_args
+from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium
 from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, ValidationInfo, field_validator, model_validator
@@ -28,7 +28,6 @@ _FOLDERS = "any_quadcopter", "nominal", "robust", "thesis", "value_based"
 SETTINGS = YamlFolder("settings file", "sb3_quad.zoo_configs", ".yml", folders=_FOLDERS)
 """The settings files that come with the package, as ``--conf-file`` takes them."""
 VecEnvKind: TypeAlias = Literal["batch", "dummy", "subproc"]
-VEC_ENVS = get_args(VecEnvKind)
 MAX_SINGLE = 1000  # environments of dummy and subproc; PyBullet allows about as many in a process
 
 

@@ -160,6 +160,7 @@ class Scenario(Frozen):
     @property
     def task(self) -> Task:
         """What the environments sample themselves, so that random targets and attitudes are those of training."""
+        elsewhere = self.target.distance or any(point != self.start.position for point in self.target.points)
         return Task(
             name="scenario",
             start_position=self.start.position,
@@ -168,7 +169,7 @@ class Scenario(Frozen):
             velocity_std=self.start.velocity.std or 0.0,
             body_rates_std=self.start.body_rates.std or 0.0,
             max_distance=self.max_distance,
-            **({} if self._is_flown_to() else RECOVERED),
+            **({} if elsewhere else RECOVERED),
         )
 
     @property
@@ -189,10 +190,6 @@ class Scenario(Frozen):
         if self.start != Start() or self.wrenches or self.randomize or self.vehicles or 0.1 not in self.tolerances:
             return None
         return (self.flown_vehicle().time_optimal or {}).get(self.target.distance or 0.0)
-
-    def _is_flown_to(self) -> bool:
-        """Whether the target lies elsewhere than the start."""
-        return bool(self.target.distance) or any(point != self.start.position for point in self.target.points)
 
     @property
     def is_fixed(self) -> bool:
