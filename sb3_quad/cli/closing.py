@@ -22,7 +22,7 @@ from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
 from sb3_quad.training.trainer import TrainingResult
 
-FRESH_EPISODES, PIPELINE_EPISODES = 240, 960  # in a table after a single run, and after a pipeline
+FRESH_EPISODES, PIPELINE_EPISODES = 240, 480  # in a table after a single run, and after a pipeline
 THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
 SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of its suite, by task
 
