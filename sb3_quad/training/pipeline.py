@@ -268,7 +268,7 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
     if run.trimmed_model.is_file():
         return run.trimmed_model
     model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, job, run), device=job.device)
-    report(f"trimming the agent ({stage.trim}), which may take a minute")
+    report(f"trimming the agent ({stage.trim}{f', {stage.trims} times' * (stage.trims > 1)}), which may take minutes")
     seed = seed_for("trim", job.seed)
     if stage.trim == "hover":
         did = trim_hover(model, seed, job.flight_settings)
