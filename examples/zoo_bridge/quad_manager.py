@@ -25,6 +25,7 @@ from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import convert
 
 Settings = dict[str, Any]
+VEC_ENVS = get_args(VecEnvKind)
 
 
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
@@ -103,8 +104,8 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         parser.add_argument("--vec-env")
         flag = parser.parse_known_args()[0].vec_env  # rl_zoo3's own default hides whether it was given
         kind = flag or setting or ("batch" if self._env_id in ENVIRONMENTS else "dummy")
-        if kind not in get_args(VecEnvKind):
-            raise ConfigError(f"{self.config}: {unknown('vec_env', kind, get_args(VecEnvKind))}")
+        if kind not in VEC_ENVS:
+            raise ConfigError(f"{self.config}: {unknown('vec_env', kind, VEC_ENVS)}")
         if kind == "batch" and self._env_id not in ENVIRONMENTS:
             raise ConfigError(f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; use dummy or subproc")
         self._batched = kind == "batch"

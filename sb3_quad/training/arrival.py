@@ -29,8 +29,8 @@ _MEMBERS = np.array([[fnmatchcase(name, group) for name in FEATURE_NAMES] for gr
 ROUNDS, CANDIDATES, BEST = 8, 16, 4
 FIRST_SPREAD, KEPT = 0.08, 0.3  # of log α at first; share of the last round's mean in the next
 N_FLIGHTS, N_CHECKED = 120, 480  # of a candidate to targets, half of its recoveries; of the agent before and after
-_Sets = list[tuple[FlightSettings, float]]  # of flights, with the weight of their time
 LEFT, FAILED, LOST = 0.25, 0.2, 10.0  # s that a flight costs that leaves its target again, fails, or is lost (fails, too)
+_Sets = list[tuple[FlightSettings, float]]  # of flights, with the weight of their time
 
 
 def trim_arrival(

@@ -268,15 +268,15 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
     if run.trimmed_model.is_file():
         return run.trimmed_model
     model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, job, run), device=job.device)
-    report(f"trimming the agent ({stage.trim}{f', {stage.trims} times' * (stage.trims > 1)}), which may take minutes")
+    report(f"trimming the agent ({stage.trim}), which may take minutes")
     seed = seed_for("trim", job.seed)
     if stage.trim == "hover":
         did = trim_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
     elif stage.trim == "arrival":
         flown = job.config.flight_settings.with_changes(**stage.trim_env_kwargs)
-        seeds = (seed_for("trim", job.seed + i) for i in range(stage.trims))
-        found = [trim_arrival(model, seed, job.flight_settings, flown, stage.leaving_cost) for seed in seeds]
+        seeds = [seed_for("trim", job.seed + i) for i in range(stage.trims)]
+        found = [trim_arrival(model, each, job.flight_settings, flown, stage.leaving_cost) for each in seeds]
         words = "slow arrivals, failures and losses cost " + "; ".join(f"{a:.2f} s, now {b:.2f} s" for a, b in found)
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
