@@ -13,8 +13,8 @@ from sb3_quad.base.files import read_text
 class EpisodeLog(BaseCallback):
     """Adds a line for each episode that ends: return, length, seconds since the start, success.
 
-    It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and rl-zoo's plots read the file.
-    An existing file is continued, its seconds too.
+    It reads ``info["episode"]``, which costs nothing until an episode ends. ``load_results`` and
+    rl-zoo's plots read the file. An existing file is continued, its seconds too.
 
     >>> from stable_baselines3 import PPO
     >>> from stable_baselines3.common.results_plotter import load_results
@@ -41,7 +41,9 @@ class EpisodeLog(BaseCallback):
             with self._path.open("rb+") as file:
                 file.truncate(file.read().rfind(b"\n") + 1)  # a crash may have cut the last row
         rows = read_text(self._path).splitlines()[2:] if self._path.exists() else []
-        self._writer = ResultsWriter(str(self._path), header, ("is_success",), override_existing=not self._path.exists())
+        self._writer = ResultsWriter(
+            str(self._path), header, ("is_success",), override_existing=not self._path.exists()
+        )
         if rows:
             self._start -= float(rows[-1].split(",")[2])
 
@@ -50,7 +52,11 @@ class EpisodeLog(BaseCallback):
         for row in np.flatnonzero(self.locals["dones"]):
             info = infos[row]
             if "episode" in info:
-                values = {"r": round(float(info["episode"]["r"]), 6), "l": int(info["episode"]["l"]), "t": seconds}
+                values = {
+                    "r": round(float(info["episode"]["r"]), 6),
+                    "l": int(info["episode"]["l"]),
+                    "t": seconds,
+                }
                 self._writer.write_row({**values, "is_success": info.get("is_success", "")})
         return True
 

@@ -7,9 +7,11 @@ from sb3_quad.base.files import save_model
 
 
 class EveryTimesteps(EventCallback):
-    """Calls :meth:`_on_event` after the first step at or beyond each multiple of ``every``, also in a resumed training.
+    """Calls :meth:`_on_event` after the first step at or beyond each multiple of ``every``, also in
+    a resumed training.
 
-    SB3's EveryNTimesteps counts from its last call instead, so its events drift away from the multiples.
+    SB3's EveryNTimesteps counts from its last call instead, so its events drift away from the
+    multiples.
 
     :param every: timesteps, over all environments together.
     :raises ConfigError: it is below 1.
@@ -40,14 +42,18 @@ class Checkpoint(EveryTimesteps):
     ['rl_model_1600_steps.zip', 'rl_model_800_steps.zip']
 
     :param every: timesteps, over all environments together.
-    :param path: the file, with ``{steps}`` where the number of timesteps goes. A file there is replaced.
-    :raises ConfigError: ``every`` below 1, a path without ``{steps}``; when saving, a folder that cannot be written.
+    :param path: the file, with ``{steps}`` where the number of timesteps goes. A file there is
+        replaced.
+    :raises ConfigError: ``every`` below 1, a path without ``{steps}``; when saving, a folder that
+        cannot be written.
     """
 
     def __init__(self, every: int, path: str, verbose: int = 0) -> None:
         super().__init__(every, verbose)
         if "{steps}" not in path:
-            raise ConfigError(f"Checkpoint: {path}: must hold {{steps}}, or each checkpoint would replace the one before")
+            raise ConfigError(
+                f"Checkpoint: {path}: must hold {{steps}}, or each checkpoint would replace the one before"
+            )
         self._path = path
 
     def _on_event(self) -> bool:

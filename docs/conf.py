@@ -37,7 +37,12 @@ autodoc_inherit_docstrings = False
 linkcheck_anchors = False
 nitpick_ignore_regex = [("py:.*", r"(?!sb3_quad).*")]  # what other packages document
 
-PACKAGES = ("sb3_quad", "sb3_quad.envs", "sb3_quad.callbacks", "sb3_quad.vehicles")  # whose __all__ is in the reference
+PACKAGES = (
+    "sb3_quad",
+    "sb3_quad.envs",
+    "sb3_quad.callbacks",
+    "sb3_quad.vehicles",
+)  # whose __all__ is in the reference
 IMPORTED = re.compile(r"^from (sb3_quad[\w.]*) import ([\w, ]+)", re.MULTILINE)
 
 
@@ -49,7 +54,12 @@ class Manual(SphinxDirective):
     def run(self) -> list[nodes.Node]:
         """Parse it as a part of the page, its headings as bold lines."""
         text = inspect.getdoc(find(self.arguments[0])) or ""
-        text = re.sub(r"^#+ (.+)$", r"**\1**", re.sub(r":(class|func|meth):`", r"{py:\1}`", text), flags=re.MULTILINE)
+        text = re.sub(
+            r"^#+ (.+)$",
+            r"**\1**",
+            re.sub(r":(class|func|meth):`", r"{py:\1}`", text),
+            flags=re.MULTILINE,
+        )
         node = nodes.container()
         self.state.nested_parse(StringList(text.splitlines(), self.arguments[0]), 0, node)
         return node.children
@@ -64,24 +74,43 @@ def find(path: str) -> object:
         return getattr(find(module), name)
 
 
-def describe_fields(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """The fields of a pydantic model become its parameters; a manual in Markdown stands on the page already."""
+def describe_fields(
+    app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]
+) -> None:
+    """The fields of a pydantic model become its parameters; a manual in Markdown stands on the page
+    already.
+    """
     if isinstance(thing, type) and issubclass(thing, BaseModel):
         fields = {key: each.description for key, each in thing.model_fields.items()}
-        lines += ["", *(f":param {key}: {' '.join(text.split())}" for key, text in fields.items() if text), ""]
+        lines += [
+            "",
+            *(f":param {key}: {' '.join(text.split())}" for key, text in fields.items() if text),
+            "",
+        ]
     if "## Description" in lines:
         lines[:] = ["The manual is above."]
-    lines[:] = [re.sub(r"\|(r[^|`]*)\|", r"\\|\1\\|", line) for line in lines]  # a distance, no substitution
+    lines[:] = [
+        re.sub(r"\|(r[^|`]*)\|", r"\\|\1\\|", line) for line in lines
+    ]  # a distance, no substitution
 
 
 def check_coverage(app: Sphinx, env: BuildEnvironment) -> None:
     """Each public name, and each name that a page imports, is in the reference."""
-    wanted = {f"{package}.{name}" for package in PACKAGES for name in find(package).__all__ if name != "__version__"}
+    wanted = {
+        f"{package}.{name}"
+        for package in PACKAGES
+        for name in find(package).__all__
+        if name != "__version__"
+    }
     for page in [ROOT / "README.md", *ROOT.glob("docs/**/*.md")]:
         for module, names in IMPORTED.findall(page.read_text(encoding="utf-8")):
             wanted |= {f"{module}.{name.strip()}" for name in names.split(",")}
     kinds = ("class", "function", "data", "exception")
-    documented = [find(path) for path, each in env.domains.python_domain.objects.items() if each.objtype in kinds]
+    documented = [
+        find(path)
+        for path, each in env.domains.python_domain.objects.items()
+        if each.objtype in kinds
+    ]
     for path in sorted(wanted):
         if not any(find(path) is each for each in documented):
             logging.getLogger(__name__).warning("%s is not in the reference", path)
@@ -99,7 +128,9 @@ def write_demo(app: Sphinx) -> None:
     from sb3_quad.show.demo.page import DEFAULT_AGENTS, make_page
 
     if app.builder.format == "html":
-        (Path(app.outdir) / "throw.html").write_text(make_page(parse_controllers(DEFAULT_AGENTS), None)[0], encoding="utf-8")
+        (Path(app.outdir) / "throw.html").write_text(
+            make_page(parse_controllers(DEFAULT_AGENTS), None)[0], encoding="utf-8"
+        )
 
 
 def setup(app: Sphinx) -> None:

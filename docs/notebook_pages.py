@@ -1,4 +1,6 @@
-"""Notebooks in jupytext's percent form on pages, with what they print and plot where SB3_QUAD_NOTEBOOKS is run."""
+"""Notebooks in jupytext's percent form on pages, with what they print and plot where
+SB3_QUAD_NOTEBOOKS is run.
+"""
 
 import base64
 import contextlib
@@ -18,7 +20,9 @@ def append_notebook(app: Sphinx, page: str, source: list[str]) -> None:
     """Behind a page's own text come the cells of the notebook beside it; its title is the page's."""
     path = Path(app.srcdir, f"{page}.py")
     if path.is_file():
-        source[0] += "\n\n" + "\n\n".join(cells_of(path.read_text(encoding="utf-8"))).partition("\n")[2]
+        source[0] += (
+            "\n\n" + "\n\n".join(cells_of(path.read_text(encoding="utf-8"))).partition("\n")[2]
+        )
 
 
 def cells_of(text: str) -> list[str]:
@@ -30,7 +34,9 @@ def cells_of(text: str) -> list[str]:
         plt.rc_context(),
         contextlib.chdir(folder) if RUN else contextlib.nullcontext(),
     ):
-        for head, cell in re.findall(r"^# %%([^\n]*)\n(.*?)(?=^# %%|\Z)", text, flags=re.DOTALL | re.MULTILINE):
+        for head, cell in re.findall(
+            r"^# %%([^\n]*)\n(.*?)(?=^# %%|\Z)", text, flags=re.DOTALL | re.MULTILINE
+        ):
             if "[markdown]" in head:
                 found.append(re.sub(r"^# ?", "", cell.strip(), flags=re.MULTILINE))
             else:
@@ -47,7 +53,9 @@ def run(cell: str, scope: dict[str, object]) -> list[str]:
         picture = io.BytesIO()
         plt.savefig(picture, format="png")
         plt.close("all")
-        plots.append(f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">')
+        plots.append(
+            f'<img alt="plot" src="data:image/png;base64,{base64.b64encode(picture.getvalue()).decode()}">'
+        )
 
     shown, plt.show = plt.show, show
     with contextlib.redirect_stdout(printed):

@@ -12,7 +12,8 @@ if TYPE_CHECKING:
 
 __all__ = ["TASKS", "QuadcopterEnv", "QuadcopterVecEnv", "QuadcopterVectorEnv", "Task"]
 
-_LAZY = {  # imported on first use: `import sb3_quad` waits neither for pybullet nor for numba nor for torch
+# Imported on first use: `import sb3_quad` waits neither for pybullet nor for numba nor for torch
+_LAZY = {
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",
     "QuadcopterVectorEnv": "sb3_quad.envs.gym_vector",

@@ -1,4 +1,6 @@
-"""What all environments have in common: their spaces, and what they can be asked and told in flight."""
+"""What all environments have in common: their spaces, and what they can be asked and told in
+flight.
+"""
 
 import functools
 import inspect
@@ -20,11 +22,15 @@ from sb3_quad.vehicles.vehicle import Vehicle
 
 P = ParamSpec("P")
 T = TypeVar("T")
-INFOS = {"is_success": "success", "survival": "truncated"} | {key: key for key in ("distance", "collision", "out_of_range")}
+INFOS = {"is_success": "success", "survival": "truncated"} | {
+    key: key for key in ("distance", "collision", "out_of_range")
+}
 """Keys of an info, and the fields of ``batch.outcome`` that they show."""
 
 
-def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[Concatenate["BatchEnv", P], T]:
+def _of_batch(
+    method: Callable[Concatenate[QuadcopterBatch, P], T],
+) -> Callable[Concatenate["BatchEnv", P], T]:
     """The method of an environment that is this one of its batch."""
 
     @functools.wraps(method)
@@ -35,24 +41,34 @@ def _of_batch(method: Callable[Concatenate[QuadcopterBatch, P], T]) -> Callable[
 
 
 def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
-    """Observation and action space of one quadcopter; made anew, since each space has random numbers of its own."""
+    """Observation and action space of one quadcopter; made anew, since each space has random
+    numbers of its own.
+    """
     observations = spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return observations, spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
 class BatchEnv:
-    """An environment whose rows are those of ``batch``; ``QuadcopterEnv`` has one, and its values are without a row axis.
+    """An environment whose rows are those of ``batch``; ``QuadcopterEnv`` has one, and its values
+    are without a row axis.
 
-    ``indices`` says which rows are set: a number, several, a slice, or None for all. What is set holds until it is set anew,
-    a target until its row's next reset. A value that does not fit raises :class:`~sb3_quad.base.errors.ConfigError`.
+    ``indices`` says which rows are set: a number, several, a slice, or None for all. What is set
+    holds until it is set anew, a target until its row's next reset. A value that does not fit
+    raises :class:`~sb3_quad.base.errors.ConfigError`.
     """
 
     batch: QuadcopterBatch
 
-    def _make_batch(self, n: int, seed: int | None, n_threads: int | None, autoreset: bool, **keywords: Any) -> None:
-        """Make the batch of n rows that fly as the keywords say; errors name the environment's class."""
+    def _make_batch(
+        self, n: int, seed: int | None, n_threads: int | None, autoreset: bool, **keywords: Any
+    ) -> None:
+        """Make the batch of n rows that fly as the keywords say; errors name the environment's
+        class.
+        """
         own = inspect.signature(type(self)).parameters.values()
-        valid = {each.name for each in own if each.kind is each.POSITIONAL_OR_KEYWORD} | FlightSettings.model_fields.keys()
+        valid = {
+            each.name for each in own if each.kind is each.POSITIONAL_OR_KEYWORD
+        } | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
             raise ConfigError(f"{type(self).__name__}: {unknown('keyword', key, valid)}")
         settings = validate(FlightSettings, keywords, type(self).__name__)
@@ -80,7 +96,9 @@ class BatchEnv:
 
     @property
     def wrench(self) -> FloatArray:
-        """What was set or sampled, without gusts, (n, 12): force world, force body, torque world, torque body; N, N m."""
+        """What was set or sampled, without gusts, (n, 12): force world, force body, torque world,
+        torque body; N, N m.
+        """
         return self._by_row(self.batch.wrench)
 
     @property

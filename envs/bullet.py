@@ -11,9 +11,23 @@ from sb3_quad.base.bullet import p
 from sb3_quad.envs.rendering.camera import ChaseCamera
 from sb3_quad.envs.rendering.models import rotor_turning
 from sb3_quad.envs.rendering.scene import Pose, Scene
-from sb3_quad.envs.rendering.window import disconnect, has_display, open_window, point_window, start_drawing
+from sb3_quad.envs.rendering.window import (
+    disconnect,
+    has_display,
+    open_window,
+    point_window,
+    start_drawing,
+)
 from sb3_quad.simulation.kernel import write_body
-from sb3_quad.simulation.state import FORCE_WORLD, POSITION, ROTOR_SPEEDS, TARGET, TORQUE_WORLD, P, QuadcopterState
+from sb3_quad.simulation.state import (
+    FORCE_WORLD,
+    POSITION,
+    ROTOR_SPEEDS,
+    TARGET,
+    TORQUE_WORLD,
+    P,
+    QuadcopterState,
+)
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
@@ -24,28 +38,44 @@ _ORIGIN = (0.0, 0.0, 0.0)
 class BulletBody:
     """The rigid body of a vehicle in a PyBullet client of its own; several live side by side.
 
-    PyBullet integrates a floating multibody base, which is what specification section 1 describes: explicit velocities,
-    then the pose by the new velocities. The body is the only one in the simulation that can move or be touched; contact
-    with the ground is decided by the task from the position, not here.
+    PyBullet integrates a floating multibody base, which is what specification section 1 describes:
+    explicit velocities, then the pose by the new velocities. The body is the only one in the
+    simulation that can move or be touched; contact with the ground is decided by the task from the
+    position, not here.
 
     :param vehicle: mass, inertia, gravity, collision radius and physics step.
-    :param window: width and height in pixels of PyBullet's window, of which it allows one per process; None: no window.
-        Without a display there is none either, and a line on stderr says so.
+    :param window: width and height in pixels of PyBullet's window, of which it allows one per
+        process; None: no window. Without a display there is none either, and a line on stderr says
+        so.
     :raises ConfigError: the window cannot be opened.
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
         self.has_window = window is not None and has_display()
         if window is not None and not self.has_window:
-            print("sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures", file=sys.stderr)
-        self.client = open_window(*window) if window is not None and self.has_window else int(p.connect(p.DIRECT))
-        # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's clients are limited.
+            print(
+                "sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures",
+                file=sys.stderr,
+            )
+        self.client = (
+            open_window(*window)
+            if window is not None and self.has_window
+            else int(p.connect(p.DIRECT))
+        )
+        # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's
+        # clients are limited.
         self._close = weakref.finalize(self, disconnect, self.client)
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
-        p.setPhysicsEngineParameter(fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client)
-        ball = p.createCollisionShape(p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client)
+        p.setPhysicsEngineParameter(
+            fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client
+        )
+        ball = p.createCollisionShape(
+            p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client
+        )
         self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=self.client)
-        p.changeDynamics(self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client)
+        p.changeDynamics(
+            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client
+        )
         self.become(vehicle.parameters())
         p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=self.client)
 
@@ -53,7 +83,11 @@ class BulletBody:
         """Have the mass and inertia that a vehicle's ``parameters()`` say."""
         inertia = parameters[[P.ixx, P.iyy, P.izz]].tolist()
         p.changeDynamics(
-            self.body, -1, mass=float(parameters[P.mass]), localInertiaDiagonal=inertia, physicsClientId=self.client
+            self.body,
+            -1,
+            mass=float(parameters[P.mass]),
+            localInertiaDiagonal=inertia,
+            physicsClientId=self.client,
         )
 
     @property
@@ -65,11 +99,18 @@ class BulletBody:
         """Put the body where the first vehicle of ``state`` is."""
         w, x, y, z = state.quaternion[0].tolist()
         rates = state.rotation[0] @ state.body_rates[0]
-        p.resetBasePositionAndOrientation(self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client)
-        p.resetBaseVelocity(self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client)
+        p.resetBasePositionAndOrientation(
+            self.body, state.position[0].tolist(), (x, y, z, w), physicsClientId=self.client
+        )
+        p.resetBaseVelocity(
+            self.body, state.velocity[0].tolist(), rates.tolist(), physicsClientId=self.client
+        )
 
-    def fly(self, wrenches: FloatArray, wrench: FloatArray, drag: FloatArray | None, wind: FloatArray) -> None:
-        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body frame.
+    def fly(
+        self, wrenches: FloatArray, wrench: FloatArray, drag: FloatArray | None, wind: FloatArray
+    ) -> None:
+        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body
+        frame.
 
         :param wrench: (WRENCH_SIZE,), of which the world-frame parts act besides.
         :param drag: (3,), d of the vehicle, N s/m; None: there is none.
@@ -81,7 +122,8 @@ class BulletBody:
         is_pushed = any(world_force) or any(world_torque)
         for force, torque in wrenches.tolist():
             if is_pushed:
-                # A world-frame force acts at a point of the world: the centre of mass, where it is now.
+                # A world-frame force acts at a point of the world: the centre of mass, where it is
+                # now.
                 position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
                 push(body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client)
                 twist(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
@@ -100,8 +142,12 @@ class BulletBody:
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
-        position, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
-        write_body(state, position, quaternion, *p.getBaseVelocity(self.body, physicsClientId=self.client))
+        position, quaternion = p.getBasePositionAndOrientation(
+            self.body, physicsClientId=self.client
+        )
+        write_body(
+            state, position, quaternion, *p.getBaseVelocity(self.body, physicsClientId=self.client)
+        )
 
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""
@@ -109,7 +155,8 @@ class BulletBody:
 
 
 class Renderer:
-    """Draws one vehicle, its target and the wrench that acts on it; the flight is the same with and without it.
+    """Draws one vehicle, its target and the wrench that acts on it; the flight is the same with and
+    without it.
 
     :param width: of the pictures, pixels; ``height`` likewise.
     :param body: the simulation. If it has a window, that is drawn into, in real time.
@@ -120,7 +167,9 @@ class Renderer:
         self.size, self.human = (width, height), body.has_window
         self.shown_at, self.frames_due = time.perf_counter(), 1.0
         # PyBullet would draw the collision sphere.
-        p.changeVisualShape(body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client)
+        p.changeVisualShape(
+            body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client
+        )
         self.reset(np.zeros(TARGET.stop))
         if self.human:
             start_drawing(self.scene.client)
@@ -134,11 +183,13 @@ class Renderer:
     def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
         """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,); once for each control step.
 
-        :return: uint8 (height, width, 3). None if there is a window: it is drawn WINDOW_FPS times a second, and this call
-            waits until real time has caught up.
+        :return: uint8 (height, width, 3). None if there is a window: it is drawn WINDOW_FPS times a
+            second, and this call waits until real time has caught up.
         """
         camera = self.chase.follow(state, 0.04)
-        self.rotor_angles += rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * self.vehicle.control_step
+        self.rotor_angles += (
+            rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * self.vehicle.control_step
+        )
         if not self.human:
             self._place(state, wrench)
             return self.scene.picture(camera)

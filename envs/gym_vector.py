@@ -18,21 +18,27 @@ from sb3_quad.simulation.tasks import TaskSpec
 class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.NDArray[Any]]):
     """The batched environment for users outside Stable-Baselines3.
 
-    ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8, vectorization_mode="vector_entry_point")`` makes one. The
-    learning problem, the arguments and the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i of
+    ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8,
+    vectorization_mode="vector_entry_point")`` makes one. The learning problem, the arguments and
+    the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i of
     ``reset(seed=s)`` flies as that environment does after ``reset(seed=row_seeds(s, n)[i])``, see
     :func:`~sb3_quad.base.seeds.row_seeds`.
 
-    The infos of every step hold ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``, (n,) each,
-    and as ``_is_success`` and so on the mask of the rows that they are of.
+    The infos of every step hold ``is_success``, ``survival``, ``distance``, ``collision`` and
+    ``out_of_range``, (n,) each, and as ``_is_success`` and so on the mask of the rows that they are
+    of.
 
-    :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. ``"SameStep"``: a row that ends returns the
-        first observation and infos of its next episode, and the last ones are in ``final_obs[i]`` and ``final_info``.
-        ``"NextStep"``: it returns its last ones, and the next step begins its next episode, whatever its action is.
+    :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. ``"SameStep"``: a row
+        that ends returns the first observation and infos of its next episode, and the last ones are
+        in ``final_obs[i]`` and ``final_info``. ``"NextStep"``: it returns its last ones, and the
+        next step begins its next episode, whatever its action is.
     :raises ConfigError: an argument that does not fit.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}  # type: ignore[misc]
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": [],
+        "autoreset_mode": AutoresetMode.SAME_STEP,
+    }  # type: ignore[misc]
 
     def __init__(
         self,
@@ -46,42 +52,66 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         **keywords: Any,
     ) -> None:
         if render_mode is not None:
-            raise ConfigError(f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv")
+            raise ConfigError(
+                f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv"
+            )
         modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
         name = getattr(autoreset_mode, "value", autoreset_mode)
         if name not in modes:
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}  # type: ignore[misc]
-        self._make_batch(num_envs, seed, n_threads, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords)
+        self._make_batch(
+            num_envs,
+            seed,
+            n_threads,
+            autoreset=False,
+            task=task,
+            task_kwargs=task_kwargs,
+            **keywords,
+        )
         self.num_envs = self.batch.n
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step
-        self.single_observation_space, self.single_action_space = quadcopter_spaces(self.batch.observation.size)
+        self.single_observation_space, self.single_action_space = quadcopter_spaces(
+            self.batch.observation.size
+        )
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(
-        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+        self,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Begin new episodes in all rows.
 
-        :param seed: one number, from which each row gets its own stream, or a number for each row; None: the next episodes.
+        :param seed: one number, from which each row gets its own stream, or a number for each row;
+            None: the next episodes.
         """
         n = self.num_envs
         for key in options or {}:
-            raise ConfigError(f"reset option {key!r}: the batched environment takes none; call set_target after it")
+            raise ConfigError(
+                f"reset option {key!r}: the batched environment takes none; call set_target after it"
+            )
         seeds = [None] * n if seed is None else seed
         seeds = row_seeds(int(seeds), n) if isinstance(seeds, (int, np.integer)) else list(seeds)
         if len(seeds) != n:
-            raise ConfigError(f"seed: {len(seeds)} numbers for {n} environments; give one, or one for each")
+            raise ConfigError(
+                f"seed: {len(seeds)} numbers for {n} environments; give one, or one for each"
+            )
         rows = [row for row, each in enumerate(seeds) if each is not None]
         if rows:
             self.batch.seed([seeds[row] for row in rows], rows)
         self._ended[:] = False
         return self._begin(~self._ended), self._infos()
 
-    def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos."""
+    def step(
+        self, actions: npt.NDArray[Any]
+    ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
+        """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated
+        (n,), infos.
+        """
         before, final = self._ended, {}
         observations, rewards, done = self.batch.step(actions)
         if self._mode is AutoresetMode.NEXT_STEP and before.any():
@@ -94,7 +124,12 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
             last = np.full(self.num_envs, None, dtype=object)
             for row in np.flatnonzero(done):
                 last[row] = observations[row]
-            final = {"final_obs": last, "_final_obs": done, "final_info": self._infos(done), "_final_info": done}
+            final = {
+                "final_obs": last,
+                "_final_obs": done,
+                "final_info": self._infos(done),
+                "_final_info": done,
+            }
             observations = self._begin(done)
         return observations, rewards, done & ~truncated, truncated, {**self._infos(), **final}
 

@@ -18,31 +18,40 @@ from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, 
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
-_START = {"position": POSITION, "quaternion": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
+_START = {
+    "position": POSITION,
+    "quaternion": QUATERNION,
+    "velocity": VELOCITY,
+    "body_rates": BODY_RATES,
+}
 
 
 class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     """
     ## Description
 
-    A quadcopter with slow motors and a delayed command flies to a target and stays there. Two tasks are registered:
+    A quadcopter with slow motors and a delayed command flies to a target and stays there. Two tasks
+    are registered:
 
     | id | start | target |
     |----|-------|--------|
     | `QuadTargetTracking-v0` | hovering at (0, 0, 15) m | 10 m away in a uniformly random direction |
     | `QuadStateRecovery-v0` | at (0, 0, 15) m, thrown: any attitude, velocity and body rates at random | (0, 0, 15) m |
 
-    The vehicle, the tasks and all numbers are those of the study thesis STUD-512; its equations are cited by number. The
-    body is flown by PyBullet; :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` flies many at once by compiled code, and
-    each of its rows agrees with this environment reset with the row's seed to 1e-9.
+    The vehicle, the tasks and all numbers are those of the study thesis STUD-512; its equations are
+    cited by number. The body is flown by PyBullet; :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`
+    flies many at once by compiled code, and each of its rows agrees with this environment reset
+    with the row's seed to 1e-9.
 
-    The world frame has z up and the ground at z = 0. The body frame has x forward, y left, z up. Units are SI.
+    The world frame has z up and the ground at z = 0. The body frame has x forward, y left, z up.
+    Units are SI.
 
     ## Action Space
 
-    `Box(-1, 1, (4,), float32)`: the commanded thrust of each rotor, as (0.5 a + 1) m g / 4 (Eq. 3.18; the limits are the
-    vehicle's, and 0 the middle between them: hover for the default vehicle, `vehicle.hover_action` is it for any). Numbers
-    outside [-1, 1] are clipped; ones that are not finite are refused.
+    `Box(-1, 1, (4,), float32)`: the commanded thrust of each rotor, as (0.5 a + 1) m g / 4 (Eq.
+    3.18; the limits are the vehicle's, and 0 the middle between them: hover for the default
+    vehicle, `vehicle.hover_action` is it for any). Numbers outside [-1, 1] are clipped; ones that
+    are not finite are refused.
 
     | Num | Rotor (default vehicle) | Min | Max | Thrust (N) |
     |-----|-------------------------|-----|-----|------------|
@@ -51,13 +60,15 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | 2 | rear right | -1 | 1 | 2.12 to 6.35 |
     | 3 | rear left | -1 | 1 | 2.12 to 6.35 |
 
-    A command acts one control step (0.01 s) after it was given; then the rotor speed follows it by Eq. 4.1.
+    A command acts one control step (0.01 s) after it was given; then the rotor speed follows it by
+    Eq. 4.1.
 
     ## Observation Space
 
-    `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every control step, then
-    `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`, `history` or `position_integral` it is made of
-    frames of these, in all `batch.observation.size` numbers.
+    `Box(-inf, inf, (18,), float32)`: each feature times `1 + noise * N(0, 1)`, sampled every
+    control step, then `(x - mean) / std` (Eq. 3.16; `std` as in Table A.2). With `last_action`,
+    `history` or `position_integral` it is made of frames of these, in all `batch.observation.size`
+    numbers.
 
     | Num | Feature | Frame | Unit | std |
     |-----|---------|-------|------|-----|
@@ -69,12 +80,14 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     ## Rewards
 
     Per control step, on the true state (Eqs. 4.5-4.9):
-    `-0.003 |r - r_T| - 0.002 arccos(R33) - 0.0005 |ω|`, and -15 on touching the ground, -15 on getting out of range.
+    `-0.003 |r - r_T| - 0.002 arccos(R33) - 0.0005 |ω|`, and -15 on touching the ground, -15 on
+    getting out of range.
 
     ## Starting State
 
-    As the table above says. State recovery: attitude uniform on SO(3), velocity N(0, 2 m/s) and body rates N(0, 4 rad/s)
-    per axis. Rotors turn at hover speed, and hover is the command under way. `reset(options=...)` fixes a start:
+    As the table above says. State recovery: attitude uniform on SO(3), velocity N(0, 2 m/s) and
+    body rates N(0, 4 rad/s) per axis. Rotors turn at hover speed, and hover is the command under
+    way. `reset(options=...)` fixes a start:
 
     | Key | Meaning |
     |-----|---------|
@@ -95,8 +108,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     - *Terminated*: the collision sphere (radius 0.135 m) touches the ground, or |r - r_T| > 30 m.
     - *Truncated*: after 1500 control steps (15 s), by `max_episode_steps` of `gymnasium.make`.
 
-    An episode succeeds that is truncated within 0.1 m of the target; state recovery within 0.25 m, tilted by at most 10°
-    (`success_distance` and `success_tilt` of the task).
+    An episode succeeds that is truncated within 0.1 m of the target; state recovery within 0.25 m,
+    tilted by at most 10° (`success_distance` and `success_tilt` of the task).
 
     ## Info
 
@@ -114,8 +127,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     import gymnasium
     import sb3_quad
 
-    env = gymnasium.make("QuadTargetTracking-v0", noise=0.0, task_kwargs={"target_distance": 15.0}, render_mode="rgb_array")
-    ```
+    env = gymnasium.make("QuadTargetTracking-v0", noise=0.0, task_kwargs={"target_distance": 15.0},
+    render_mode="rgb_array") ```
 
     | Argument | Default | Meaning |
     |----------|---------|---------|
@@ -145,8 +158,8 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | `set_wind(velocity)` | the velocity of the air, (3,), world frame, m/s; it acts on vehicles with `drag` |
     | `set_noise(level)` | the relative standard deviation of the observation noise |
 
-    `true_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`, `task`, `task_kwargs` and
-    `vehicle` tell what holds.
+    `true_state()`, `target`, `wrench`, `wind`, `noise`, `observation_mean`, `observation_std`,
+    `task`, `task_kwargs` and `vehicle` tell what holds.
 
     ## Version History
 
@@ -168,10 +181,15 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
-        # One row of the batched environment, whose body PyBullet moves; Gymnasium's TimeLimit truncates.
+        # One row of the batched environment, whose body PyBullet moves; Gymnasium's TimeLimit
+        # truncates.
         if (steps := keywords.setdefault("max_episode_steps", ENDLESS)) != ENDLESS:
-            raise ConfigError(f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates")
-        self._make_batch(1, seed, n_threads=1, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords)
+            raise ConfigError(
+                f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates"
+            )
+        self._make_batch(
+            1, seed, n_threads=1, autoreset=False, task=task, task_kwargs=task_kwargs, **keywords
+        )
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
@@ -186,10 +204,13 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         if self._body.has_window or self.render_mode == "rgb_array":
             self._renderer = Renderer(self.vehicle, *self._size, self._body)
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Float32Array, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Float32Array, dict[str, Any]]:
         """Begin an episode; after :meth:`close`, in a new simulation.
 
-        :param seed: begins a new stream of random numbers; None: the next episode of the present one.
+        :param seed: begins a new stream of random numbers; None: the next episode of the present
+            one.
         :param options: a fixed ``target`` and parts of the ``state``, as the class says.
         :raises ConfigError: an unknown option, or a value that is no start.
         """
@@ -213,7 +234,9 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         batch.clear_outcome()
         return self.observe(), self._info()
 
-    def step(self, action: npt.NDArray[Any]) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
+    def step(
+        self, action: npt.NDArray[Any]
+    ) -> tuple[Float32Array, float, bool, bool, dict[str, Any]]:
         """Fly one control step.
 
         :param action: (4,), clipped to [-1, 1].
@@ -221,14 +244,21 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         """
         array = np.asarray(action, dtype=np.float32)
         if array.shape != (4,):
-            raise ValueError(f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor")
+            raise ValueError(
+                f"action of shape {array.shape}: must be (4,), one number in [-1, 1] for each rotor"
+            )
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
         if not math.isfinite(sum(array.tolist())):
             raise ValueError(f"action {array.tolist()}: every number must be finite")
         batch = self.batch
         drag = batch.vehicles[P.drag_x : P.drag_z + 1, 0] if batch.has_drag else None
-        self._body.fly(batch.turn_rotors(array[None]), batch.total_wrench()[:, 0], drag, batch.total_wind()[:, 0])
+        self._body.fly(
+            batch.turn_rotors(array[None]),
+            batch.total_wrench()[:, 0],
+            drag,
+            batch.total_wind()[:, 0],
+        )
         self._body.read(batch.state)
         observations, _, _ = batch.score(array[None])
         if self.render_mode == "human":
@@ -237,17 +267,27 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
     def _info(self) -> dict[str, Any]:
-        ended = dict(zip(self.batch.outcome.dtype.names or (), self.batch.outcome[0].item(), strict=True))
+        ended = dict(
+            zip(self.batch.outcome.dtype.names or (), self.batch.outcome[0].item(), strict=True)
+        )
         return {key: ended[field] for key, field in INFOS.items()}
 
     def render(self) -> Image | None:
-        """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose window step() draws into."""
+        """A picture, uint8 (height, width, 3), for ``"rgb_array"``; None for ``"human"``, whose
+        window step() draws into.
+        """
         if self.render_mode is None:
-            gymnasium.logger.warn("render() does nothing without a render_mode; pass render_mode='rgb_array' to make()")
+            gymnasium.logger.warn(
+                "render() does nothing without a render_mode; pass render_mode='rgb_array' to make()"
+            )
         return self._draw() if self.render_mode == "rgb_array" else None
 
     def _draw(self) -> Image | None:
-        return None if self._renderer is None else self._renderer.render(self.batch.state[:, 0], self.wrench)
+        return (
+            None
+            if self._renderer is None
+            else self._renderer.render(self.batch.state[:, 0], self.wrench)
+        )
 
     def close(self) -> None:
         """End the simulation; calling it twice is fine."""
@@ -255,19 +295,25 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         self._body.close()
 
     def observe(self) -> Float32Array:
-        """The present observation, (18,); the same numbers until the next step, unless something was set meanwhile."""
+        """The present observation, (18,); the same numbers until the next step, unless something
+        was set meanwhile.
+        """
         return np.asarray(self.batch.observe()[0])
 
     @property
     def wrench(self) -> FloatArray:
-        """Set or sampled, without gusts, (12,), a live view: force world, force body, torque world, torque body; N, N m."""
+        """Set or sampled, without gusts, (12,), a live view: force world, force body, torque world,
+        torque body; N, N m.
+        """
         return self.batch.wrench[:, 0]
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         return np.asarray(super()._by_row(columns)[0])
 
 
-def _fixed_rows(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tuple[slice, FloatArray]]:
+def _fixed_rows(
+    options: Mapping[str, Any] | None, vehicle: Vehicle
+) -> list[tuple[slice, FloatArray]]:
     """The rows of the state that ``options`` of a reset fix, and their values."""
     given = dict(options or {})
     start = given.pop("state", None) or {}
@@ -284,7 +330,9 @@ def _fixed_rows(options: Mapping[str, Any] | None, vehicle: Vehicle) -> list[tup
             continue
         values = per_row(f"options: {name}", value, 1, rows.stop - rows.start)[:, 0]
         if name == "position" and values[2] <= vehicle.collision_radius:
-            raise ConfigError(f"position {values.tolist()}: touches the ground; z must exceed {vehicle.collision_radius} m")
+            raise ConfigError(
+                f"position {values.tolist()}: touches the ground; z must exceed {vehicle.collision_radius} m"
+            )
         if name == "quaternion":
             if np.linalg.norm(values) < 1e-6:
                 raise ConfigError("options: quaternion: must not be zero")

@@ -1,14 +1,21 @@
-"""Registers the environments with Gymnasium, by module paths, so that nothing heavy is imported before it is used."""
+"""Registers the environments with Gymnasium, by module paths, so that nothing heavy is imported
+before it is used.
+"""
 
 import gymnasium
 
 from sb3_quad.simulation import MAX_EPISODE_STEPS
 
-ENVIRONMENTS = {"QuadTargetTracking-v0": "target_tracking", "QuadStateRecovery-v0": "state_recovery"}
+ENVIRONMENTS = {
+    "QuadTargetTracking-v0": "target_tracking",
+    "QuadStateRecovery-v0": "state_recovery",
+}
 
 
 def register_environments() -> None:
-    """Register ``QuadTargetTracking-v0`` and ``QuadStateRecovery-v0``; called when ``sb3_quad`` is imported."""
+    """Register ``QuadTargetTracking-v0`` and ``QuadStateRecovery-v0``; called when ``sb3_quad`` is
+    imported.
+    """
     for env_id, task in ENVIRONMENTS.items():
         if env_id not in gymnasium.registry:
             gymnasium.register(

@@ -24,11 +24,14 @@ _METHODS = ("set_target", "set_wrench", "set_wind", "set_noise")
 class RowSeeds(VecEnv):
     """A vectorised environment whose rows have nothing in common, whatever the seeds.
 
-    SB3 gives row i ``seed + i``: of 480 rows, those of seeds 0 and 1 share 479 streams of random numbers.
+    SB3 gives row i ``seed + i``: of 480 rows, those of seeds 0 and 1 share 479 streams of random
+    numbers.
     """
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seed all rows from their next reset on; returns :func:`~sb3_quad.base.seeds.row_seeds`. None: by a random number."""
+        """Seed all rows from their next reset on; returns :func:`~sb3_quad.base.seeds.row_seeds`.
+        None: by a random number.
+        """
         first = secrets.randbits(32) if seed is None else seed
         self._seeds = [*row_seeds(first, self.num_envs)]
         return [*self._seeds]
@@ -37,19 +40,22 @@ class RowSeeds(VecEnv):
 class QuadcopterVecEnv(BatchEnv, RowSeeds):
     """n quadcopters stepped together by compiled code; the flight is PyBullet's to 1e-9.
 
-    The learning problem, the arguments and the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`;
-    row i flies exactly as that environment does after ``reset(seed=row_seeds(seed, n)[i])``
-    (:func:`~sb3_quad.base.seeds.row_seeds`; ``seed()`` returns them). A row that ends begins its next episode
-    within the same step, and its info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``,
-    ``l``, ``t`` as of SB3's Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
-    infos of other rows are empty. The list of infos is the environment's own and changes with the next step; the arrays are
-    fresh.
+    The learning problem, the arguments and the setters are those of
+    :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i flies exactly as that environment
+    does after ``reset(seed=row_seeds(seed, n)[i])`` (:func:`~sb3_quad.base.seeds.row_seeds`;
+    ``seed()`` returns them). A row that ends begins its next episode within the same step, and its
+    info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``, ``l``,
+    ``t`` as of SB3's Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and
+    ``out_of_range``. The infos of other rows are empty. The list of infos is the environment's own
+    and changes with the next step; the arrays are fresh.
 
     Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
-    :param n_envs: number of rows; ``seed`` and ``n_threads`` as of :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
-    :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over ``max_episode_steps``, so
-        that the mean return and success of a training are of all its episodes, not at first of crashes alone.
+    :param n_envs: number of rows; ``seed`` and ``n_threads`` as of
+        :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
+    :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over
+        ``max_episode_steps``, so that the mean return and success of a training are of all its
+        episodes, not at first of crashes alone.
     :raises ConfigError: an argument that does not fit.
     """
 
@@ -63,7 +69,9 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         n_threads: int | None = None,
         **keywords: Any,
     ) -> None:
-        self._make_batch(n_envs, seed, n_threads, autoreset=True, task=task, task_kwargs=task_kwargs, **keywords)
+        self._make_batch(
+            n_envs, seed, n_threads, autoreset=True, task=task, task_kwargs=task_kwargs, **keywords
+        )
         self.render_mode, self._staggered = None, staggered  # QuadcopterEnv draws
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
@@ -75,7 +83,9 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         """Begin a new episode in every row; observations float32 (n, 18)."""
         if any(self._options):
             self._reset_options()
-            raise ConfigError("reset options: the batched environment takes none; call set_target and its like after reset()")
+            raise ConfigError(
+                "reset options: the batched environment takes none; call set_target and its like after reset()"
+            )
         if any(seed is not None for seed in self._seeds):
             self.batch.seed(self._seeds)
             self._reset_seeds()
@@ -97,7 +107,10 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self._ended = ended = rows.tolist()
         if ended:
             elapsed = round(time.time() - self._start, 6)
-            outcomes, last = self.batch.outcome[rows].tolist(), self.batch.last_observations[rows]  # copies
+            outcomes, last = (
+                self.batch.outcome[rows].tolist(),
+                self.batch.last_observations[rows],
+            )  # copies
             for row, outcome, observation in zip(ended, outcomes, last, strict=True):
                 total, _, length, distance, collision, out_of_range, truncated, success = outcome
                 self._infos[row] = {  # not from INFOS, which takes twice as long
@@ -130,7 +143,11 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self.env_method(f"set_{attr_name}", value, indices=indices)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
     ) -> list[Any]:
         """Call a method for the given rows; one result per row."""
         rows = self.batch.rows(indices)
@@ -138,10 +155,14 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
             state = self.true_state()
             return [state.rows(slice(row, row + 1)) for row in rows]
         if method_name not in _METHODS:
-            raise AttributeError(f"no method {method_name!r} of rows; there are: true_state, {', '.join(_METHODS)}")
+            raise AttributeError(
+                f"no method {method_name!r} of rows; there are: true_state, {', '.join(_METHODS)}"
+            )
         getattr(self, method_name)(*method_args, indices=indices, **method_kwargs)
         return [None] * rows.size
 
-    def env_is_wrapped(self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None) -> list[bool]:
+    def env_is_wrapped(
+        self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
+    ) -> list[bool]:
         """True of SB3's ``Monitor``, whose ``info["episode"]`` the rows give; of no other wrapper."""
         return [wrapper_class is Monitor] * self.batch.rows(indices).size

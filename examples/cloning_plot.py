@@ -1,9 +1,11 @@
-"""How far agents hover from their targets after stage two, with the cloning term and without: docs/research/results.md.
+"""How far agents hover from their targets after stage two, with the cloning term and without:
+docs/research/results.md.
 
     sb3-quad sweep cloning
     python examples/cloning_plot.py logs/sweep/cloning_1/results.csv cloning.png
 
-A configuration is called after what it shares with another and whether it clones, such as "our reward, cloning, 1 M".
+A configuration is called after what it shares with another and whether it clones, such as "our
+reward, cloning, 1 M".
 """
 
 import argparse
@@ -17,7 +19,9 @@ COLOURS = {"cloning": "#1B7EC2", "none": "#D55E00"}
 
 
 def pairs(path: str | Path, scenario: str = "tracking") -> dict[str, dict[str, list[float]]]:
-    """By what two configurations share, and by whether they clone, the median final error of each seed, m."""
+    """By what two configurations share, and by whether they clone, the median final error of each
+    seed, m.
+    """
     found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     with Path(path).open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
@@ -39,7 +43,14 @@ def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
             height = y + {"cloning": -0.14, "none": 0.14}.get(kind, 0.0)
             shown = kind if y == 0 else None  # in the legend
             axes.plot(errors, [height] * len(errors), "o", color=colour, alpha=0.75, label=shown)
-            axes.plot(sum(errors) / len(errors), height, "|", color=colour, markersize=16, markeredgewidth=2.5)
+            axes.plot(
+                sum(errors) / len(errors),
+                height,
+                "|",
+                color=colour,
+                markersize=16,
+                markeredgewidth=2.5,
+            )
     axes.set_yticks(range(len(found)), [label or "all else as it is" for label in found])
     axes.invert_yaxis()
     axes.set_xscale("log")
@@ -52,7 +63,9 @@ def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("results", help="results.csv of the sweep")
     parser.add_argument("output", help="PNG")
     arguments = parser.parse_args()

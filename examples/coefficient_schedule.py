@@ -1,8 +1,10 @@
-"""A callback by which a coefficient of the algorithm follows how well the training goes; docs/callbacks.md says more.
+"""A callback by which a coefficient of the algorithm follows how well the training goes;
+docs/callbacks.md says more.
 
     python examples/coefficient_schedule.py
 
-In a settings file, with ``PYTHONPATH=examples``: ``callback: {coefficient_schedule.CoefficientSchedule: {…}}``.
+In a settings file, with ``PYTHONPATH=examples``: ``callback:
+{coefficient_schedule.CoefficientSchedule: {…}}``.
 """
 
 import argparse
@@ -25,25 +27,28 @@ PROGRESS = "progress"
 
 
 class CoefficientSchedule(BaseCallback):
-    """Moves a coefficient from ``start`` to ``final`` while what it follows goes through ``between``.
+    """Moves a coefficient from ``start`` to ``final`` while what it follows goes through
+    ``between``.
 
-    Made for DAgger's ``beta`` (how often the expert flies) and PPOBC's ``bc_coef`` (weight of the cloning term); with any
-    algorithm, for any of its numbers that are given as floats or schedules: ``ent_coef``, ``clip_range``, ``learning_rate``,
-    SAC's ``tau``.
+    Made for DAgger's ``beta`` (how often the expert flies) and PPOBC's ``bc_coef`` (weight of the
+    cloning term); with any algorithm, for any of its numbers that are given as floats or schedules:
+    ``ent_coef``, ``clip_range``, ``learning_rate``, SAC's ``tau``.
 
-    It is set after a rollout, holds for the next one and is logged as ``schedule/<coefficient>``. A model's zip holds the
-    present number, nothing of this package; a training that continues from the zip continues from that number.
+    It is set after a rollout, holds for the next one and is logged as ``schedule/<coefficient>``. A
+    model's zip holds the present number, nothing of this package; a training that continues from
+    the zip continues from that number.
 
     :param coefficient: its name. If the model has a method ``set_<name>(value)``, it is called.
     :param start: its value until the followed quantity is known and has passed ``between[0]``.
     :param final: its value from ``between[1]`` on; in between, linear.
-    :param follow: ``progress``, the share of the timesteps done; or the name of anything that is logged, such as
-        ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate`` (of
+    :param follow: ``progress``, the share of the timesteps done; or the name of anything that is
+        logged, such as ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate`` (of
         :class:`~sb3_quad.callbacks.BestModel` or SB3's EvalCallback).
-    :param between: where it begins to move and where it ends; the second may be the smaller one, as for a loss.
+    :param between: where it begins to move and where it ends; the second may be the smaller one, as
+        for a loss.
     :param one_way: it never goes back when the followed quantity does.
-    :raises ConfigError: numbers that are not finite, equal ends of ``between``; when training begins, a coefficient that the
-        algorithm does not have.
+    :raises ConfigError: numbers that are not finite, equal ends of ``between``; when training
+        begins, a coefficient that the algorithm does not have.
     """
 
     def __init__(
@@ -58,16 +63,24 @@ class CoefficientSchedule(BaseCallback):
     ) -> None:
         super().__init__(verbose)
         numbers = (start, final, *between)
-        if len(numbers) != 4 or not all(isinstance(value, (int, float)) and math.isfinite(value) for value in numbers):
-            raise ConfigError(f"CoefficientSchedule: start {start}, final {final}, between {between}: must be finite numbers")
+        if len(numbers) != 4 or not all(
+            isinstance(value, (int, float)) and math.isfinite(value) for value in numbers
+        ):
+            raise ConfigError(
+                f"CoefficientSchedule: start {start}, final {final}, between {between}: must be finite numbers"
+            )
         if between[0] == between[1]:
-            raise ConfigError(f"CoefficientSchedule: between {tuple(between)}: its ends must differ")
+            raise ConfigError(
+                f"CoefficientSchedule: between {tuple(between)}: its ends must differ"
+            )
         self.coefficient, self.follow = coefficient, follow
         self._start, self._final, self._between = float(start), float(final), tuple(between)
         self._one_way = one_way
 
     def value_at(self, measured: float) -> float:
-        """The coefficient that belongs to a value of the followed quantity, without regard to ``one_way``."""
+        """The coefficient that belongs to a value of the followed quantity, without regard to
+        ``one_way``.
+        """
         first, last = self._between
         share = min(max((measured - first) / (last - first), 0.0), 1.0)
         return self._start + share * (self._final - self._start)
@@ -76,8 +89,14 @@ class CoefficientSchedule(BaseCallback):
         _check(self.model, self.coefficient)
         self._logged = _LastLogged()
         self.logger.output_formats.append(self._logged)
-        self._value = self._start if self.num_timesteps == 0 else _read(self.model, self.coefficient)
-        for value in (self._final, self._start, self._value):  # one that is out of range is refused now, not at the end
+        self._value = (
+            self._start if self.num_timesteps == 0 else _read(self.model, self.coefficient)
+        )
+        for value in (
+            self._final,
+            self._start,
+            self._value,
+        ):  # one that is out of range is refused now, not at the end
             _set(self.model, self.coefficient, value)
         if self.follow == PROGRESS:
             self._on_rollout_end()
@@ -88,7 +107,9 @@ class CoefficientSchedule(BaseCallback):
     def _on_rollout_end(self) -> None:
         self._logged.write(self.logger.name_to_value)
         done = self.num_timesteps / self.model._total_timesteps
-        measured = done if self.follow == PROGRESS else self._logged.values.get(self.follow, math.nan)
+        measured = (
+            done if self.follow == PROGRESS else self._logged.values.get(self.follow, math.nan)
+        )
         if math.isfinite(measured):
             value, falls = self.value_at(measured), self._final < self._start
             self._value = (min if falls else max)(value, self._value) if self._one_way else value
@@ -98,12 +119,21 @@ class CoefficientSchedule(BaseCallback):
     def _on_training_end(self) -> None:
         self.logger.output_formats.remove(self._logged)
         if self.follow != PROGRESS and self.follow not in self._logged.values:
-            known = unknown("metric", self.follow, self._logged.values) if self._logged.values else "nothing was logged"
-            warnings.warn(f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {known}", stacklevel=2)
+            known = (
+                unknown("metric", self.follow, self._logged.values)
+                if self._logged.values
+                else "nothing was logged"
+            )
+            warnings.warn(
+                f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {known}",
+                stacklevel=2,
+            )
 
 
 def _set(model: BaseAlgorithm, name: str, value: float) -> None:
-    """Give the algorithm another value of a coefficient: by its ``set_<name>``, else as its constructor would."""
+    """Give the algorithm another value of a coefficient: by its ``set_<name>``, else as its
+    constructor would.
+    """
     setter = getattr(model, f"set_{name}", None)
     if setter is not None:
         setter(value)
@@ -119,13 +149,25 @@ def _read(model: BaseAlgorithm, name: str) -> float:
 
 
 def _check(model: BaseAlgorithm, name: str) -> None:
-    """:raises ConfigError: a name that is no coefficient of the algorithm, or one that is no float there."""
-    public = {key: value for key, value in vars(model).items() if not key.startswith("_") and key != "lr_schedule"}
-    valid = [key for key, value in public.items() if isinstance(value, (float, FloatSchedule)) or key == "learning_rate"]
+    """:raises ConfigError: a name that is no coefficient of the algorithm, or one that is no float
+    there.
+    """
+    public = {
+        key: value
+        for key, value in vars(model).items()
+        if not key.startswith("_") and key != "lr_schedule"
+    }
+    valid = [
+        key
+        for key, value in public.items()
+        if isinstance(value, (float, FloatSchedule)) or key == "learning_rate"
+    ]
     if name not in valid and not isinstance(public.get(name), int):
         raise ConfigError(unknown(f"coefficient of {type(model).__name__}", name, valid))
     if name not in valid and not hasattr(model, f"set_{name}"):
-        raise ConfigError(f"{name} of {type(model).__name__} is {public[name]!r}, which is no float; give it as one, as 0.0")
+        raise ConfigError(
+            f"{name} of {type(model).__name__} is {public[name]!r}, which is no float; give it as one, as 0.0"
+        )
 
 
 class _LastLogged(KVWriter):
@@ -134,7 +176,9 @@ class _LastLogged(KVWriter):
     def __init__(self) -> None:
         self.values: dict[str, float] = {}
 
-    def write(self, key_values: Mapping[str, Any], key_excluded: object = None, step: int = 0) -> None:
+    def write(
+        self, key_values: Mapping[str, Any], key_excluded: object = None, step: int = 0
+    ) -> None:
         for name, value in key_values.items():
             if isinstance(value, (int, float)) or getattr(value, "shape", None) == ():
                 self.values[name] = float(value)
@@ -144,8 +188,12 @@ class _LastLogged(KVWriter):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=240_000, help="over all environments (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--timesteps", type=int, default=240_000, help="over all environments (%(default)s)"
+    )
     arguments = parser.parse_args()
 
     env = QuadcopterVecEnv(48, max_episode_steps=1000, seed=0)
@@ -162,7 +210,9 @@ if __name__ == "__main__":
         device="cpu",
     )
     # β falls from 1 to 0 while the share of training episodes that succeed goes from 50 % to 95 %.
-    schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95))
+    schedule = CoefficientSchedule(
+        "beta", 1.0, 0.0, follow="rollout/success_rate", between=(0.5, 0.95)
+    )
     model.learn(arguments.timesteps, callback=schedule)
     print(f"beta {model.current_beta:.2f}")
     flights = fly(model, "target_tracking", n_episodes=480, seed=1_000_000)

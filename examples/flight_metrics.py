@@ -1,9 +1,11 @@
-"""A callback that logs distances and times of the latest training episodes, beside SB3's own ``rollout/success_rate``.
+"""A callback that logs distances and times of the latest training episodes, beside SB3's own
+``rollout/success_rate``.
 
     python examples/flight_metrics.py
 
-In a settings file, with ``PYTHONPATH=examples``: ``callback: [flight_metrics.FlightMetrics]``. What it logs may be followed by
-:class:`sb3_quad.callbacks.CoefficientSchedule`, as ``rollout/reached_0.1m``.
+In a settings file, with ``PYTHONPATH=examples``: ``callback: [flight_metrics.FlightMetrics]``. What
+it logs may be followed by :class:`sb3_quad.callbacks.CoefficientSchedule`, as
+``rollout/reached_0.1m``.
 """
 
 import argparse
@@ -21,24 +23,30 @@ from sb3_quad.evaluation.flights import fly
 
 
 class FlightMetrics(BaseCallback):
-    """Logs distances and times of the latest training episodes, beside SB3's own ``rollout/success_rate``.
+    """Logs distances and times of the latest training episodes, beside SB3's own
+    ``rollout/success_rate``.
 
-    ===========================  ======================================================================================
-    name                         meaning
-    ===========================  ======================================================================================
+    ===========================
+    ====================================================================================== name
+    meaning ===========================
+    ======================================================================================
     rollout/final_distance       |r - r_T| at the end, m: mean over the flights that were not lost
     rollout/reached_0.1m         share of the flights that came within the tolerance
-    rollout/time_to_0.1m         s until they first did: mean over those
-    rollout/collision_rate       share of the flights that touched the ground
-    rollout/out_of_range_rate    share of those that got too far from the target
-    ===========================  ======================================================================================
+    rollout/time_to_0.1m         s until they first did: mean over those rollout/collision_rate
+    share of the flights that touched the ground rollout/out_of_range_rate    share of those that
+    got too far from the target ===========================
+    ======================================================================================
 
-    It works with any algorithm on the quadcopter's environments, batched or not, and measures the true state, without noise.
-    The flights are those of the training: with sampled actions, and under DAgger partly flown by the expert.
+    It works with any algorithm on the quadcopter's environments, batched or not, and measures the
+    true state, without noise. The flights are those of the training: with sampled actions, and
+    under DAgger partly flown by the expert.
 
-    :param tolerance: what counts as arrived, m. A flight that begins there arrives at 0 s, as every recovery does.
-    :param window: episodes that the metrics are about, the latest; None for the algorithm's ``stats_window_size``.
-    :raises ConfigError: a tolerance that is not positive; when training begins, an environment that is no quadcopter's.
+    :param tolerance: what counts as arrived, m. A flight that begins there arrives at 0 s, as every
+        recovery does.
+    :param window: episodes that the metrics are about, the latest; None for the algorithm's
+        ``stats_window_size``.
+    :raises ConfigError: a tolerance that is not positive; when training begins, an environment that
+        is no quadcopter's.
     """
 
     def __init__(self, tolerance: float = 0.1, window: int | None = None, verbose: int = 0) -> None:
@@ -48,7 +56,8 @@ class FlightMetrics(BaseCallback):
         if window is not None and window < 1:
             raise ConfigError(f"FlightMetrics: window {window}: must be at least 1 episode")
         self._tolerance, self._window = tolerance, window
-        # By flight: final distance, m; time until it arrived, s, NaN if it never did; collision; out of range.
+        # By flight: final distance, m; time until it arrived, s, NaN if it never did; collision;
+        # out of range.
         self._flights: deque[tuple[float, float, bool, bool]] = deque()
 
     def metrics(self) -> dict[str, float]:
@@ -64,12 +73,16 @@ class FlightMetrics(BaseCallback):
             "final_distance": final[kept],
             f"time_to_{self._tolerance:g}m": time_to[arrived],
         }
-        return {f"rollout/{name}": float(values.mean()) for name, values in means.items() if values.size}
+        return {
+            f"rollout/{name}": float(values.mean()) for name, values in means.items() if values.size
+        }
 
     def _on_training_start(self) -> None:
         env, state = self.training_env, true_state_of(self.training_env)
         if state is None or not env.has_attr("vehicle"):
-            raise ConfigError(f"FlightMetrics: {env} is no quadcopter environment of sb3_quad; leave this callback out")
+            raise ConfigError(
+                f"FlightMetrics: {env} is no quadcopter environment of sb3_quad; leave this callback out"
+            )
         self._state = state
         self._control_step = float(env.get_attr("vehicle", [0])[0].control_step)
         self._flights = deque(self._flights, maxlen=self._window or self.model._stats_window_size)
@@ -82,7 +95,9 @@ class FlightMetrics(BaseCallback):
         infos, ended = self.locals["infos"], np.flatnonzero(self.locals["dones"])
         now = self._state().distance
         distance = now.copy()
-        distance[ended] = [infos[row]["distance"] for row in ended]  # it flies its next episode already
+        distance[ended] = [
+            infos[row]["distance"] for row in ended
+        ]  # it flies its next episode already
         self._steps += 1
         arrived = np.isnan(self._time_to) & (distance <= self._tolerance)
         self._time_to[arrived] = self._steps[arrived] * self._control_step
@@ -100,8 +115,12 @@ class FlightMetrics(BaseCallback):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=600_000, help="over all environments (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--timesteps", type=int, default=600_000, help="over all environments (%(default)s)"
+    )
     arguments = parser.parse_args()
 
     env = QuadcopterVecEnv(240, task="target_tracking", max_episode_steps=500, seed=0)

@@ -1,4 +1,5 @@
-"""A callback of one's own: mean and deviation of what is observed while training, from which Table A.2 of the thesis comes.
+"""A callback of one's own: mean and deviation of what is observed while training, from which Table
+A.2 of the thesis comes.
 
     python examples/observation_statistics.py
 
@@ -24,13 +25,17 @@ from sb3_quad.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
 
 
 class ObservationStatistics(EveryTimesteps):
-    """Running mean and standard deviation (Eq. 3.17) of the 18 features, in m, m/s and rad/s, with noise.
+    """Running mean and standard deviation (Eq. 3.17) of the 18 features, in m, m/s and rad/s, with
+    noise.
 
-    Each control step's observations, whose scaling (Eq. 3.16) is undone, are combined with all before (T. F. Chan, G. H.
-    Golub, R. J. LeVeque, *Updating formulae and a pairwise algorithm for computing sample variances*, Stanford 1979).
+    Each control step's observations, whose scaling (Eq. 3.16) is undone, are combined with all
+    before (T. F. Chan, G. H. Golub, R. J. LeVeque, *Updating formulae and a pairwise algorithm for
+    computing sample variances*, Stanford 1979).
 
-    :param path: of a YAML file, whose ``observation_std`` is a list as ``env_kwargs`` takes it; None for no file.
-    :param every: timesteps between two logs (``observation/std_<group>``) and writes; both are also done at the end.
+    :param path: of a YAML file, whose ``observation_std`` is a list as ``env_kwargs`` takes it;
+        None for no file.
+    :param every: timesteps between two logs (``observation/std_<group>``) and writes; both are also
+        done at the end.
     """
 
     def __init__(self, path: str | None = None, every: int = 100_000, verbose: int = 0) -> None:
@@ -40,16 +45,23 @@ class ObservationStatistics(EveryTimesteps):
 
     def groups(self) -> dict[str, float]:
         """The deviation of each group of Table A.2: the root mean square over its features."""
-        return {name: float(np.sqrt(np.mean(self.moments.var[rows]))) for name, rows in GROUPS.items()}
+        return {
+            name: float(np.sqrt(np.mean(self.moments.var[rows]))) for name, rows in GROUPS.items()
+        }
 
     def table(self) -> str:
         """The deviation of each group beside that of Table A.2."""
         groups = self.groups()
-        lines = [f"{each.name:<10} {groups[each.name]:10.3f}  {each.std:9.3f} {each.unit}" for each in FEATURES]
+        lines = [
+            f"{each.name:<10} {groups[each.name]:10.3f}  {each.std:9.3f} {each.unit}"
+            for each in FEATURES
+        ]
         return "\n".join([f"{'group':<10} {'sigma':>10}  Table A.2", *lines])
 
     def _on_step(self) -> bool:
-        std, mean = (np.array(self.training_env.get_attr(f"observation_{name}")) for name in ("std", "mean"))
+        std, mean = (
+            np.array(self.training_env.get_attr(f"observation_{name}")) for name in ("std", "mean")
+        )
         self.moments.update(self.locals["new_obs"] * std + mean)
         return super()._on_step()
 
@@ -57,8 +69,13 @@ class ObservationStatistics(EveryTimesteps):
         for name, sigma in self.groups().items():
             self.logger.record(f"observation/std_{name}", sigma)
         if self._path is not None:
-            found = {"observation_mean": self.moments.mean, "observation_std": np.sqrt(self.moments.var)}
-            write_text(self._path, yaml.safe_dump({name: array.tolist() for name, array in found.items()}))
+            found = {
+                "observation_mean": self.moments.mean,
+                "observation_std": np.sqrt(self.moments.var),
+            }
+            write_text(
+                self._path, yaml.safe_dump({name: array.tolist() for name, array in found.items()})
+            )
         return True
 
     def _on_training_end(self) -> None:
@@ -66,10 +83,20 @@ class ObservationStatistics(EveryTimesteps):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=100_000, help="over all environments (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--timesteps", type=int, default=100_000, help="over all environments (%(default)s)"
+    )
     arguments = parser.parse_args()
-    model = PPO("MlpPolicy", QuadcopterVecEnv(40, "target_tracking", seed=0), n_steps=100, batch_size=4000, device="cpu")
+    model = PPO(
+        "MlpPolicy",
+        QuadcopterVecEnv(40, "target_tracking", seed=0),
+        n_steps=100,
+        batch_size=4000,
+        device="cpu",
+    )
     statistics = ObservationStatistics("sigma.yaml")
     model.learn(arguments.timesteps, callback=statistics)
     print(statistics.table())

@@ -1,4 +1,5 @@
-"""A callback of one's own, and a schedule that follows what it logs: the expert flies less as crashes get rare.
+"""A callback of one's own, and a schedule that follows what it logs: the expert flies less as
+crashes get rare.
 
     python examples/own_callback.py
 
@@ -36,8 +37,15 @@ class CrashRate(BaseCallback):
                   f"beta {self.model.current_beta:.2f}")  # fmt: skip
 
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+)
+parser.add_argument(
+    "--timesteps",
+    type=int,
+    default=600_000,
+    help="transitions, over all environments (%(default)s)",
+)
 arguments = parser.parse_args()
 
 env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=300, seed=0)
@@ -54,7 +62,9 @@ model = DAgger(
     seed=0,
     device="cpu",
 )
-less_expert = CoefficientSchedule("beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05))
+less_expert = CoefficientSchedule(
+    "beta", start=0.8, final=0.0, follow="my/crash_rate", between=(0.5, 0.05)
+)
 model.learn(arguments.timesteps, callback=[CrashRate(), less_expert])
 flights = fly(model, "state_recovery", n_episodes=480, seed=1_000_000)
 print(f"agent: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")

@@ -1,9 +1,11 @@
-"""An expert of one's own: the geometric controller while tilted or turning, the thesis's PID else; it teaches an agent.
+"""An expert of one's own: the geometric controller while tilted or turning, the thesis's PID else;
+it teaches an agent.
 
     python examples/own_expert.py
 
-An expert answers with actions in [-1, 1], (n, 4), to the true state of n vehicles: docs/experts.md. On the command line the
-same class teaches as `PYTHONPATH=examples sb3-quad train --algo dagger --expert own_expert:SwitchingExpert`.
+An expert answers with actions in [-1, 1], (n, 4), to the true state of n vehicles: docs/experts.md.
+On the command line the same class teaches as `PYTHONPATH=examples sb3-quad train --algo dagger
+--expert own_expert:SwitchingExpert`.
 """
 
 import argparse
@@ -26,14 +28,25 @@ class SwitchingExpert(Expert):
 
     def actions(self, state):
         """Float32 (n, 4), for the true state of n vehicles."""
-        upright = state.rotation[:, 2, 2] > np.cos(np.radians(20.0))  # the body's z axis, seen from the world's
+        upright = state.rotation[:, 2, 2] > np.cos(
+            np.radians(20.0)
+        )  # the body's z axis, seen from the world's
         calm = np.linalg.norm(state.body_rates, axis=1) < 1.0  # rad/s
-        return np.where((upright & calm)[:, None], self.pid.actions(state), self.geometric.actions(state))
+        return np.where(
+            (upright & calm)[:, None], self.pid.actions(state), self.geometric.actions(state)
+        )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--timesteps",
+        type=int,
+        default=600_000,
+        help="transitions, over all environments (%(default)s)",
+    )
     arguments = parser.parse_args()
 
     expert = SwitchingExpert()
@@ -57,4 +70,6 @@ if __name__ == "__main__":
     model.learn(arguments.timesteps)
     for name, controller in (("PID", PIDExpert()), ("own expert", expert), ("agent", model)):
         flights = fly(controller, "state_recovery", n_episodes=480, seed=1_000_000)
-        print(f"{name}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")
+        print(
+            f"{name}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
+        )

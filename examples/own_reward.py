@@ -1,10 +1,11 @@
-"""A reward of one's own: the task's coefficients by name, and a wrapper for anything that they don't hold.
+"""A reward of one's own: the task's coefficients by name, and a wrapper for anything that they
+don't hold.
 
     python examples/own_reward.py
 
-Here restless actions cost something, and an agent that comes with sb3_quad learns to fly with calmer ones. The wrapper is
-SB3's, around many vehicles at once; around a single environment (`gymnasium.make`) a `gymnasium.Wrapper` with the same two
-lines does it.
+Here restless actions cost something, and an agent that comes with sb3_quad learns to fly with
+calmer ones. The wrapper is SB3's, around many vehicles at once; around a single environment
+(`gymnasium.make`) a `gymnasium.Wrapper` with the same two lines does it.
 """
 
 import argparse
@@ -21,7 +22,9 @@ from sb3_quad.training.transfer import transfer_policy
 
 
 class CalmActions(VecEnvWrapper):
-    """Takes `cost` times the mean squared change of the action from the reward of every control step."""
+    """Takes `cost` times the mean squared change of the action from the reward of every control
+    step.
+    """
 
     def __init__(self, venv, cost):
         super().__init__(venv)
@@ -46,13 +49,26 @@ class CalmActions(VecEnvWrapper):
 
 
 def make_env(n_envs, seed):
-    """Coefficients of Eqs. 4.5 to 4.9 are `task_kwargs`: here a tilt costs twice as much as in the thesis."""
-    env = QuadcopterVecEnv(n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed)
-    return VecMonitor(CalmActions(env, cost=2.0))  # ep_rew_mean is of the new reward; SB3 warns of that
+    """Coefficients of Eqs. 4.5 to 4.9 are `task_kwargs`: here a tilt costs twice as much as in the
+    thesis.
+    """
+    env = QuadcopterVecEnv(
+        n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed
+    )
+    return VecMonitor(
+        CalmActions(env, cost=2.0)
+    )  # ep_rew_mean is of the new reward; SB3 warns of that
 
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+)
+parser.add_argument(
+    "--timesteps",
+    type=int,
+    default=600_000,
+    help="transitions, over all environments (%(default)s)",
+)
 arguments = parser.parse_args()
 
 model = PPOBC(

@@ -1,4 +1,5 @@
-"""A vehicle of one's own: its parameters in a YAML file; the experts derive their gains, an agent learns to fly it.
+"""A vehicle of one's own: its parameters in a YAML file; the experts derive their gains, an agent
+learns to fly it.
 
     python examples/own_vehicle.py
     python examples/own_vehicle.py --vehicle path/to/yours.yaml
@@ -16,14 +17,29 @@ from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.vehicles.vehicle import load_vehicle
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--vehicle", default=str(Path(__file__).with_name("my_quadcopter.yaml")), help="a name or a YAML file")
-parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+)
+parser.add_argument(
+    "--vehicle",
+    default=str(Path(__file__).with_name("my_quadcopter.yaml")),
+    help="a name or a YAML file",
+)
+parser.add_argument(
+    "--timesteps",
+    type=int,
+    default=600_000,
+    help="transitions, over all environments (%(default)s)",
+)
 arguments = parser.parse_args()
 
-vehicle = load_vehicle(arguments.vehicle)  # checked: a value that no vehicle can have is refused with its name
+vehicle = load_vehicle(
+    arguments.vehicle
+)  # checked: a value that no vehicle can have is refused with its name
 low, high = vehicle.thrust_range
-print(f"{vehicle.name}: rotors from {low:.2f} to {high:.2f} N, hover at {vehicle.hover_rotor_speed:.0f} rad/s")
+print(
+    f"{vehicle.name}: rotors from {low:.2f} to {high:.2f} N, hover at {vehicle.hover_rotor_speed:.0f} rad/s"
+)
 
 expert = GeometricExpert(vehicle)
 env = QuadcopterVecEnv(240, task="state_recovery", vehicle=vehicle, max_episode_steps=500, seed=0)

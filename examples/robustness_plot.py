@@ -22,22 +22,37 @@ LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
 
 
 def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> None:
-    """Draw the success, in %, with 95 % intervals, and the median final error, in m, of the cells of one scenario."""
+    """Draw the success, in %, with 95 % intervals, and the median final error, in m, of the cells
+    of one scenario.
+    """
     (key,) = cells[0].cell
     for number, controller in enumerate(results.controllers):
         entries = [(cell.cell[key], results.entry(controller.label, cell.name)) for cell in cells]
         flown = [(x, entry.metrics) for x, entry in entries if entry is not None]
-        style = {"marker": MARKERS[number % len(MARKERS)], "markersize": 5, "color": f"C{number}", "alpha": 0.9}
-        shares = [(x, 100.0 * m.success.value, 100.0 * m.success.low, 100.0 * m.success.high) for x, m in flown if m.success]
+        style = {
+            "marker": MARKERS[number % len(MARKERS)],
+            "markersize": 5,
+            "color": f"C{number}",
+            "alpha": 0.9,
+        }
+        shares = [
+            (x, 100.0 * m.success.value, 100.0 * m.success.low, 100.0 * m.success.high)
+            for x, m in flown
+            if m.success
+        ]
         if shares:
             x, success, low, high = zip(*shares, strict=True)
             top.plot(x, success, label=controller.label, **style)
             top.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
         # A median over the few flights that are left would flatter: half of them must survive.
-        errors = [(x, max(m.final_error_median, LEAST_ERROR)) for x, m in flown if m.survival.value >= 0.5]
+        errors = [
+            (x, max(m.final_error_median, LEAST_ERROR)) for x, m in flown if m.survival.value >= 0.5
+        ]
         if errors:
             bottom.plot(*zip(*errors, strict=True), **style)
-    top.set_title(cells[0].title.split(":")[0].capitalize(), loc="left", fontweight="bold", fontsize=10)
+    top.set_title(
+        cells[0].title.split(":")[0].capitalize(), loc="left", fontweight="bold", fontsize=10
+    )
     top.set_ylim(-4.0, 104.0)
     top.tick_params(labelbottom=False)
     bottom.set_yscale("log")
@@ -59,7 +74,9 @@ def draw(results: Results) -> Figure:
         if len(scenario.cell) == 1:
             groups.setdefault(scenario.group, []).append(scenario)
     if not groups:
-        raise SystemExit("no scenario of these results varies one quantity; evaluate --suite robustness --scenario mass does")
+        raise SystemExit(
+            "no scenario of these results varies one quantity; evaluate --suite robustness --scenario mass does"
+        )
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
     figure = Figure(figsize=(4.2 * columns, 4.4 * rows), dpi=120, layout="constrained")
@@ -77,7 +94,9 @@ def draw(results: Results) -> Figure:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path, help="of results, as evaluate leaves it")
     parser.add_argument("picture", type=Path, help="PNG, SVG or PDF to write")
     options = parser.parse_args()

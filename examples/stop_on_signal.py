@@ -1,4 +1,5 @@
-"""Ctrl-C in a training script of one's own: the training ends after the step, and the model is saved.
+"""Ctrl-C in a training script of one's own: the training ends after the step, and the model is
+saved.
 
     python examples/stop_on_signal.py
 
@@ -17,13 +18,15 @@ from sb3_quad.envs import QuadcopterVecEnv
 
 
 class StopOnSignal(BaseCallback):
-    """Makes Ctrl-C (SIGINT), SIGTERM and SIGHUP end ``model.learn`` after the step, and saves the model, whole or not at all.
+    """Makes Ctrl-C (SIGINT), SIGTERM and SIGHUP end ``model.learn`` after the step, and saves the
+    model, whole or not at all.
 
     A second signal interrupts at once, without saving.
     ``learn`` returns as usual and the script continues; ``signal`` tells whether one came.
 
-    To continue: ``PPO.load("interrupted.zip", env).learn(n, reset_num_timesteps=False)``. While ``learn`` runs, signals are
-    held back. If an exception ends it, the next signal is held back too.
+    To continue: ``PPO.load("interrupted.zip", env).learn(n, reset_num_timesteps=False)``. While
+    ``learn`` runs, signals are held back. If an exception ends it, the next signal is held back
+    too.
 
     :param path: where the model goes; an existing file is replaced.
     :raises ConfigError: where the model is saved, a folder that cannot be written.
@@ -32,7 +35,9 @@ class StopOnSignal(BaseCallback):
     signal = ""
     """The name of the signal that ended the training, empty if none did."""
     exit_code = 0
-    """For ``sys.exit``, as a shell expects it: 130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP; 0 if none came."""
+    """For ``sys.exit``, as a shell expects it: 130 after SIGINT, 143 after SIGTERM, 129 after
+    SIGHUP; 0 if none came.
+    """
 
     def __init__(self, path: str | Path, verbose: int = 1) -> None:
         super().__init__(verbose)
@@ -53,17 +58,30 @@ class StopOnSignal(BaseCallback):
             if self.signal:
                 save_model(self.model, self._path)
                 if self.verbose:
-                    print(f"{self.signal} after {self.num_timesteps:,} timesteps: model saved to {self._path}")
+                    print(
+                        f"{self.signal} after {self.num_timesteps:,} timesteps: model saved to {self._path}"
+                    )
         finally:
             self._signals.__exit__(None, None, None)
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=1_000_000, help="over all environments (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--timesteps", type=int, default=1_000_000, help="over all environments (%(default)s)"
+    )
     arguments = parser.parse_args()
 
-    model = PPO("MlpPolicy", QuadcopterVecEnv(48, seed=0), n_steps=250, batch_size=3000, seed=0, device="cpu")
+    model = PPO(
+        "MlpPolicy",
+        QuadcopterVecEnv(48, seed=0),
+        n_steps=250,
+        batch_size=3000,
+        seed=0,
+        device="cpu",
+    )
     stop = StopOnSignal("interrupted.zip")
     model.learn(arguments.timesteps, callback=stop)
     print(f"{model.num_timesteps:,} timesteps")

@@ -1,11 +1,14 @@
-"""The thesis's PID law in each way its text can be read: order of the Euler angles, frame of the velocity.
+"""The thesis's PID law in each way its text can be read: order of the Euler angles, frame of the
+velocity.
 
     python examples/thesis_readings.py
-    PYTHONPATH=examples sb3-quad evaluate ours=pid zxy_body=thesis_readings:zxy_body zyx_world=thesis_readings:zyx_world \
+    PYTHONPATH=examples sb3-quad evaluate ours=pid zxy_body=thesis_readings:zxy_body
+    zyx_world=thesis_readings:zyx_world \
         zxy_world=thesis_readings:zxy_world --suite thesis -o evaluations/readings
 
-Eq. 2.1 prints the order Z-X-Y and Eq. 2.9 the velocity of the world frame. ``PIDExpert`` takes Z-Y-X and the body frame;
-docs/choices.md tells why, with the figures of this command. Everything else is as there.
+Eq. 2.1 prints the order Z-X-Y and Eq. 2.9 the velocity of the world frame. ``PIDExpert`` takes
+Z-Y-X and the body frame; docs/choices.md tells why, with the figures of this command. Everything
+else is as there.
 """
 
 import numpy as np
@@ -23,7 +26,8 @@ ANGLE_FACTOR = 0.25  # 3.2.1
 class PIDReading(PIDExpert):
     """The PID law with a given order of angles and frame of the velocity.
 
-    :param order: ``zyx``, ``zxy`` or ``xyz``: body to world is the product of the three turns, the first one leftmost.
+    :param order: ``zyx``, ``zxy`` or ``xyz``: body to world is the product of the three turns, the
+        first one leftmost.
     :param frame: ``body`` or ``world``: the axes of the velocity in Eq. 2.9.
     """
 
@@ -35,20 +39,34 @@ class PIDReading(PIDExpert):
         """Actions in [-1, 1], float32 of shape (n, 4)."""
         vehicle, rotation = self.vehicle, state.rotation  # (n, 3, 3), body to world
         roll, pitch, yaw = euler_angles(rotation, self._order)
-        velocity = state.velocity if self._frame == "world" else np.einsum("nji,nj->ni", rotation, state.velocity)
+        velocity = (
+            state.velocity
+            if self._frame == "world"
+            else np.einsum("nji,nj->ni", rotation, state.velocity)
+        )
         error = state.target - state.position
         wanted = KP * error - KD * velocity
         sin, cos = np.sin(yaw), np.cos(yaw)
-        tilts = np.stack([wanted[:, 0] * sin - wanted[:, 1] * cos, wanted[:, 0] * cos + wanted[:, 1] * sin])
+        tilts = np.stack(
+            [wanted[:, 0] * sin - wanted[:, 1] * cos, wanted[:, 0] * cos + wanted[:, 1] * sin]
+        )
         angles = [*(ANGLE_FACTOR / vehicle.gravity * tilts - np.stack([roll, pitch])), -yaw]
-        turning = NATURAL_FREQUENCY**2 * np.stack(angles, 1) - 2 * DAMPING * NATURAL_FREQUENCY * state.body_rates
+        turning = (
+            NATURAL_FREQUENCY**2 * np.stack(angles, 1)
+            - 2 * DAMPING * NATURAL_FREQUENCY * state.body_rates
+        )
         height = wanted[:, 2] + KI * vehicle.control_step * error[:, 2]
         force = vehicle.mass * (vehicle.gravity + height)
-        thrusts = np.column_stack([force, np.asarray(vehicle.inertia) * turning]) @ vehicle.mixer_inverse.T
+        thrusts = (
+            np.column_stack([force, np.asarray(vehicle.inertia) * turning])
+            @ vehicle.mixer_inverse.T
+        )
         low, high = vehicle.thrust_range
         thrusts *= (high / np.maximum(thrusts.max(1), high))[:, None]
         half = (high - low) / 2
-        return np.asarray(np.clip((np.maximum(thrusts, low) - low) / half - 1, -1, 1), dtype=np.float32)
+        return np.asarray(
+            np.clip((np.maximum(thrusts, low) - low) / half - 1, -1, 1), dtype=np.float32
+        )
 
 
 def euler_angles(r: npt.NDArray[np.float64], order: str) -> tuple[npt.NDArray[np.float64], ...]:
@@ -58,10 +76,22 @@ def euler_angles(r: npt.NDArray[np.float64], order: str) -> tuple[npt.NDArray[np
         return np.asarray(np.arcsin(np.clip(x, -1, 1)))
 
     if order == "zyx":
-        return np.arctan2(r[:, 2, 1], r[:, 2, 2]), arcsin(-r[:, 2, 0]), np.arctan2(r[:, 1, 0], r[:, 0, 0])
+        return (
+            np.arctan2(r[:, 2, 1], r[:, 2, 2]),
+            arcsin(-r[:, 2, 0]),
+            np.arctan2(r[:, 1, 0], r[:, 0, 0]),
+        )
     if order == "zxy":
-        return arcsin(r[:, 2, 1]), np.arctan2(-r[:, 2, 0], r[:, 2, 2]), np.arctan2(-r[:, 0, 1], r[:, 1, 1])
-    return np.arctan2(-r[:, 1, 2], r[:, 2, 2]), arcsin(r[:, 0, 2]), np.arctan2(-r[:, 0, 1], r[:, 0, 0])
+        return (
+            arcsin(r[:, 2, 1]),
+            np.arctan2(-r[:, 2, 0], r[:, 2, 2]),
+            np.arctan2(-r[:, 0, 1], r[:, 1, 1]),
+        )
+    return (
+        np.arctan2(-r[:, 1, 2], r[:, 2, 2]),
+        arcsin(r[:, 0, 2]),
+        np.arctan2(-r[:, 0, 1], r[:, 0, 0]),
+    )
 
 
 def zyx_body(vehicle: str | Vehicle) -> PIDReading:
@@ -97,4 +127,6 @@ def xyz_world(vehicle: str | Vehicle) -> PIDReading:
 if __name__ == "__main__":
     for reading in (zyx_body, zyx_world, zxy_body, zxy_world, xyz_body, xyz_world):
         flights = fly(reading("itm"), "state_recovery", n_episodes=240, seed=0)
-        print(f"{reading.__name__}: {flights.survival.mean():.1%} of 240 recoveries survive (thesis: 29.48%)")
+        print(
+            f"{reading.__name__}: {flights.survival.mean():.1%} of 240 recoveries survive (thesis: 29.48%)"
+        )

@@ -1,13 +1,15 @@
-"""The least time in which a vehicle comes to a target: within 0.1 m of it, to stay and come to rest there.
+"""The least time in which a vehicle comes to a target: within 0.1 m of it, to stay and come to rest
+there.
 
     pip install casadi
     python examples/time_optimal.py itm
     python examples/time_optimal.py my.yaml --distances 10 20 --directions 12
 
-The vehicle hovers until the first command acts, which its delay puts off. Its rotors then turn up and down as fast as their
-motor gains and limits let them (Eq. 4.1). Direct collocation (Hermite-Simpson) of its full model, solved by IPOPT from the
-flight of its geometric expert: so each time is the least nearby, and a bound on what a controller can do only as far as no
-other kind of flight is quicker. The directions are spread evenly over the sphere.
+The vehicle hovers until the first command acts, which its delay puts off. Its rotors then turn up
+and down as fast as their motor gains and limits let them (Eq. 4.1). Direct collocation
+(Hermite-Simpson) of its full model, solved by IPOPT from the flight of its geometric expert: so
+each time is the least nearby, and a bound on what a controller can do only as far as no other kind
+of flight is quicker. The directions are spread evenly over the sphere.
 """
 
 import argparse
@@ -23,7 +25,13 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 NEAR, START = 0.1, 100.0  # m; the height of the start, so that no ground is below
 WAY, REST = 60, 20  # intervals until it is near, and from then to rest
 REST_TIME = 1.0  # s, at most
-STATES = {"position": 3, "quaternion": 4, "velocity": 3, "rates": 3, "speeds": 4}  # rotor speeds in those of hover
+STATES = {
+    "position": 3,
+    "quaternion": 4,
+    "velocity": 3,
+    "rates": 3,
+    "speeds": 4,
+}  # rotor speeds in those of hover
 
 
 def rates_of_change(vehicle: Vehicle) -> ca.Function:
@@ -44,12 +52,16 @@ def rates_of_change(vehicle: Vehicle) -> ca.Function:
     spin = (total[1:] - ca.cross(w, inertia * w)) / inertia
     turning = 0.5 * ca.vertcat(-ca.dot(q[1:], w), qw * w + ca.cross(q[1:], w))
     return ca.Function(
-        "f", [state, turn], [ca.vertcat(v, turning, force / vehicle.mass - ca.DM([0, 0, vehicle.gravity]), spin, turn)]
+        "f",
+        [state, turn],
+        [ca.vertcat(v, turning, force / vehicle.mass - ca.DM([0, 0, vehicle.gravity]), spin, turn)],
     )
 
 
 def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
-    """Seconds from hover until the vehicle has come near a target that lies ``way`` from it; infinite where IPOPT fails."""
+    """Seconds from hover until the vehicle has come near a target that lies ``way`` from it;
+    infinite where IPOPT fails.
+    """
     f, problem = rates_of_change(vehicle), ca.Opti()
     n, size = WAY + REST, sum(STATES.values())
     x, u, middle = problem.variable(size, n + 1), problem.variable(4, n + 1), problem.variable(4, n)
@@ -58,7 +70,10 @@ def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
     steps = ca.repmat(h, size, 1)
     slope = f.map(n + 1)(x, u)
     half = (x[:, :-1] + x[:, 1:]) / 2 + steps / 8 * (slope[:, :-1] - slope[:, 1:])
-    problem.subject_to(x[:, 1:] - x[:, :-1] == steps / 6 * (slope[:, :-1] + 4 * f.map(n)(half, middle) + slope[:, 1:]))
+    problem.subject_to(
+        x[:, 1:] - x[:, :-1]
+        == steps / 6 * (slope[:, :-1] + 4 * f.map(n)(half, middle) + slope[:, 1:])
+    )
     low, high = np.sqrt(vehicle.thrust_limits)
     for turn, speeds in ((u, x[13:, :]), (middle, half[13:, :])):
         problem.subject_to(ca.vec(turn - vehicle.motor_gain_up * (high - speeds)) <= 0)
@@ -76,7 +91,9 @@ def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
     guess, seconds = flight(vehicle, way)
     problem.set_initial(x, guess)
     problem.set_initial(durations, seconds)
-    problem.solver("ipopt", {"print_time": False}, {"print_level": 0, "max_iter": 1000, "sb": "yes"})
+    problem.solver(
+        "ipopt", {"print_time": False}, {"print_level": 0, "max_iter": 1000, "sb": "yes"}
+    )
     try:
         solution = problem.solve()
     except RuntimeError:
@@ -85,11 +102,21 @@ def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
 
 
 def flight(vehicle: Vehicle, way: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """The states of the geometric expert's flight at the ends of the intervals, and the durations of its two parts, s."""
+    """The states of the geometric expert's flight at the ends of the intervals, and the durations
+    of its two parts, s.
+    """
     settings = FlightSettings(
-        task_kwargs={"start_position": (0.0, 0.0, START)}, vehicle=vehicle, noise=0.0, max_episode_steps=3000
+        task_kwargs={"start_position": (0.0, 0.0, START)},
+        vehicle=vehicle,
+        noise=0.0,
+        max_episode_steps=3000,
     )
-    batch, expert, states, distance = QuadcopterBatch(1, settings, seed=0, autoreset=False), GeometricExpert(vehicle), [], []
+    batch, expert, states, distance = (
+        QuadcopterBatch(1, settings, seed=0, autoreset=False),
+        GeometricExpert(vehicle),
+        [],
+        [],
+    )
     batch.reset()
     start = batch.true_state().position[0].copy()
     batch.set_target(start + way)
@@ -100,7 +127,9 @@ def flight(vehicle: Vehicle, way: np.ndarray) -> tuple[np.ndarray, list[float]]:
         batch.step(expert.actions(batch.true_state()))
     near = int(np.flatnonzero(np.array(distance) > NEAR)[-1]) + 1
     seconds = [near * vehicle.control_step, 0.5 * REST_TIME]
-    at = np.concatenate([np.linspace(0, seconds[0], WAY + 1), seconds[0] + np.linspace(0, seconds[1], REST + 1)[1:]])
+    at = np.concatenate(
+        [np.linspace(0, seconds[0], WAY + 1), seconds[0] + np.linspace(0, seconds[1], REST + 1)[1:]]
+    )
     times = np.arange(len(states)) * vehicle.control_step
     return np.stack([np.interp(at, times, column) for column in np.array(states).T]), seconds
 
@@ -109,22 +138,33 @@ def directions(n: int) -> np.ndarray:
     """n unit vectors spread evenly over the sphere (Fibonacci), (n, 3)."""
     k = np.arange(n) + 0.5
     z, angle = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
-    return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1)
+    return np.stack(
+        [np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1
+    )
 
 
 def main() -> None:
     """Solve, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("vehicle", nargs="?", default="itm", help="name or YAML file (itm)")
-    parser.add_argument("--distances", type=float, nargs="+", default=[10.0, 20.0], help="m (10 20)")
+    parser.add_argument(
+        "--distances", type=float, nargs="+", default=[10.0, 20.0], help="m (10 20)"
+    )
     parser.add_argument("--directions", type=int, default=12, help="targets at each distance (12)")
     options = parser.parse_args()
     vehicle = load_vehicle(options.vehicle)
     for distance in options.distances:
-        times = np.array([least_time(vehicle, distance * each) for each in directions(options.directions)])
+        times = np.array(
+            [least_time(vehicle, distance * each) for each in directions(options.directions)]
+        )
         found = times[np.isfinite(times)]
         spread = f"{found.mean():.2f} s ({found.min():.2f} to {found.max():.2f})"
-        print(f"{vehicle.name}, {distance:g} m: {spread}, {found.size} of {times.size} directions solved", flush=True)
+        print(
+            f"{vehicle.name}, {distance:g} m: {spread}, {found.size} of {times.size} directions solved",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""Stage one of the thesis: an agent learns from the PID expert to fly to targets (DAgger), then both fly.
+"""Stage one of the thesis: an agent learns from the PID expert to fly to targets (DAgger), then
+both fly.
 
 python examples/train_dagger.py
 """
@@ -13,8 +14,15 @@ from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings
 
-parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+parser = argparse.ArgumentParser(
+    description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+)
+parser.add_argument(
+    "--timesteps",
+    type=int,
+    default=600_000,
+    help="transitions, over all environments (%(default)s)",
+)
 parser.add_argument("--output", default="dagger.zip", help="where the agent goes (%(default)s)")
 arguments = parser.parse_args()
 
@@ -34,11 +42,15 @@ model = DAgger(
     device="cpu",
 )
 FlightSettings().write_into(model)  # so that the zip says how its agent flies: ITM, 18 features
-model.learn(arguments.timesteps, callback=StopOnSignal(arguments.output))  # Ctrl-C ends it and saves
+model.learn(
+    arguments.timesteps, callback=StopOnSignal(arguments.output)
+)  # Ctrl-C ends it and saves
 model.save(arguments.output)
 
 for task in ("state_recovery", "target_tracking"):
     for name, controller in (("expert", PIDExpert()), ("agent", model)):
         flights = fly(controller, task, n_episodes=480, seed=1_000_000)
-        print(f"{name}, {task}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}")
+        print(
+            f"{name}, {task}: success {flights.success.mean():.1%}, survival {flights.survival.mean():.1%}"
+        )
 print(f"saved to {arguments.output}")

@@ -29,16 +29,19 @@ from sb3_quad.simulation.settings import FlightSettings
 
 
 class TrajectoryPlots(EveryTimesteps):
-    """Flies a few episodes every ``every`` timesteps and logs them as ``flights/figure``: path, error, actions.
+    """Flies a few episodes every ``every`` timesteps and logs them as ``flights/figure``: path,
+    error, actions.
 
-    It works with any algorithm whose policy flies on the quadcopter's own observation. The flights are deterministic, the
-    same each time, and separate from the training: neither its environments nor its random numbers are touched.
+    It works with any algorithm whose policy flies on the quadcopter's own observation. The flights
+    are deterministic, the same each time, and separate from the training: neither its environments
+    nor its random numbers are touched.
 
     :param every: timesteps between plots.
     :param n_flights: episodes in a plot.
     :param seed: of the flights.
     :param max_steps: control steps after which an episode ends at the latest.
-    :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as ``task`` and ``vehicle``.
+    :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as
+        ``task`` and ``vehicle``.
     :raises ConfigError: ``every`` or ``n_flights`` below 1, or an unknown keyword.
     """
 
@@ -69,13 +72,23 @@ def _plot(flights: Arrays) -> Picture:
     picture = Picture(figsize=(13, 4), layout="constrained")
     space: Any = picture.add_subplot(1, 3, 1, projection="3d")
     space.set(xlabel="x (m)", ylabel="y (m)", zlabel="z (m)", title="paths and targets")
-    error = picture.add_subplot(1, 3, 2, xlabel="time (s)", ylabel="distance from target (m)", title="error")
-    actions = picture.add_subplot(1, 3, 3, xlabel="time (s)", ylabel="action", title="actions of flight 0", ylim=(-1.05, 1.05))
-    for number, (position, target) in enumerate(zip(flights["position"], flights["target"], strict=True)):
+    error = picture.add_subplot(
+        1, 3, 2, xlabel="time (s)", ylabel="distance from target (m)", title="error"
+    )
+    actions = picture.add_subplot(
+        1, 3, 3, xlabel="time (s)", ylabel="action", title="actions of flight 0", ylim=(-1.05, 1.05)
+    )
+    for number, (position, target) in enumerate(
+        zip(flights["position"], flights["target"], strict=True)
+    ):
         space.plot(*position.T, color=f"C{number}")
         space.plot(*target[:1].T, color=f"C{number}", marker="D")
-        error.plot(flights["time"], np.linalg.norm(position - target, axis=1), label=f"flight {number}")
-    actions.plot(flights["time"], flights["action"][0], label=[f"rotor {rotor}" for rotor in range(4)])
+        error.plot(
+            flights["time"], np.linalg.norm(position - target, axis=1), label=f"flight {number}"
+        )
+    actions.plot(
+        flights["time"], flights["action"][0], label=[f"rotor {rotor}" for rotor in range(4)]
+    )
     space.set_aspect("equal", adjustable="datalim")
     for axes in (error, actions):
         axes.grid(alpha=0.3)
@@ -84,8 +97,15 @@ def _plot(flights: Arrays) -> Picture:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--timesteps", type=int, default=600_000, help="transitions, over all environments (%(default)s)")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--timesteps",
+        type=int,
+        default=600_000,
+        help="transitions, over all environments (%(default)s)",
+    )
     arguments = parser.parse_args()
 
     env = QuadcopterVecEnv(240, task="state_recovery", max_episode_steps=500, seed=0)

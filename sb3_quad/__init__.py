@@ -1,10 +1,12 @@
-"""Quadcopter environments, experts, DAgger, and PPO and SAC with behavioural cloning for Stable-Baselines3."""
+"""Quadcopter environments, experts, DAgger, and PPO and SAC with behavioural cloning for
+Stable-Baselines3.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie beside this folder rather than inside it; an installed
-# package holds them inside, and then this does nothing.
+# In a checkout, `envs/`, `callbacks/` and `zoo_configs/` lie beside this folder rather than inside
+# it; an installed package holds them inside, and then this does nothing.
 _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
     __path__.append(str(_checkout))

@@ -1,4 +1,6 @@
-"""What every test starts from (the CPU, one thread of torch, fixed seeds, no display), and small agents to fly and read."""
+"""What every test starts from (the CPU, one thread of torch, fixed seeds, no display), and small
+agents to fly and read.
+"""
 
 import importlib.abc
 import importlib.util
@@ -9,7 +11,9 @@ import signal
 import sys
 from pathlib import Path
 
-os.environ["CUDA_VISIBLE_DEVICES"] = ""  # read when torch is imported; the tests are the same on every machine
+os.environ["CUDA_VISIBLE_DEVICES"] = (
+    ""  # read when torch is imported; the tests are the same on every machine
+)
 os.environ["MPLBACKEND"] = "Agg"
 
 import numpy as np
@@ -17,12 +21,29 @@ import pytest
 import torch
 from hypothesis import settings
 
-# The first example of a test may compile, so no deadline. The same examples every time, except in `make fuzz`.
-settings.register_profile("fuzz", deadline=None, derandomize=False, max_examples=1000, print_blob=True)
-settings.register_profile("default", deadline=None, derandomize=True, database=None, max_examples=20, print_blob=True)
+# The first example of a test may compile, so no deadline. The same examples every time, except in
+# `make fuzz`.
+settings.register_profile(
+    "fuzz", deadline=None, derandomize=False, max_examples=1000, print_blob=True
+)
+settings.register_profile(
+    "default", deadline=None, derandomize=True, database=None, max_examples=20, print_blob=True
+)
 settings.load_profile("default")
 
-TINY = ["--n-envs", "16", "-n", "1600", "--eval-episodes", "2", "--eval-freq", "800", "--no-progress", "--num-threads", "1"]
+TINY = [
+    "--n-envs",
+    "16",
+    "-n",
+    "1600",
+    "--eval-episodes",
+    "2",
+    "--eval-freq",
+    "800",
+    "--no-progress",
+    "--num-threads",
+    "1",
+]
 HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
     "dagger": ["n_steps:50", "gradient_steps:2", "batch_size:64"],
     "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
@@ -31,7 +52,9 @@ HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
 
 
 class WithoutPyBullet(importlib.abc.MetaPathFinder):
-    """Where there is no PyBullet, skips what imports it: a test, or a file of them. test_without_pybullet.py has the rest."""
+    """Where there is no PyBullet, skips what imports it: a test, or a file of them.
+    test_without_pybullet.py has the rest.
+    """
 
     def find_spec(self, name, path=None, target=None):
         if name in ("pybullet", "sb3_quad.base.bullet"):
@@ -43,15 +66,21 @@ if importlib.util.find_spec("pybullet") is None:
 
 
 def pytest_configure():
-    """Under nohup, or in a shell's background, signals are ignored, also by the programs that are started from here."""
+    """Under nohup, or in a shell's background, signals are ignored, also by the programs that are
+    started from here.
+    """
     for number in (signal.SIGINT, signal.SIGHUP):
         if signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+            signal.signal(
+                number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
+            )
 
 
 @pytest.fixture(autouse=True)
 def same_start(monkeypatch):
-    """Sums come out the same on any number of cores, global generators start from the same seed, closing tables are small."""
+    """Sums come out the same on any number of cores, global generators start from the same seed,
+    closing tables are small.
+    """
     torch.set_num_threads(1)
     random.seed(0)
     np.random.seed(0)  # noqa: NPY002 - SB3's buffers draw from it
@@ -63,14 +92,26 @@ def same_start(monkeypatch):
 def _trained(algo: str, folder: Path) -> Path:
     from sb3_quad.cli import main
 
-    command = ["train", "--algo", algo, "--env", "QuadStateRecovery-v0", "--conf-file", f"nominal/{algo}.yml", "--seed", "3"]
+    command = [
+        "train",
+        "--algo",
+        algo,
+        "--env",
+        "QuadStateRecovery-v0",
+        "--conf-file",
+        f"nominal/{algo}.yml",
+        "--seed",
+        "3",
+    ]
     assert main([*command, "-f", str(folder), *TINY, "--hyperparams", *HYPERPARAMS[algo]]) == 0
     return folder / algo / "QuadStateRecovery-v0_1"
 
 
 @pytest.fixture(scope="session")
 def trained_runs(tmp_path_factory):
-    """By an algorithm's name, the folder of a tiny run of it, trained when it is first asked for; to be read, not written."""
+    """By an algorithm's name, the folder of a tiny run of it, trained when it is first asked for;
+    to be read, not written.
+    """
     folder, found = tmp_path_factory.mktemp("logs"), {}
 
     def run(algo: str) -> Path:
@@ -91,7 +132,9 @@ def dagger_run(trained_runs, tmp_path):
 
 @pytest.fixture(scope="session")
 def results_folder(tmp_path_factory):
-    """The results of evaluating two experts on a suite of two short scenarios; to be read, not written."""
+    """The results of evaluating two experts on a suite of two short scenarios; to be read, not
+    written.
+    """
     from sb3_quad.cli import main
 
     folder = tmp_path_factory.mktemp("results")
@@ -99,7 +142,10 @@ def results_folder(tmp_path_factory):
     scenarios = "[{name: hover, duration: 0.5, episodes: 3}, {name: far, target: [1, 0, 15], duration: 1, episodes: 2}]"
     suite.write_text(f"{{name: small, scenarios: {scenarios}}}")
     out = folder / "out"
-    assert main(["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out), "--no-report"]) == 0
+    assert (
+        main(["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out), "--no-report"])
+        == 0
+    )
     return out
 
 

@@ -38,7 +38,13 @@ class Walk(gymnasium.Env):
 
     def step(self, action):
         self.steps += 1
-        return self._observation(), float(action[0]), False, self.steps == 10, {"is_success": bool(action[0] > 0)}
+        return (
+            self._observation(),
+            float(action[0]),
+            False,
+            self.steps == 10,
+            {"is_success": bool(action[0] > 0)},
+        )
 
     def _observation(self):
         return self.np_random.uniform(-1, 1, 2).astype(np.float32)
@@ -47,11 +53,28 @@ class Walk(gymnasium.Env):
 def make_model(algorithm=PPO, n_envs=2, **kwargs):
     size = {"batch_size": 20} if algorithm is PPO else {}
     env = make_vec_env(Walk, n_envs)
-    return algorithm("MlpPolicy", env, n_steps=20, policy_kwargs={"net_arch": [4]}, seed=0, device="cpu", **size, **kwargs)
+    return algorithm(
+        "MlpPolicy",
+        env,
+        n_steps=20,
+        policy_kwargs={"net_arch": [4]},
+        seed=0,
+        device="cpu",
+        **size,
+        **kwargs,
+    )
 
 
 def make_best(tmp_path, every=1000, **kwargs):
-    return BestModel(make_vec_env(Walk, 2), every, 4, 5, tmp_path / "best_model.zip", tmp_path / "evaluations.npz", **kwargs)
+    return BestModel(
+        make_vec_env(Walk, 2),
+        every,
+        4,
+        5,
+        tmp_path / "best_model.zip",
+        tmp_path / "evaluations.npz",
+        **kwargs,
+    )
 
 
 def test_evaluations_are_regular_and_recorded(tmp_path):
@@ -62,7 +85,9 @@ def test_evaluations_are_regular_and_recorded(tmp_path):
     make_model().learn(60, callback=best)
     with np.load(tmp_path / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [60, 120, 160, 60, 80]  # whole rollouts
-        assert file["results"].shape == file["successes"].shape == file["ep_lengths"].shape == (5, 4)
+        assert (
+            file["results"].shape == file["successes"].shape == file["ep_lengths"].shape == (5, 4)
+        )
         assert (np.diff(file["seconds"]) >= 0).all()
         means = file["results"].mean(axis=1), file["successes"].mean(axis=1)
     assert best.best == max(zip(means[1].tolist(), means[0].tolist(), strict=True))
@@ -86,11 +111,17 @@ def test_tensorboard_shows_every_evaluation_where_it_happened(tmp_path):
 
 
 def test_the_final_error_is_the_median_of_the_flights_that_are_not_lost(tmp_path):
-    how = {"task_kwargs": {"start_position": (0, 0, 0.5), "target_distance": 1.0, "velocity_std": 2.0}}
+    how = {
+        "task_kwargs": {"start_position": (0, 0, 0.5), "target_distance": 1.0, "velocity_std": 2.0}
+    }
     env = QuadcopterVecEnv(8, max_episode_steps=50, **how)
-    model = PPO("MlpPolicy", env, n_steps=10, batch_size=80, device="cpu", tensorboard_log=str(tmp_path))
+    model = PPO(
+        "MlpPolicy", env, n_steps=10, batch_size=80, device="cpu", tensorboard_log=str(tmp_path)
+    )
     lines = []
-    best = BestModel(env, 1000, 8, 5, tmp_path / "best.zip", tmp_path / "evaluations.npz", lines.append)
+    best = BestModel(
+        env, 1000, 8, 5, tmp_path / "best.zip", tmp_path / "evaluations.npz", lines.append
+    )
     model.learn(80, callback=best)
     flown = fly(model, n_episodes=8, seed=5, max_steps=50, **how)
     assert 0 < flown.survival.sum() < 8
@@ -128,9 +159,14 @@ def test_other_environments_are_evaluated_at_the_same_times_and_decide_nothing(t
     best = make_best(tmp_path / "both", every=40, others={"far": make_vec_env(lambda: Walk(), 2)})
     make_model().learn(80, callback=best)
     assert best.best == alone.best
-    with np.load(tmp_path / "both" / "evaluations.npz") as own, np.load(tmp_path / "both" / "evaluations_far.npz") as far:
+    with (
+        np.load(tmp_path / "both" / "evaluations.npz") as own,
+        np.load(tmp_path / "both" / "evaluations_far.npz") as far,
+    ):
         assert own["timesteps"].tolist() == far["timesteps"].tolist() == [40, 80]
-        np.testing.assert_array_equal(own["results"], far["results"])  # here the same environment, so the same episodes
+        np.testing.assert_array_equal(
+            own["results"], far["results"]
+        )  # here the same environment, so the same episodes
 
 
 def test_a_training_that_goes_on_keeps_to_the_multiples(tmp_path):
@@ -186,18 +222,27 @@ class Signal(BaseCallback):
         return True
 
 
-@pytest.mark.parametrize(("algorithm", "number", "exit_code"), [(PPO, signal.SIGINT, 130), (SAC, signal.SIGTERM, 143)])
-def test_a_signal_ends_the_training_after_the_step_and_saves(tmp_path, capsys, algorithm, number, exit_code):
+@pytest.mark.parametrize(
+    ("algorithm", "number", "exit_code"), [(PPO, signal.SIGINT, 130), (SAC, signal.SIGTERM, 143)]
+)
+def test_a_signal_ends_the_training_after_the_step_and_saves(
+    tmp_path, capsys, algorithm, number, exit_code
+):
     handlers = [signal.getsignal(each) for each in (signal.SIGINT, signal.SIGTERM)]
     if algorithm is SAC:
-        model = SAC("MlpPolicy", make_vec_env(Walk, 2), policy_kwargs={"net_arch": [4]}, device="cpu")
+        model = SAC(
+            "MlpPolicy", make_vec_env(Walk, 2), policy_kwargs={"net_arch": [4]}, device="cpu"
+        )
     else:
         model = make_model(algorithm)
     stop = StopOnSignal(tmp_path / "model.zip")
     model.learn(40, callback=stop)
     assert (stop.signal, stop.exit_code) == ("", 0) and not list(tmp_path.iterdir())
     model.learn(1000, callback=[Signal(number, 50), stop])
-    assert model.num_timesteps == 50 and (stop.signal, stop.exit_code) == (signal.Signals(number).name, exit_code)
+    assert model.num_timesteps == 50 and (stop.signal, stop.exit_code) == (
+        signal.Signals(number).name,
+        exit_code,
+    )
     assert f"{stop.signal} after 50 timesteps" in capsys.readouterr().out
     assert [entry.name for entry in tmp_path.iterdir()] == ["model.zip"]
     saved = algorithm.load(tmp_path / "model.zip", device="cpu")

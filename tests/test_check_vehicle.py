@@ -1,4 +1,6 @@
-"""What a vehicle can do by its parameters alone, checked by trying it; and the command that tells of it."""
+"""What a vehicle can do by its parameters alone, checked by trying it; and the command that tells
+of it.
+"""
 
 import re
 
@@ -31,14 +33,20 @@ def test_no_thrusts_within_the_limits_give_more(name, actions):
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])
 def test_the_environment_accelerates_as_the_parameters_say(name):
-    """Full thrust upwards once the motors have settled; full roll for as long as it turns below 100 rad/s, so not quite."""
+    """Full thrust upwards once the motors have settled; full roll for as long as it turns below 100
+    rad/s, so not quite.
+    """
     vehicle = load_vehicle(name)
     greatest = vehicle.greatest_moments / vehicle.inertia
     batch = QuadcopterBatch(1, FlightSettings(vehicle=vehicle, noise=0.0), seed=0)
     climbing = accelerations(batch, np.ones((1, 4), dtype=np.float32), 9, 80)
-    assert climbing[-1] == pytest.approx(vehicle.gravity * (vehicle.thrust_limits[1] - 1.0), rel=1e-3)
+    assert climbing[-1] == pytest.approx(
+        vehicle.gravity * (vehicle.thrust_limits[1] - 1.0), rel=1e-3
+    )
     for axis in range(3):
-        turning = accelerations(batch, np.sign(vehicle.mixer[None, 1 + axis]).astype(np.float32), 10 + axis, 20)
+        turning = accelerations(
+            batch, np.sign(vehicle.mixer[None, 1 + axis]).astype(np.float32), 10 + axis, 20
+        )
         assert 0.85 * greatest[axis] < turning.max() <= greatest[axis] * (1 + 1e-9)
 
 
@@ -46,7 +54,10 @@ def test_the_table_says_what_the_parameters_give(capsys):
     assert main(["check-vehicle", "cf2x_L250", "-n", "0"]) == 0
     vehicle, text = load_vehicle("cf2x_L250"), capsys.readouterr().out
     assert f"up {vehicle.gravity * (vehicle.thrust_limits[1] - 1.0):.1f}, down while level" in text
-    assert f"{1000 / vehicle.motor_gain_up:.1f} ms up, {1000 / vehicle.motor_gain_down:.1f} ms down" in text
+    assert (
+        f"{1000 / vehicle.motor_gain_up:.1f} ms up, {1000 / vehicle.motor_gain_down:.1f} ms down"
+        in text
+    )
 
 
 def accelerations(batch, action, row, steps):
@@ -79,35 +90,66 @@ def test_warnings_are_about_units():
 
 def written(path, **changes):
     data = {**ITM.model_dump(mode="json", exclude={"geometric_gains"}), **changes}
-    path.write_text(yaml.safe_dump({key: value for key, value in data.items() if value is not None}))
+    path.write_text(
+        yaml.safe_dump({key: value for key, value in data.items() if value is not None})
+    )
     return str(path)
 
 
 def test_it_tells_what_a_vehicle_can_do_and_how_the_experts_fly_it(tmp_path, capsys):
-    own = written(tmp_path / "own.yaml", name="own", mass=1.5, thrust_limits=None, rotor_thrust_limits=[2.0, 6.0])
+    own = written(
+        tmp_path / "own.yaml",
+        name="own",
+        mass=1.5,
+        thrust_limits=None,
+        rotor_thrust_limits=[2.0, 6.0],
+    )
     assert main(["check-vehicle", own, "-n", "24"]) == 0
     printed = capsys.readouterr().out
     vehicle = load_vehicle(own)
-    assert f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed and "physical" in printed and "tune_expert" in printed
-    assert ", ".join(f"{each:.1f}" for each in vehicle.greatest_moments / vehicle.inertia) + " rad/s²" in printed
-    assert re.search(r"success, % +│ +\S+ \(.* 100\.0 \(", printed) and "mean time to 0.1 m" in printed
+    assert (
+        f"thrust-to-weight ratio {24 / (1.5 * 9.81):.2f}" in printed
+        and "physical" in printed
+        and "tune_expert" in printed
+    )
+    assert (
+        ", ".join(f"{each:.1f}" for each in vehicle.greatest_moments / vehicle.inertia) + " rad/s²"
+        in printed
+    )
+    assert (
+        re.search(r"success, % +│ +\S+ \(.* 100\.0 \(", printed) and "mean time to 0.1 m" in printed
+    )
     assert "thesis" not in printed  # its figures are of another vehicle
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])
-@pytest.mark.parametrize("limits", [{}, {"thrust_limits": None, "rotor_thrust_limits": [0.02, 9.0]}])
+@pytest.mark.parametrize(
+    "limits", [{}, {"thrust_limits": None, "rotor_thrust_limits": [0.02, 9.0]}]
+)
 def test_a_mass_in_grams_is_blamed_on_the_mass_and_leaves_with_1(name, limits, tmp_path, capsys):
-    vehicle = load_vehicle(name).model_copy(update={"name": "grams"}).model_dump(mode="json", exclude={"geometric_gains"})
-    grams = written(tmp_path / "grams.yaml", **{**vehicle, **limits, "mass": 1000 * vehicle["mass"]})
+    vehicle = (
+        load_vehicle(name)
+        .model_copy(update={"name": "grams"})
+        .model_dump(mode="json", exclude={"geometric_gains"})
+    )
+    grams = written(
+        tmp_path / "grams.yaml", **{**vehicle, **limits, "mass": 1000 * vehicle["mass"]}
+    )
     assert main(["check-vehicle", grams, "-n", "0"]) == 1
     error = capsys.readouterr().err
     assert (
-        error.startswith("cannot hover") and "grams.yaml" in error and "is the mass in kg" in error and "inertia" not in error
+        error.startswith("cannot hover")
+        and "grams.yaml" in error
+        and "is the mass in kg" in error
+        and "inertia" not in error
     )
 
 
 def test_bad_files_leave_with_2(tmp_path, capsys):
-    for changes, message in (({"mas": 1.0}, "did you mean 'mass'"), ({"inertia": [0.1, 0.1, 0.5]}, "no rigid body")):
+    for changes, message in (
+        ({"mas": 1.0}, "did you mean 'mass'"),
+        ({"inertia": [0.1, 0.1, 0.5]}, "no rigid body"),
+    ):
         path = written(tmp_path / "bad.yaml", **changes)
         assert main(["check-vehicle", path]) == 2
         error = capsys.readouterr().err

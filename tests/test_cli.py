@@ -1,4 +1,6 @@
-"""The command line: light until a command runs, nothing lost on interruption, a run that resumes as if nothing was."""
+"""The command line: light until a command runs, nothing lost on interruption, a run that resumes as
+if nothing was.
+"""
 
 import os
 import re
@@ -78,11 +80,17 @@ def settings_file(tmp_path):
 
 def job(tmp_path, algo="dagger", **changes):
     settings = {**(SMALL_DAGGER if algo == "dagger" else SMALL), **changes}
-    return TrainingJob(config=build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0)
+    return TrainingJob(
+        config=build_config(algo, ENV, settings), log_folder=str(tmp_path / "logs"), eval_episodes=0
+    )
 
 
 def one_line_of_error(capsys) -> str:
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("sb3_quad: compiling")]
+    lines = [
+        line
+        for line in capsys.readouterr().err.splitlines()
+        if not line.startswith("sb3_quad: compiling")
+    ]
     assert len(lines) == 1, lines
     assert lines[0].startswith("error: "), lines
     return lines[0]
@@ -100,29 +108,74 @@ def test_help_has_examples_and_needs_no_torch_nor_does_a_missing_agent():
         "codes.append(main(['train', '-i', 'missing.zip']) != 2)\n"
         "sys.exit(any(codes) or bool({'torch', 'numba', 'matplotlib', 'rich'} & sys.modules.keys()))"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False
+    )
     assert result.returncode == 0, result.stderr
     assert result.stdout.count("examples:") == 1 + len(COMMANDS) and "exit codes:" in result.stdout
 
 
 def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
-    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path / "logs"), "--no-progress"]
-    more = ["--eval-freq", "400", "--eval-episodes", "4", "--save-freq", "800", "--env-kwargs", "noise:0.1", "--seed", "3"]
+    arguments = [
+        "train",
+        "--algo",
+        "dagger",
+        "--conf-file",
+        settings_file,
+        "-f",
+        str(tmp_path / "logs"),
+        "--no-progress",
+    ]
+    more = [
+        "--eval-freq",
+        "400",
+        "--eval-episodes",
+        "4",
+        "--save-freq",
+        "800",
+        "--env-kwargs",
+        "noise:0.1",
+        "--seed",
+        "3",
+    ]
     more += ["--hyperparams", "eval_tasks:state_recovery"]
     assert main(arguments + more) == 0
     output = capsys.readouterr().out
     run = tmp_path / "logs" / "dagger" / f"{ENV}_1"
-    for part in ("agent", "expert", "thesis", "success", "mean time to 0.1 m", "mean path", "trained in", str(run)):
+    for part in (
+        "agent",
+        "expert",
+        "thesis",
+        "success",
+        "mean time to 0.1 m",
+        "mean path",
+        "trained in",
+        str(run),
+    ):
         assert part in output
     files = {str(path.relative_to(run)) for path in run.rglob("*") if path.is_file()}
     assert files == {
-        *(f"{ENV}.zip", "best_model.zip", "rl_model_800_steps.zip", "evaluations.npz", "0.monitor.csv"),
-        *("evaluations_state_recovery.npz", f"{ENV}/config.yml", f"{ENV}/args.yml", f"{ENV}/command.txt"),
+        *(
+            f"{ENV}.zip",
+            "best_model.zip",
+            "rl_model_800_steps.zip",
+            "evaluations.npz",
+            "0.monitor.csv",
+        ),
+        *(
+            "evaluations_state_recovery.npz",
+            f"{ENV}/config.yml",
+            f"{ENV}/args.yml",
+            f"{ENV}/command.txt",
+        ),
     }
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == 1200
     arguments_file = yaml.safe_load((run / ENV / "args.yml").read_text())
     assert arguments_file["seed"] == 3
-    assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {"max_episode_steps": 60, "noise": 0.1}
+    assert yaml.safe_load((run / ENV / "config.yml").read_text())["env_kwargs"] == {
+        "max_episode_steps": 60,
+        "noise": 0.1,
+    }
     with np.load(run / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [400, 800, 1200]
     lines = [line for line in output.splitlines() if " timesteps, " in line and " s: " in line]
@@ -131,7 +184,9 @@ def test_a_run_from_beginning_to_end(tmp_path, settings_file, capsys):
 
 @pytest.mark.parametrize("vec_env", ["batch", pytest.param("dummy", marks=pytest.mark.slow)])
 def test_episodes_end_at_all_ages_from_the_first_rollout_on(tmp_path, vec_env):
-    result = train(job(tmp_path, vec_env=vec_env, n_timesteps=400), report=lambda line: None)  # 50 steps of at most 60
+    result = train(
+        job(tmp_path, vec_env=vec_env, n_timesteps=400), report=lambda line: None
+    )  # 50 steps of at most 60
     assert load_results(str(result.run.path)).l.tolist() == [8, 15, 23, 30, 38, 45]
     assert [info["l"] for info in result.model.ep_info_buffer] == [8, 15, 23, 30, 38, 45]
 
@@ -146,13 +201,32 @@ def test_the_last_update_learns(tmp_path, n_timesteps, last):
 def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.delenv("DISPLAY", raising=False)
-    assert main(["train", "--algo", "dagger", "--conf-file", settings_file, "--eval-episodes", "0", "--no-progress"]) == 0
+    assert (
+        main(
+            [
+                "train",
+                "--algo",
+                "dagger",
+                "--conf-file",
+                settings_file,
+                "--eval-episodes",
+                "0",
+                "--no-progress",
+            ]
+        )
+        == 0
+    )
     lines = capsys.readouterr().out.split("next:\n")[1].splitlines()
     agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
     for line, more, made in zip(
         lines,
         ([], [], ["--episodes", "2", "--no-report"], ["-o", "agent.pt"]),
-        (f"dagger_{ENV}_1.png", f"dagger_{ENV}_1.html", f"evaluations/dagger_{ENV}_1/results.json", "agent.pt"),
+        (
+            f"dagger_{ENV}_1.png",
+            f"dagger_{ENV}_1.html",
+            f"evaluations/dagger_{ENV}_1/results.json",
+            "agent.pt",
+        ),
         strict=True,
     ):
         words = shlex.split(line)
@@ -165,15 +239,22 @@ def test_the_commands_after_a_training_can_be_pasted(tmp_path, settings_file, ca
 @pytest.mark.parametrize("vec_env", ["dummy", pytest.param("subproc", marks=pytest.mark.slow)])
 def test_pybullet_gives_the_same_run_as_the_batch(tmp_path, vec_env):
     changes = {"n_timesteps": 200, "n_envs": 2, "env_kwargs": {"noise": 0, "max_episode_steps": 60}}
-    models = [train(job(tmp_path, vec_env=kind, **changes), report=lambda line: None).model for kind in ("batch", vec_env)]
-    for ours, theirs in zip(models[0].policy.parameters(), models[1].policy.parameters(), strict=True):
+    models = [
+        train(job(tmp_path, vec_env=kind, **changes), report=lambda line: None).model
+        for kind in ("batch", vec_env)
+    ]
+    for ours, theirs in zip(
+        models[0].policy.parameters(), models[1].policy.parameters(), strict=True
+    ):
         torch.testing.assert_close(ours, theirs, rtol=1e-3, atol=1e-5)
 
 
 def test_other_environments_train_too(tmp_path):
     settings = {"n_timesteps": 128, "n_envs": 2, "n_steps": 32, "batch_size": 32}
     config, lines = build_config("ppo", "Pendulum-v1", settings), []
-    result = train(TrainingJob(config=config, log_folder=str(tmp_path), eval_episodes=1), report=lines.append)
+    result = train(
+        TrainingJob(config=config, log_folder=str(tmp_path), eval_episodes=1), report=lines.append
+    )
     assert PPO.load(result.run.model).num_timesteps == 128
     assert result.run.best_model.is_file() and "successes" not in np.load(result.run.evaluations)
     (line,) = lines
@@ -183,8 +264,20 @@ def test_other_environments_train_too(tmp_path):
 
 @pytest.mark.slow
 def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
-    """In a process of its own, as a shell would send it; SIGTERM is sent by the tests of resumption."""
-    arguments = ["train", "--algo", "dagger", "--conf-file", settings_file, "-f", str(tmp_path), "-n", "1e9"]
+    """In a process of its own, as a shell would send it; SIGTERM is sent by the tests of
+    resumption.
+    """
+    arguments = [
+        "train",
+        "--algo",
+        "dagger",
+        "--conf-file",
+        settings_file,
+        "-f",
+        str(tmp_path),
+        "-n",
+        "1e9",
+    ]
     process = subprocess.Popen(
         [sys.executable, "-m", "sb3_quad.cli", *arguments, "--eval-episodes", "0"],
         stdout=subprocess.PIPE,
@@ -206,7 +299,9 @@ def test_ctrl_c_saves_the_model_and_says_where(tmp_path, settings_file):
     assert PPO.load(saved).num_timesteps > 0
 
 
-@pytest.mark.parametrize(("algo", "after"), [("dagger", 8), ("dagger", 900), ("ppo", 1000), ("ppo_bc", 900)])
+@pytest.mark.parametrize(
+    ("algo", "after"), [("dagger", 8), ("dagger", 900), ("ppo", 1000), ("ppo_bc", 900)]
+)
 def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after):
     interruption = {"test_cli.Interrupt": {"after": after}}
     Interrupt.sent = True
@@ -225,20 +320,32 @@ def test_a_resumed_run_equals_one_that_was_not_interrupted(tmp_path, algo, after
     ours, theirs = again.model.get_parameters(), whole.model.get_parameters()
     for name, tensor in theirs["policy"].items():
         assert torch.equal(tensor, ours["policy"][name]), name
-    assert str(ours["policy.optimizer"]["param_groups"]) == str(theirs["policy.optimizer"]["param_groups"])
+    assert str(ours["policy.optimizer"]["param_groups"]) == str(
+        theirs["policy.optimizer"]["param_groups"]
+    )
     assert not again.run.resume_state.exists()
 
 
-def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_path, monkeypatch, capsys):
+def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(
+    tmp_path, monkeypatch, capsys
+):
     std = [2.0] * 18
     (tmp_path / "heavy.yaml").write_text(
         load_vehicle("itm").model_copy(update={"mass": 1.6, "name": "heavy"}).model_dump_json()
     )
     own = {"vehicle": str(tmp_path / "heavy.yaml"), "observation_std": std, "max_episode_steps": 40}
     config = build_config(
-        "ppo", "QuadStateRecovery-v0", {**SMALL, "n_timesteps": 800, "env_kwargs": own, "eval_env_kwargs": {"noise": 0}}
+        "ppo",
+        "QuadStateRecovery-v0",
+        {**SMALL, "n_timesteps": 800, "env_kwargs": own, "eval_env_kwargs": {"noise": 0}},
     )
-    job = TrainingJob(config=config, log_folder=str(tmp_path / "logs"), eval_freq=400, eval_episodes=2, save_freq=400)
+    job = TrainingJob(
+        config=config,
+        log_folder=str(tmp_path / "logs"),
+        eval_freq=400,
+        eval_episodes=2,
+        save_freq=400,
+    )
     run = train(job, report=lambda line: None).run
     (tmp_path / "heavy.yaml").unlink()
     zips = list(run.path.glob("*.zip"))
@@ -248,20 +355,40 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
         mailed.write_bytes(path.read_bytes())
         settings, source = agent_settings(mailed)
         assert source == mailed and (settings.vehicle.mass, settings.vehicle.name) == (1.6, "heavy")
-        assert (settings.task, settings.noise, settings.observation_std) == ("state_recovery", 0, std)
+        assert (settings.task, settings.noise, settings.observation_std) == (
+            "state_recovery",
+            0,
+            std,
+        )
     monkeypatch.chdir(tmp_path)
     assert agent_path(str(run.path)) == str(run.best_model)
     assert main(["enjoy", "mailed_best_model.zip", "--no-render"]) == 0
     output = capsys.readouterr()
     assert "0.40 s" in output.out and not output.err.count("warning")
     assert main(["enjoy", str(run.path), "--no-render", "--env-kwargs", "vehicle:itm"]) == 0
-    assert f"{run.path.name}: was trained on the vehicle heavy and flies itm" in capsys.readouterr().err
+    assert (
+        f"{run.path.name}: was trained on the vehicle heavy and flies itm"
+        in capsys.readouterr().err
+    )
     assert main(["export", str(run.path), "--format", "torchscript"]) == 0
     assert "vehicle: heavy" in capsys.readouterr().out and (tmp_path / "best_model.pt").is_file()
-    small = ["--suite", "quick", "--scenario", "recovery", "--episodes", "2", "--no-report", "-o", "out"]
+    small = [
+        "--suite",
+        "quick",
+        "--scenario",
+        "recovery",
+        "--episodes",
+        "2",
+        "--no-report",
+        "-o",
+        "out",
+    ]
     assert main(["evaluate", str(run.path), *small]) == 0
     output = capsys.readouterr()
-    assert run.path.name in output.out and f"{run.path.name} flies heavy, the reference flies itm" in output.err
+    assert (
+        run.path.name in output.out
+        and f"{run.path.name} flies heavy, the reference flies itm" in output.err
+    )
     assert publish.main([str(run.path), "--name", "mine", "--episodes", "2"]) == 0
     card, arguments = (tmp_path / "mine.md").read_text(), run.read_yaml()[1]
     facts = (
@@ -275,8 +402,13 @@ def test_every_zip_of_a_run_says_how_it_flies_and_folders_stand_for_zips(tmp_pat
     assert agent_settings("mine.zip")[0] == agent_settings("mailed_best_model.zip")[0]
     again = ["train", "--algo", "ppo", "--env", ENV, "-i", str(run.path), "-n", "400"]
     assert main([*again, "--conf-file", "ppo.yml"]) == 2  # of other sizes
-    assert f"{run.best_model}: environment spaces and policy_kwargs must be the same" in capsys.readouterr().err
-    assert main([*again, "--eval-episodes", "0", "--no-progress"]) == 0  # its successor has its observation and networks
+    assert (
+        f"{run.best_model}: environment spaces and policy_kwargs must be the same"
+        in capsys.readouterr().err
+    )
+    assert (
+        main([*again, "--eval-episodes", "0", "--no-progress"]) == 0
+    )  # its successor has its observation and networks
     (successor,) = Path("logs", "ppo").glob(f"{ENV}_*/{ENV}.zip")
     assert agent_settings(successor)[0].observation_std == std
 
@@ -286,7 +418,22 @@ def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo)
     path = tmp_path / "diverging.yml"
     settings = SMALL_DAGGER if algo == "dagger" else SMALL
     path.write_text(yaml.safe_dump({ENV: {**settings, "callback": "test_cli.Diverge"}}))
-    assert main(["train", "--algo", algo, "--conf-file", str(path), "-f", str(tmp_path), "--eval-episodes", "0"]) == 2
+    assert (
+        main(
+            [
+                "train",
+                "--algo",
+                algo,
+                "--conf-file",
+                str(path),
+                "-f",
+                str(tmp_path),
+                "--eval-episodes",
+                "0",
+            ]
+        )
+        == 2
+    )
     saved = tmp_path / algo / f"{ENV}_1" / f"{ENV}.zip"
     assert str(saved) in one_line_of_error(capsys)
     model = PPO.load(saved)
@@ -295,11 +442,14 @@ def test_a_diverging_training_leaves_the_last_good_model(tmp_path, capsys, algo)
 
 
 @pytest.mark.parametrize(
-    ("agent", "other"), [("crazyflie-recovery", True), ("itm-recovery", False), ("any-quadcopter", False)]
+    ("agent", "other"),
+    [("crazyflie-recovery", True), ("itm-recovery", False), ("any-quadcopter", False)],
 )
 def test_an_agent_that_goes_on_with_another_vehicle_is_said(agent, other, capsys):
     as_agent(agent_path(agent), build_config("dagger", ENV, {"n_timesteps": 1}), {})
-    assert ("was trained on the vehicle crazyflie and flies itm" in capsys.readouterr().err) == other
+    assert (
+        "was trained on the vehicle crazyflie and flies itm" in capsys.readouterr().err
+    ) == other
 
 
 def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
@@ -319,9 +469,16 @@ def test_agents_are_handed_over_with_a_fresh_optimiser(tmp_path):
 
 @pytest.mark.slow
 def test_the_benchmark_measures_each_kind_of_environments(capsys):
-    assert main(["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training"]) == 0
-    rows = re.findall(r"^│ (PyBullet|batch).*│ +(\d+) │ +([\d,]+) │", capsys.readouterr().out, flags=re.MULTILINE)
-    assert [n for _, n, _ in rows] == ["1", "2", "2", "64", "64"] and all(rate != "0" for *_, rate in rows)
+    assert (
+        main(["benchmark", "--seconds", "0.1", "--sizes", "64", "--n-envs", "2", "--no-training"])
+        == 0
+    )
+    rows = re.findall(
+        r"^│ (PyBullet|batch).*│ +(\d+) │ +([\d,]+) │", capsys.readouterr().out, flags=re.MULTILINE
+    )
+    assert [n for _, n, _ in rows] == ["1", "2", "2", "64", "64"] and all(
+        rate != "0" for *_, rate in rows
+    )
 
 
 def test_the_benchmark_measures_rollouts_and_updates(tmp_path, capsys):
@@ -334,7 +491,9 @@ def test_the_benchmark_measures_rollouts_and_updates(tmp_path, capsys):
 
 def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_with():
     scaling = {"noise": 0.0, "observation_mean": [5.0] * 18, "observation_std": [2.0] * 18}
-    config = build_config("ppo", ENV, {"n_timesteps": 1, "env_kwargs": {**scaling, "max_episode_steps": 2}})
+    config = build_config(
+        "ppo", ENV, {"n_timesteps": 1, "env_kwargs": {**scaling, "max_episode_steps": 2}}
+    )
     seen = []
 
     def agent(observation):
@@ -351,8 +510,17 @@ def test_the_closing_tables_fly_the_agent_with_the_scaling_that_it_was_trained_w
 
 @pytest.mark.parametrize("task", [*TASKS, {"target_tracking": 3, "far_tracking": 1}])
 def test_any_task_has_a_closing_table(task):
-    config = build_config("ppo", ENV, {"n_timesteps": 1, "env_kwargs": {"task": task, "max_episode_steps": 2}})
-    table = closing.agent_and_expert(TrainingJob(config=config), lambda observation: np.zeros((len(observation), 4)))
-    assert table.title.startswith(task if isinstance(task, str) else "75% target_tracking, 25% far_tracking")
+    config = build_config(
+        "ppo", ENV, {"n_timesteps": 1, "env_kwargs": {"task": task, "max_episode_steps": 2}}
+    )
+    table = closing.agent_and_expert(
+        TrainingJob(config=config), lambda observation: np.zeros((len(observation), 4))
+    )
+    assert table.title.startswith(
+        task if isinstance(task, str) else "75% target_tracking, 25% far_tracking"
+    )
     of_thesis = isinstance(task, str) and task in closing.SCENARIOS
-    assert [bool(column.source) for column in table.columns] == [False, False] + of_thesis * [True, True]
+    assert [bool(column.source) for column in table.columns] == [False, False] + of_thesis * [
+        True,
+        True,
+    ]

@@ -1,4 +1,6 @@
-"""CoefficientSchedule: where the coefficient is, for any course of what it follows, and what it leaves in the model."""
+"""CoefficientSchedule: where the coefficient is, for any course of what it follows, and what it
+leaves in the model.
+"""
 
 import numpy as np
 import pytest
@@ -20,14 +22,27 @@ NUMBER = st.floats(-1e3, 1e3)
 
 def make(algorithm, **kwargs):
     env = QuadcopterVecEnv(2, max_episode_steps=10, seed=0)
-    size = {"learning_starts": 5, "batch_size": 4} if algorithm is SAC else {"n_steps": 10, "batch_size": 20, "n_epochs": 1}
+    size = (
+        {"learning_starts": 5, "batch_size": 4}
+        if algorithm is SAC
+        else {"n_steps": 10, "batch_size": 20, "n_epochs": 1}
+    )
     expert = {} if algorithm in (PPO, SAC) else {"expert": PIDExpert()}
     policy_kwargs = {"net_arch": [4]}
-    return algorithm("MlpPolicy", env, **{**size, **expert, **kwargs}, policy_kwargs=policy_kwargs, seed=0, device="cpu")
+    return algorithm(
+        "MlpPolicy",
+        env,
+        **{**size, **expert, **kwargs},
+        policy_kwargs=policy_kwargs,
+        seed=0,
+        device="cpu",
+    )
 
 
 class Course(BaseCallback):
-    """Logs a metric of a given course, one number a rollout, and notes the coefficient each rollout is flown with."""
+    """Logs a metric of a given course, one number a rollout, and notes the coefficient each rollout
+    is flown with.
+    """
 
     def __init__(self, course, read):
         super().__init__()
@@ -46,20 +61,27 @@ class Course(BaseCallback):
 
 
 @given(start=NUMBER, final=NUMBER, first=NUMBER, last=NUMBER, measured=NUMBER)
-def test_the_coefficient_is_linear_between_its_ends_and_constant_beyond(start, final, first, last, measured):
+def test_the_coefficient_is_linear_between_its_ends_and_constant_beyond(
+    start, final, first, last, measured
+):
     if first == last:
         with pytest.raises(ConfigError, match="must differ"):
             CoefficientSchedule("beta", start, final, between=(first, last))
         return
     schedule = CoefficientSchedule("beta", start, final, between=(first, last))
-    expected = np.interp(measured, *((first, last), (start, final)) if first < last else ((last, first), (final, start)))
+    expected = np.interp(
+        measured,
+        *((first, last), (start, final)) if first < last else ((last, first), (final, start)),
+    )
     assert schedule.value_at(measured) == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
 @pytest.mark.parametrize(("one_way", "last"), [(True, 0.25), (False, 0.75)])
 def test_beta_follows_a_metric_from_the_next_rollout_on(one_way, last):
     model = make(DAgger, beta=0.5, beta_decay=0.1, beta_final=0.2)
-    schedule = CoefficientSchedule("beta", 1.0, 0.0, follow="my/metric", between=(10.0, 14.0), one_way=one_way)
+    schedule = CoefficientSchedule(
+        "beta", 1.0, 0.0, follow="my/metric", between=(10.0, 14.0), one_way=one_way
+    )
     course = Course([None, 12.0, float("nan"), 13.0, 11.0, 11.0], lambda model: model.current_beta)
     model.learn(120, callback=[course, schedule])
     assert course.seen == [1.0, 1.0, 0.5, 0.5, 0.25, last]
@@ -77,7 +99,12 @@ def test_the_cloning_weight_can_rise_from_nothing_and_every_cloned_row_is_labell
             return True
 
         def _on_rollout_end(self):
-            losses.append((model._rollout_bc_coef, np.abs(model.rollout_buffer.expert_actions).sum(axis=2).min()))
+            losses.append(
+                (
+                    model._rollout_bc_coef,
+                    np.abs(model.rollout_buffer.expert_actions).sum(axis=2).min(),
+                )
+            )
 
     model.learn(80, callback=[course, schedule, Note()])
     assert course.seen == [0.0, 0.0, 0.5, 1.0]
@@ -100,12 +127,22 @@ def test_any_algorithms_coefficients_follow_the_progress(algorithm, name, kwargs
 
 def test_a_training_that_goes_on_starts_where_it_stopped(tmp_path):
     model = make(DAgger)
-    model.learn(40, callback=[Course([0.5, 0.5], lambda model: 0), CoefficientSchedule("beta", 1.0, 0.0, "my/metric")])
+    model.learn(
+        40,
+        callback=[
+            Course([0.5, 0.5], lambda model: 0),
+            CoefficientSchedule("beta", 1.0, 0.0, "my/metric"),
+        ],
+    )
     assert model.current_beta == 0.5
     model.save(tmp_path / "model.zip")
     again = DAgger.load(tmp_path / "model.zip", env=model.env, expert=PIDExpert())
     course = Course([None, 0.75], lambda model: model.current_beta)
-    again.learn(40, callback=[course, CoefficientSchedule("beta", 1.0, 0.0, "my/metric")], reset_num_timesteps=False)
+    again.learn(
+        40,
+        callback=[course, CoefficientSchedule("beta", 1.0, 0.0, "my/metric")],
+        reset_num_timesteps=False,
+    )
     assert course.seen == [0.5, 0.5] and again.current_beta == 0.25
 
 
@@ -118,11 +155,14 @@ def test_a_run_of_a_configuration_file_follows_what_best_model_logs(tmp_path):
         "batch_size": 100,
         "n_epochs": 1,
         "env_kwargs": {"max_episode_steps": 20},
-        "callback": [{"coefficient_schedule.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}],
+        "callback": [
+            {"coefficient_schedule.CoefficientSchedule": {**schedule, "between": [-1000.0, -999.0]}}
+        ],
     }
     config = build_config("dagger", "QuadTargetTracking-v0", settings)
     result = train(
-        TrainingJob(config=config, log_folder=str(tmp_path), eval_freq=200, eval_episodes=2), report=lambda line: None
+        TrainingJob(config=config, log_folder=str(tmp_path), eval_freq=200, eval_episodes=2),
+        report=lambda line: None,
     )
     assert result.model.current_beta == 0.25
 
@@ -146,4 +186,6 @@ def test_what_cannot_be_set_is_refused_when_training_begins(algorithm, arguments
 
 def test_a_metric_that_is_never_logged_is_warned_about():
     with pytest.warns(UserWarning, match="did you mean 'rollout/success_rate'"):
-        make(DAgger).learn(40, callback=CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/succes_rate"))
+        make(DAgger).learn(
+            40, callback=CoefficientSchedule("beta", 1.0, 0.0, follow="rollout/succes_rate")
+        )

@@ -48,24 +48,36 @@ def test_the_true_state_is_collected_from_single_environments():
     env = VecMonitor(DummyVecEnv([lambda n=n: Stateful(n) for n in (0.25, 0.75)]))
     labeller = Controller.for_env(FromState(), env)
     assert labeller.needs_state
-    np.testing.assert_array_equal(labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1))
+    np.testing.assert_array_equal(
+        labeller.labels(env.reset()), np.repeat([[0.25], [0.75]], 4, axis=1)
+    )
 
 
 @pytest.mark.parametrize(
     ("algorithm", "settings"),
-    [(DAgger, {"n_steps": 8}), (PPOBC, {"n_steps": 8, "batch_size": 16, "bc_coef": 1.0}), (SACBC, {"bc_coef": 1.0})],
+    [
+        (DAgger, {"n_steps": 8}),
+        (PPOBC, {"n_steps": 8, "batch_size": 16, "bc_coef": 1.0}),
+        (SACBC, {"bc_coef": 1.0}),
+    ],
 )
-def test_an_expert_can_be_a_name_and_is_made_for_the_vehicle_of_the_environments(algorithm, settings):
+def test_an_expert_can_be_a_name_and_is_made_for_the_vehicle_of_the_environments(
+    algorithm, settings
+):
     env = VecMonitor(QuadcopterVecEnv(2, vehicle="crazyflie", seed=0))
     model = algorithm("MlpPolicy", env, expert="pid", device="cpu", **settings).learn(16)
     labeller = Controller.for_env(model.expert, env, model._labeller)
     assert labeller is model._labeller  # made once
-    assert isinstance(labeller.source, PIDExpert) and labeller.source.vehicle == load_vehicle("crazyflie")
+    assert isinstance(labeller.source, PIDExpert) and labeller.source.vehicle == load_vehicle(
+        "crazyflie"
+    )
     with pytest.raises(ConfigError, match="unknown expert 'pidd': did you mean 'pid'"):
         algorithm("MlpPolicy", env, expert="pidd", device="cpu", **settings).learn(16)
 
 
-@pytest.mark.parametrize("wrap", [lambda env: env, VecMonitor, lambda env: VecNormalize(VecMonitor(env))])
+@pytest.mark.parametrize(
+    "wrap", [lambda env: env, VecMonitor, lambda env: VecNormalize(VecMonitor(env))]
+)
 def test_the_true_state_of_the_batched_environment(wrap):
     env = wrap(QuadcopterVecEnv(5, seed=0))
     observation = env.reset()
@@ -107,7 +119,9 @@ def test_an_sb3_model_and_its_policy():
 
 def test_labels_are_clipped_to_the_action_space():
     env = make_vec_env("Pendulum-v1", 2, seed=0)
-    labels = Controller.for_env(lambda observation: np.array([[9.0], [-9.0]]), env).labels(env.reset())
+    labels = Controller.for_env(lambda observation: np.array([[9.0], [-9.0]]), env).labels(
+        env.reset()
+    )
     np.testing.assert_array_equal(labels, [[2.0], [-2.0]])
     assert labels.dtype == np.float32
 
@@ -117,7 +131,10 @@ def test_labels_are_clipped_to_the_action_space():
     [
         (lambda observation: np.zeros(2), r"shape \(2,\), must be \(2, 1\)"),
         (lambda observation: np.zeros((2, 4)), r"shape \(2, 4\)"),
-        (lambda observation: np.array([[0.0], [np.inf]]), r"\[inf\] in row 1; every number must be finite"),
+        (
+            lambda observation: np.array([[0.0], [np.inf]]),
+            r"\[inf\] in row 1; every number must be finite",
+        ),
     ],
 )
 def test_unfit_labels_are_named(expert, message):
@@ -146,12 +163,16 @@ def test_unfit_experts_are_refused_at_once(expert, message):
 
 
 def test_a_model_of_another_environment_is_refused():
-    with pytest.raises(ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"):
+    with pytest.raises(
+        ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"
+    ):
         Controller.for_env(PPO("MlpPolicy", "Pendulum-v1", device="cpu"), QuadcopterVecEnv(2))
 
 
 class Counter:
-    """Its state is how often it was asked; it notes what it was given, as SB3's recurrent policies are."""
+    """Its state is how often it was asked; it notes what it was given, as SB3's recurrent policies
+    are.
+    """
 
     def __init__(self):
         self.given, self.starts = [], []
@@ -171,7 +192,11 @@ def test_the_state_of_a_controller_is_of_one_flight():
 
 def test_the_state_of_an_expert_goes_on_in_its_environment():
     counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
-    labeller, observation, starts = Controller.for_env(counter, env), env.reset(), np.array([True, False])
+    labeller, observation, starts = (
+        Controller.for_env(counter, env),
+        env.reset(),
+        np.array([True, False]),
+    )
     labeller.labels(observation, np.ones(2, dtype=bool))
     Controller.for_env(counter, env, labeller).labels(observation, starts)
     Controller.for_env(counter, QuadcopterVecEnv(2, seed=0), labeller).labels(observation, starts)

@@ -51,11 +51,15 @@ def actor_and_critic(model):
     named = dict(model.policy.named_parameters())
     critic = [p for name, p in named.items() if "value" in name]
     actor = [p for name, p in named.items() if "value" not in name]
-    return th.cat([p.detach().flatten() for p in actor]), th.cat([p.detach().flatten() for p in critic])
+    return th.cat([p.detach().flatten() for p in actor]), th.cat(
+        [p.detach().flatten() for p in critic]
+    )
 
 
 class Recorder(BaseCallback):
-    """Keeps, per step, what ``keys`` of the algorithm's local variables held; and what the last rollout logged."""
+    """Keeps, per step, what ``keys`` of the algorithm's local variables held; and what the last
+    rollout logged.
+    """
 
     def __init__(self, *keys):
         super().__init__()
@@ -69,7 +73,8 @@ class Recorder(BaseCallback):
         return True
 
 
-# --- Learning ---------------------------------------------------------------------------------------------------------
+# --- Learning
+# ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_agent_becomes_the_expert():
@@ -84,14 +89,20 @@ def test_an_sb3_model_teaches(bc_loss):
     teacher = PPO("MlpPolicy", "Pendulum-v1", seed=5, device="cpu")
     model = build(expert=teacher, bc_loss=bc_loss).learn(ROLLOUT)
     observations, labels = map(th.from_numpy, model.dataset.pairs.values())
-    np.testing.assert_allclose(labels, teacher.predict(observations.numpy(), deterministic=True)[0], atol=1e-5)
+    np.testing.assert_allclose(
+        labels, teacher.predict(observations.numpy(), deterministic=True)[0], atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("kind", ["huber", "huber_mse"])
 def test_how_errors_count(kind):
-    """Zero where the actions agree, convex, as steep as promised: linear far out, and with a squared part steeper still."""
+    """Zero where the actions agree, convex, as steep as promised: linear far out, and with a
+    squared part steeper still.
+    """
     error = th.linspace(-2.0, 2.0, 801, dtype=th.float64)
-    loss = cloning_errors(kind, error[:, None].repeat(1, 3), th.zeros(3), th.zeros(801, 3, dtype=th.float64))
+    loss = cloning_errors(
+        kind, error[:, None].repeat(1, 3), th.zeros(3), th.zeros(801, 3, dtype=th.float64)
+    )
     assert loss.argmin() == 400 and loss.min() < 1e-12
     th.testing.assert_close(loss, loss.flip(0))
     slope = loss.diff() / error.diff()
@@ -109,17 +120,25 @@ def test_without_a_value_term_only_the_actor_moves():
 
 
 def test_the_critic_does_not_disturb_the_actor():
-    """Their gradients are clipped separately: a large value loss leaves what the actor learns as it is."""
-    actors = [actor_and_critic(build(vf_coef=c, max_grad_norm=0.1).learn(ROLLOUT))[0] for c in (0.0, 100.0)]
+    """Their gradients are clipped separately: a large value loss leaves what the actor learns as it
+    is.
+    """
+    actors = [
+        actor_and_critic(build(vf_coef=c, max_grad_norm=0.1).learn(ROLLOUT))[0]
+        for c in (0.0, 100.0)
+    ]
     assert th.equal(*actors)
 
 
 def test_the_deviation_stops_at_its_floor():
-    model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(ROLLOUT * 4)
+    model = build(bc_loss="nll", log_std_min=-1.98, learning_rate=1e-2, n_epochs=20).learn(
+        ROLLOUT * 4
+    )
     assert model.policy.log_std.min().item() == pytest.approx(-1.98)
 
 
-# --- Loss terms -------------------------------------------------------------------------------------------------------
+# --- Loss terms
+# -------------------------------------------------------------------------------------------------------
 
 
 def test_likelihood_and_entropy_are_those_of_the_policy():
@@ -138,13 +157,18 @@ def test_the_clipped_value_loss_is_the_larger_one():
     assert value_loss(values, old, returns, Loss(clip_range_vf=0.1)) > plain
 
 
-# --- Who flies --------------------------------------------------------------------------------------------------------
+# --- Who flies
+# --------------------------------------------------------------------------------------------------------
 
 
 def flown(beta, **kwargs):
-    """One rollout of 32 environments: the share flown by the expert per step and environment, (32, 32)."""
+    """One rollout of 32 environments: the share flown by the expert per step and environment, (32,
+    32).
+    """
     recorder = Recorder("actions")
-    model = build(pendulum(32), beta=beta, beta_final=beta, **kwargs).learn(32 * 32, callback=recorder)
+    model = build(pendulum(32), beta=beta, beta_final=beta, **kwargs).learn(
+        32 * 32, callback=recorder
+    )
     labels = model.dataset.pairs["actions"].reshape(32, 32, 1)
     return recorder.logged, (np.array([row[0] for row in recorder.rows]) == labels)[..., 0]
 
@@ -157,7 +181,9 @@ def test_the_expert_flies_with_probability_beta():
     assert logged["rollout/expert_fraction"] == by_expert.mean()
     assert logged["dagger/beta"] == 0.5
     for axis in (0, 1):  # independently per step and environment
-        assert by_expert.mean(axis=axis).std() == pytest.approx(0.5 / np.sqrt(32), rel=0.5)  # 0 or 0.5 if shared
+        assert by_expert.mean(axis=axis).std() == pytest.approx(
+            0.5 / np.sqrt(32), rel=0.5
+        )  # 0 or 0.5 if shared
 
 
 def test_beta_falls_with_every_rollout_and_survives_a_save(tmp_path):
@@ -170,17 +196,22 @@ def test_beta_falls_with_every_rollout_and_survives_a_save(tmp_path):
     model._n_rollouts = 2
     model.save(tmp_path / "model")
     assert DAgger.load(tmp_path / "model").current_beta == pytest.approx(0.3)
-    assert model.learn(ROLLOUT).current_beta == pytest.approx(0.4)  # a new count of time begins β anew
+    assert model.learn(ROLLOUT).current_beta == pytest.approx(
+        0.4
+    )  # a new count of time begins β anew
 
 
-# --- What is stored ---------------------------------------------------------------------------------------------------
+# --- What is stored
+# ---------------------------------------------------------------------------------------------------
 
 
 def test_labels_belong_to_the_state_before_the_step():
     model = build().learn(ROLLOUT * 2)
     observations, labels = map(th.from_numpy, model.dataset.pairs.values())
     np.testing.assert_allclose(labels, turn_back(observations.numpy()), atol=1e-6)
-    np.testing.assert_array_equal(observations[-ROLLOUT:].view(32, N_ENVS, 3), model.rollout_buffer.observations)
+    np.testing.assert_array_equal(
+        observations[-ROLLOUT:].view(32, N_ENVS, 3), model.rollout_buffer.observations
+    )
 
 
 def test_time_limits_are_bootstrapped():
@@ -195,15 +226,21 @@ def test_time_limits_are_bootstrapped():
     assert recorder.rows[199][2].all()
     terminal = np.stack([info["terminal_observation"] for info in recorder.rows[199][1]])
     with th.no_grad():
-        rewards[199] += model.gamma * model.policy.predict_values(th.from_numpy(terminal)).numpy().flatten()
+        rewards[199] += (
+            model.gamma * model.policy.predict_values(th.from_numpy(terminal)).numpy().flatten()
+        )
     np.testing.assert_allclose(model.rollout_buffer.rewards, rewards, rtol=1e-5)
     np.testing.assert_array_equal(model.rollout_buffer.episode_starts[[0, 200]], 1.0)
     with th.no_grad():
-        values = model.policy.predict_values(th.from_numpy(model.rollout_buffer.observations[7])).flatten()
+        values = model.policy.predict_values(
+            th.from_numpy(model.rollout_buffer.observations[7])
+        ).flatten()
     np.testing.assert_allclose(model.rollout_buffer.values[7], values, rtol=1e-5)
 
 
-@pytest.mark.parametrize(("capacity", "sizes"), [(0, [64, 64, 64]), (150, [64, 128, 150]), (1000, [64, 128, 192])])
+@pytest.mark.parametrize(
+    ("capacity", "sizes"), [(0, [64, 64, 64]), (150, [64, 128, 150]), (1000, [64, 128, 192])]
+)
 def test_the_dataset_grows_to_its_capacity(capacity, sizes):
     model = build(dataset_capacity=capacity)
     for size in sizes:
@@ -212,7 +249,8 @@ def test_the_dataset_grows_to_its_capacity(capacity, sizes):
         assert len(model.dataset) == size == recorder.logged["dagger/dataset_size"]
 
 
-# --- Repeating and resuming -------------------------------------------------------------------------------------------
+# --- Repeating and resuming
+# -------------------------------------------------------------------------------------------
 
 
 def test_a_seed_decides_the_run():
@@ -222,11 +260,19 @@ def test_a_seed_decides_the_run():
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
-    settings = {"beta_decay": 0.05, "dataset_capacity": 150, "bc_loss": "nll", "clip_range_vf": 0.2, "seed": None}
+    settings = {
+        "beta_decay": 0.05,
+        "dataset_capacity": 150,
+        "bc_loss": "nll",
+        "clip_range_vf": 0.2,
+        "seed": None,
+    }
     whole = build(**settings).learn(ROLLOUT * 3)
     whole.save(tmp_path / "model")
     np.savez(tmp_path / "dataset.npz", **whole.dataset.pairs)
-    whole.set_env(pendulum(seed=7))  # episodes begin anew after an interruption, so they do here too
+    whole.set_env(
+        pendulum(seed=7)
+    )  # episodes begin anew after an interruption, so they do here too
     whole.learn(ROLLOUT * 3, reset_num_timesteps=False)
 
     resumed = DAgger.load(tmp_path / "model", env=pendulum(seed=7), device="cpu", expert=turn_back)
@@ -237,17 +283,28 @@ def test_an_interrupted_run_goes_on_bit_for_bit(tmp_path):
     assert th.equal(parameters(whole), parameters(resumed))
 
 
-# --- The life of an SB3 algorithm -------------------------------------------------------------------------------------
+# --- The life of an SB3 algorithm
+# -------------------------------------------------------------------------------------
 
 
 def test_callbacks_progress_bar_and_tensorboard(tmp_path):
     model = build(tensorboard_log=str(tmp_path / "tb"))
-    evaluation = EvalCallback(pendulum(1), n_eval_episodes=1, eval_freq=32, log_path=str(tmp_path), verbose=0)
+    evaluation = EvalCallback(
+        pendulum(1), n_eval_episodes=1, eval_freq=32, log_path=str(tmp_path), verbose=0
+    )
     model.learn(ROLLOUT * 8, callback=[evaluation], progress_bar=True)
     assert (tmp_path / "evaluations.npz").is_file()
     assert list((tmp_path / "tb" / "DAgger_1").iterdir())
     names = set(model.logger.name_to_value)
-    train = ("bc_loss", "value_loss", "entropy_loss", "std", "explained_variance", "learning_rate", "loss")
+    train = (
+        "bc_loss",
+        "value_loss",
+        "entropy_loss",
+        "std",
+        "explained_variance",
+        "learning_rate",
+        "loss",
+    )
     assert {f"train/{name}" for name in train} <= names
     assert len(model.ep_info_buffer) == N_ENVS  # an episode of Pendulum-v1 has 200 steps
 
@@ -258,13 +315,15 @@ def test_a_loaded_model_predicts_without_environment_or_expert(tmp_path):
     observation = pendulum().reset()
     loaded = DAgger.load(tmp_path / "model")
     np.testing.assert_array_equal(
-        loaded.predict(observation, deterministic=True)[0], model.predict(observation, deterministic=True)[0]
+        loaded.predict(observation, deterministic=True)[0],
+        model.predict(observation, deterministic=True)[0],
     )
     with pytest.raises(ExpertError, match="set_expert"):
         DAgger.load(tmp_path / "model", env=pendulum()).learn(ROLLOUT)
 
 
-# --- Faults -----------------------------------------------------------------------------------------------------------
+# --- Faults
+# -----------------------------------------------------------------------------------------------------------
 
 
 class BadRewards(VecEnvWrapper):
@@ -322,9 +381,32 @@ def test_dict_observations_and_discrete_actions_are_refused():
 
 def test_hidden_units_learn_to_say_what_no_observation_shows(tmp_path):
     pushes = {"mass": [0.8, 1.25], "force": {"magnitude": [0, 3]}}
-    env = QuadcopterVecEnv(64, seed=0, noise=0.0, last_action=True, history=[0, 8, 16], randomize=pushes, max_episode_steps=60)
-    sizes = {"n_steps": 30, "batch_size": 480, "n_epochs": 3, "learning_rate": 3e-3, "bc_loss": "huber_mse", "beta": 1.0}
-    model = DAgger("MlpPolicy", env, "told_geometric", aux_coef=1.0, policy_kwargs={"net_arch": [64, 32]}, seed=0, **sizes)
+    env = QuadcopterVecEnv(
+        64,
+        seed=0,
+        noise=0.0,
+        last_action=True,
+        history=[0, 8, 16],
+        randomize=pushes,
+        max_episode_steps=60,
+    )
+    sizes = {
+        "n_steps": 30,
+        "batch_size": 480,
+        "n_epochs": 3,
+        "learning_rate": 3e-3,
+        "bc_loss": "huber_mse",
+        "beta": 1.0,
+    }
+    model = DAgger(
+        "MlpPolicy",
+        env,
+        "told_geometric",
+        aux_coef=1.0,
+        policy_kwargs={"net_arch": [64, 32]},
+        seed=0,
+        **sizes,
+    )
     model.learn(64 * 30 * 30)
     env.step(model.predict(env.reset(), deterministic=True)[0])
     for _ in range(25):
@@ -337,11 +419,17 @@ def test_hidden_units_learn_to_say_what_no_observation_shows(tmp_path):
     with pytest.raises(ConfigError, match="two hidden layers"):
         DAgger("MlpPolicy", env, "pid", aux_coef=1.0, policy_kwargs={"net_arch": [8]})
     with pytest.raises(ConfigError, match="true_state"):
-        DAgger("MlpPolicy", "Pendulum-v1", lambda observations: observations[:, :1], aux_coef=1.0).learn(1)
+        DAgger(
+            "MlpPolicy", "Pendulum-v1", lambda observations: observations[:, :1], aux_coef=1.0
+        ).learn(1)
 
 
 def test_the_load_is_the_action_that_holds_the_height():
-    env = QuadcopterVecEnv(20, seed=1, randomize={"mass": [0.8, 1.25], "motor_gain": 5.0, "force": {"magnitude": [0, 3]}})
+    env = QuadcopterVecEnv(
+        20,
+        seed=1,
+        randomize={"mass": [0.8, 1.25], "motor_gain": 5.0, "force": {"magnitude": [0, 3]}},
+    )
     env.reset()
     env.batch.state[QUATERNION] = np.array([[1.0], [0.0], [0.0], [0.0]])
     env.batch.state[BODY_RATES] = env.batch.state[VELOCITY] = 0.0

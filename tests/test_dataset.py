@@ -44,7 +44,18 @@ def test_rows_are_sampled_in_whole_passes(count):
 
 
 def test_in_order_they_follow_each_other():
-    assert sample_rows(4, 10, np.random.default_rng(0), shuffle=False).tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 0, 1]
+    assert sample_rows(4, 10, np.random.default_rng(0), shuffle=False).tolist() == [
+        0,
+        1,
+        2,
+        3,
+        0,
+        1,
+        2,
+        3,
+        0,
+        1,
+    ]
 
 
 def test_pairs_do_not_depend_on_where_the_ring_begins(tmp_path):

@@ -1,4 +1,6 @@
-"""The page of ``sb3-quad demo``: its model flies what Python flies, it reads zips, and in a browser it can be thrown."""
+"""The page of ``sb3-quad demo``: its model flies what Python flies, it reads zips, and in a browser
+it can be thrown.
+"""
 
 import functools
 import json
@@ -21,12 +23,23 @@ from sb3_quad.controllers.pretrained import pretrained
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.controllers import parse_controllers
-from sb3_quad.show.demo.page import DEFAULT_AGENTS, LIMIT, MODEL, describe, make_page, numbers, pack, script
+from sb3_quad.show.demo.page import (
+    DEFAULT_AGENTS,
+    LIMIT,
+    MODEL,
+    describe,
+    make_page,
+    numbers,
+    pack,
+    script,
+)
 from sb3_quad.vehicles.vehicle import VEHICLES, load_vehicle
 
 STEPS = 1000  # control steps
 NODE = shutil.which("node")
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
 HARNESS = """
 const { readFileSync } = await import("node:fs");
 const job = JSON.parse(readFileSync(0, "utf8"));
@@ -64,7 +77,9 @@ def in_node(tmp_path, **job):
     """What the page's model answers, without a browser."""
     file = tmp_path / "model.mjs"
     file.write_text(script(MODEL) + HARNESS)
-    done = subprocess.run([NODE, str(file)], input=json.dumps(job), capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [NODE, str(file)], input=json.dumps(job), capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -72,8 +87,16 @@ def in_node(tmp_path, **job):
 def start_of(env):
     """How the episode of an environment's only row begins."""
     state = env.true_state()
-    names = {"position": "position", "quaternion": "quaternion", "velocity": "velocity", "rates": "body_rates"}
-    return {ours: getattr(state, theirs)[0].tolist() for ours, theirs in {**names, "target": "target"}.items()}
+    names = {
+        "position": "position",
+        "quaternion": "quaternion",
+        "velocity": "velocity",
+        "rates": "body_rates",
+    }
+    return {
+        ours: getattr(state, theirs)[0].tolist()
+        for ours, theirs in {**names, "target": "target"}.items()
+    }
 
 
 def fly(env, actions, steps=STEPS):
@@ -95,14 +118,21 @@ class Env(QuadcopterVecEnv):
     """One row that begins its first episode, without noise."""
 
     def __init__(self, **keywords):
-        super().__init__(1, max_episode_steps=10 * STEPS, seed=5, n_threads=1, **{"noise": 0.0, **keywords})
+        super().__init__(
+            1, max_episode_steps=10 * STEPS, seed=5, n_threads=1, **{"noise": 0.0, **keywords}
+        )
         self.first = self.reset()
 
     def observe(self):
         return self.first
 
 
-BREEZY = {"drag": (0.3, 0.4, 0.2), "motor_gain_up": 30.0, "motor_gain_down": 12.0, "motor_integration": "exact"}
+BREEZY = {
+    "drag": (0.3, 0.4, 0.2),
+    "motor_gain_up": 30.0,
+    "motor_gain_down": 12.0,
+    "motor_integration": "exact",
+}
 WORLD = {"mass": 1.2, "motor_gain": 0.7, "thrust": 0.9}
 
 
@@ -114,7 +144,11 @@ def test_given_actions_lead_to_where_python_flies(name, tmp_path):
     if name == "breezy":
         vehicle = vehicle.model_copy(update=BREEZY)
     task = {"start_position": (0.0, 0.0, 5000.0), "max_distance": 1e6}
-    random = {key: [value, value] for key, value in {**WORLD, "delay": 3}.items()} if name == "other world" else None
+    random = (
+        {key: [value, value] for key, value in {**WORLD, "delay": 3}.items()}
+        if name == "other world"
+        else None
+    )
     env = Env(task="recovery_and_tracking", vehicle=vehicle, task_kwargs=task, randomize=random)
     wrench = {"force": [0.2, -0.1, 0.3], "torque": [1e-4, -2e-4, 1e-4], "wind": [3.0, -2.0, 0.5]}
     env.set_wrench(wrench["force"], wrench["torque"])
@@ -122,7 +156,12 @@ def test_given_actions_lead_to_where_python_flies(name, tmp_path):
     walk = np.cumsum(0.03 * np.random.default_rng(0).standard_normal((STEPS, 4)), axis=0)
     actions = np.clip(vehicle.hover_action + walk, -1, 1).astype(np.float32)
     world = {"mass": 1.2, "motors": 0.7, "thrust": 0.9, "delay": 3} if random else None
-    job = {"vehicle": vehicle.model_dump(mode="json"), "start": start_of(env), "wrench": wrench, "world": world}
+    job = {
+        "vehicle": vehicle.model_dump(mode="json"),
+        "start": start_of(env),
+        "wrench": wrench,
+        "world": world,
+    }
     path = in_node(tmp_path, **job, steps=STEPS, actions=actions.astype(float).tolist())
     assert apart(path, fly(env, lambda _, step: actions[[step]])) <= 1e-9
 
@@ -138,7 +177,13 @@ def test_the_experts_fly_as_in_python(expert, name, tmp_path):
     kind = "pid" if expert == "pid" else "geometric"
     env, law = Env(task="state_recovery", vehicle=vehicle), resolve_expert(kind, vehicle)
     agent = {"label": kind, "kind": kind}
-    path = in_node(tmp_path, vehicle=vehicle.model_dump(mode="json"), agent=agent, start=start_of(env), steps=STEPS)
+    path = in_node(
+        tmp_path,
+        vehicle=vehicle.model_dump(mode="json"),
+        agent=agent,
+        start=start_of(env),
+        steps=STEPS,
+    )
     assert apart(path, fly(env, lambda *_: law.actions(env.true_state()))) <= 1e-6
 
 
@@ -150,11 +195,21 @@ ANY_PLUS = "any-quadcopter", "hummingbird"
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("how", "task"),
-    [("float32", "state_recovery"), ("float32", "target_tracking"), ("float16", "state_recovery"), ("zip", "target_tracking")],
+    [
+        ("float32", "state_recovery"),
+        ("float32", "target_tracking"),
+        ("float16", "state_recovery"),
+        ("zip", "target_tracking"),
+    ],
 )
-@pytest.mark.parametrize(("name", "vehicle"), [*((name, "itm") for name in AGENTS), ("any-quadcopter", "crazyflie"), ANY_PLUS])
+@pytest.mark.parametrize(
+    ("name", "vehicle"),
+    [*((name, "itm") for name in AGENTS), ("any-quadcopter", "crazyflie"), ANY_PLUS],
+)
 def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path):
-    """Exact weights, those rounded to half precision (also in Python), and those that the page reads from the zip itself."""
+    """Exact weights, those rounded to half precision (also in Python), and those that the page
+    reads from the zip itself.
+    """
     (spec,), flown = parse_controllers([name]), load_vehicle(vehicle)
     model = PPO.load(pretrained(name), device="cpu")
     described, network = describe(spec)
@@ -164,16 +219,28 @@ def test_the_agents_fly_as_in_python(name, vehicle, how, task, tmp_path):
         layers = [part for layer in own for part in layer.parameters()]
         for part in layers:
             part.data = part.data.half().float()
-        assert np.abs(numbers(network) - np.concatenate([part.detach().numpy().ravel() for part in layers])).max() > 0
-    env = Env(**{**env_kwargs(name), "task": task, "vehicle": flown, "noise": 0.0, "vehicles": None})
+        assert (
+            np.abs(
+                numbers(network)
+                - np.concatenate([part.detach().numpy().ravel() for part in layers])
+            ).max()
+            > 0
+        )
+    env = Env(
+        **{**env_kwargs(name), "task": task, "vehicle": flown, "noise": 0.0, "vehicles": None}
+    )
     start, turn = start_of(env), flown.turn_to(spec.own.layout)
-    if turn.angle:  # the page flies the vehicle in its own axes, Python in those that the agent knows
+    if (
+        turn.angle
+    ):  # the page flies the vehicle in its own axes, Python in those that the agent knows
         w, x, y, z = start["quaternion"]
         c, s = math.cos(turn.angle / 2), math.sin(turn.angle / 2)
         start["quaternion"] = [w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s]
         start["rates"] = (turn.axes.T @ start["rates"]).tolist()
     source = {"zip": str(pretrained(name))} if how == "zip" else {"agent": agent}
-    path = in_node(tmp_path, vehicle=flown.model_dump(mode="json"), **source, start=start, steps=STEPS)
+    path = in_node(
+        tmp_path, vehicle=flown.model_dump(mode="json"), **source, start=start, steps=STEPS
+    )
     flight = fly(env, lambda observation, _: model.predict(observation, deterministic=True)[0])
     assert apart(path, flight) <= 1e-4
     assert np.linalg.norm(flight[-1, :3] - flight[-1, 17:20]) < 0.1
@@ -196,7 +263,9 @@ def test_the_page_reads_zips_of_any_algorithm(kind, tmp_path):
     model = algorithm("MlpPolicy", Env(), device="cpu", seed=0, **keywords)
     model.save(tmp_path / "agent.zip")
     observations = np.random.default_rng(0).standard_normal((5, 18)).astype(np.float32) * 3
-    found = in_node(tmp_path, zip=str(tmp_path / "agent.zip"), observations=observations.astype(float).tolist())
+    found = in_node(
+        tmp_path, zip=str(tmp_path / "agent.zip"), observations=observations.astype(float).tolist()
+    )
     expected = model.predict(observations, deterministic=True)[0]
     np.testing.assert_allclose(np.clip(found, -1, 1), expected, atol=1e-5)
 
@@ -229,13 +298,31 @@ def test_a_controller_that_the_page_cannot_fly_is_named(given, tmp_path, capsys)
 
 def test_a_page_is_one_file_that_needs_no_other(tmp_path, capsys):
     file = tmp_path / "demo.html"
-    assert main(["demo", "two <!--<script> PIDs=pid", "geometric", "--vehicle", "crazyflie", "-o", str(file)]) == 0
+    assert (
+        main(
+            [
+                "demo",
+                "two <!--<script> PIDs=pid",
+                "geometric",
+                "--vehicle",
+                "crazyflie",
+                "-o",
+                str(file),
+            ]
+        )
+        == 0
+    )
     text = file.read_text()
-    assert not re.search(r"https?://|<link(?! rel=\"icon\" href=\"data:)|src=|@import|url\(|^import |^export ", text, re.M)
+    assert not re.search(
+        r"https?://|<link(?! rel=\"icon\" href=\"data:)|src=|@import|url\(|^import |^export ",
+        text,
+        re.M,
+    )
     data = json.loads(text.split('id="data">')[1].split("</script>")[0])
-    assert [agent["label"] for agent in data["agents"]] == ["two <!--<script> PIDs", "geometric"] and data[
-        "vehicle"
-    ] == "crazyflie"
+    assert [agent["label"] for agent in data["agents"]] == [
+        "two <!--<script> PIDs",
+        "geometric",
+    ] and data["vehicle"] == "crazyflie"
     assert main(["demo", "pid", "-o", str(file)]) == 2  # exists
     assert "--overwrite" in capsys.readouterr().err
 
@@ -261,7 +348,9 @@ def test_the_scripts_keep_their_types(tmp_path):
     from importlib.resources import files
 
     folder = files("sb3_quad.show.demo")
-    done = subprocess.run([compiler, "-p", str(folder / "jsconfig.json")], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [compiler, "-p", str(folder / "jsconfig.json")], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stdout
 
 
@@ -278,23 +367,45 @@ class Browser:
 
     def __init__(self, folder):
         ours, theirs = os.pipe(), os.pipe()
-        arguments = ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}", "--remote-debugging-pipe")
-        command = (sys.executable, "-c", _AT_3_AND_4, str(ours[0]), str(theirs[1]), CHROMIUM, *arguments, "about:blank")
+        arguments = (
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            f"--user-data-dir={folder}",
+            "--remote-debugging-pipe",
+        )
+        command = (
+            sys.executable,
+            "-c",
+            _AT_3_AND_4,
+            str(ours[0]),
+            str(theirs[1]),
+            CHROMIUM,
+            *arguments,
+            "about:blank",
+        )
         nowhere = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         self.process = subprocess.Popen(command, pass_fds=(ours[0], theirs[1]), **nowhere)
         os.close(ours[0])
         os.close(theirs[1])
         self.out, self.answers = os.fdopen(ours[1], "wb", 0), os.fdopen(theirs[0], "rb")
         self.count, self.session, self.errors, self.rest = 0, None, [], b""
-        (page,) = [each for each in self.call("Target.getTargets")["targetInfos"] if each["type"] == "page"]
-        self.session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)["sessionId"]
+        (page,) = [
+            each for each in self.call("Target.getTargets")["targetInfos"] if each["type"] == "page"
+        ]
+        self.session = self.call("Target.attachToTarget", targetId=page["targetId"], flatten=True)[
+            "sessionId"
+        ]
         self.call("Runtime.enable")
         self.call("Log.enable")
 
     def call(self, method, **params):
         self.count += 1
         message = {"id": self.count, "method": method, "params": params}
-        self.out.write(json.dumps(message | ({"sessionId": self.session} if self.session else {})).encode() + b"\0")
+        self.out.write(
+            json.dumps(message | ({"sessionId": self.session} if self.session else {})).encode()
+            + b"\0"
+        )
         while True:
             while b"\0" not in self.rest:
                 self.rest += self.answers.read1(1 << 16) or pytest.fail("chromium has ended")
@@ -321,7 +432,13 @@ class Browser:
         pytest.fail(f"never true: {expression}; {self.errors}")
 
     def open(self, file, width, height):
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=width < 600)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 600,
+        )
         self.call("Page.navigate", url=file.as_uri())
         self.wait_for("typeof demo === 'object' && demo.frames() > 2")
 
@@ -354,25 +471,48 @@ def page(tmp_path_factory):
 def test_a_throw_comes_back_and_a_push_is_felt(browser, page):
     browser.open(page, 1280, 800)
     assert browser.value("demo.fleet.flying.length") == 4
-    browser.wait_for("demo.fleet.flying.some((each) => each.flight.time > 0.5)")  # it flies by itself
+    browser.wait_for(
+        "demo.fleet.flying.some((each) => each.flight.time > 0.5)"
+    )  # it flies by itself
     rounds = browser.value("demo.fleet.rounds")
     place = "demo.camera.project(demo.player.bodies()[1].position).slice(0, 2)"
     x, y = browser.value(place)
     browser.drag((x, y), (x + 60, y - 90))
-    assert browser.value("demo.fleet.rounds") == rounds + 1  # all begin anew, from where they were let go
+    assert (
+        browser.value("demo.fleet.rounds") == rounds + 1
+    )  # all begin anew, from where they were let go
     thrown = browser.value("demo.fleet.start")
     assert np.linalg.norm(thrown["velocity"]) > 0.5
     geometric = "demo.fleet.entries[1].flight"
     assert browser.value(f"{geometric}.distance") > 0.3
     browser.wait_for(f"{geometric}.arrival > 0 && {geometric}.distance < 0.05")
-    browser.wait_for("document.querySelector('#score tr:nth-child(2) td').textContent.includes(' of ')")
+    browser.wait_for(
+        "document.querySelector('#score tr:nth-child(2) td').textContent.includes(' of ')"
+    )
 
     browser.value("document.getElementById('tool-push').click()")
     x, y = browser.value(place)
-    browser.call("Input.dispatchMouseEvent", type="mousePressed", x=x, y=y, button="left", buttons=1, clickCount=1)
-    browser.call("Input.dispatchMouseEvent", type="mouseMoved", x=x + 150, y=y, button="left", buttons=1)
+    browser.call(
+        "Input.dispatchMouseEvent",
+        type="mousePressed",
+        x=x,
+        y=y,
+        button="left",
+        buttons=1,
+        clickCount=1,
+    )
+    browser.call(
+        "Input.dispatchMouseEvent", type="mouseMoved", x=x + 150, y=y, button="left", buttons=1
+    )
     browser.wait_for(f"{geometric}.distance > 0.2")
-    browser.call("Input.dispatchMouseEvent", type="mouseReleased", x=x + 150, y=y, button="left", clickCount=1)
+    browser.call(
+        "Input.dispatchMouseEvent",
+        type="mouseReleased",
+        x=x + 150,
+        y=y,
+        button="left",
+        clickCount=1,
+    )
     browser.wait_for(f"{geometric}.distance < 0.05")
 
     assert browser.value("document.getElementById('limit').hidden")

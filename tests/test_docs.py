@@ -1,4 +1,6 @@
-"""The Python of the README and of docs/ runs as it stands there; the fast tests shorten its trainings."""
+"""The Python of the README and of docs/ runs as it stands there; the fast tests shorten its
+trainings.
+"""
 
 import re
 import runpy
@@ -32,11 +34,18 @@ def python_blocks(page: str) -> list[str]:
     return ["\n" * text.count("\n", 0, match.start(1)) + match.group(1) for match in found]
 
 
-NAMES = ["README.md", *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/**/*.md"))]
+NAMES = [
+    "README.md",
+    *sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/**/*.md")),
+]
 PAGES = {page: python_blocks(page) for page in NAMES}
 
 
-TO_RUN = [page for page, blocks in PAGES.items() if any((page, number) not in ELSEWHERE for number in range(len(blocks)))]
+TO_RUN = [
+    page
+    for page, blocks in PAGES.items()
+    if any((page, number) not in ELSEWHERE for number in range(len(blocks)))
+]
 
 
 def run(page: str) -> dict[str, object]:
@@ -55,34 +64,51 @@ def folder(tmp_path, monkeypatch):
 
 
 def shorten_trainings(monkeypatch, rollouts=1):
-    """Trainings end after so many rollouts. A list of them: how long they were to be, and the weights that they end with."""
+    """Trainings end after so many rollouts. A list of them: how long they were to be, and the
+    weights that they end with.
+    """
     learn, trained = OnPolicyAlgorithm.learn, []
 
     def short(self, total_timesteps, *args, **kwargs):
         size = min(total_timesteps, rollouts * self.n_steps * self.n_envs)
         learn(self, size, *args, **{**kwargs, "progress_bar": False})
-        trained.append((total_timesteps, [each.tolist() for each in self.policy.state_dict().values()]))
+        trained.append(
+            (total_timesteps, [each.tolist() for each in self.policy.state_dict().values()])
+        )
         return self
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
-    monkeypatch.setattr(sb3_quad.training.trim, "trim", lambda model: None)  # which needs an agent that flies
+    monkeypatch.setattr(
+        sb3_quad.training.trim, "trim", lambda model: None
+    )  # which needs an agent that flies
     return trained
 
 
 def shown_output(page):
-    (shown,) = re.findall(r"^```text\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    (shown,) = re.findall(
+        r"^```text\n(.*?)^```",
+        (ROOT / page).read_text(encoding="utf-8"),
+        flags=re.DOTALL | re.MULTILINE,
+    )
     return shown
 
 
 def check_output(page, output):
-    """A page shows what its code prints, to within what another seed changes; stage two recovers more often."""
+    """A page shows what its code prints, to within what another seed changes; stage two recovers
+    more often.
+    """
     shown, number = shown_output(page), re.compile(r"\d+\.\d+")
     assert number.sub("#", shown) in number.sub("#", output)
-    ours, theirs = ([[float(each) for each in number.findall(line)] for line in text.splitlines()] for text in (output, shown))
+    ours, theirs = (
+        [[float(each) for each in number.findall(line)] for line in text.splitlines()]
+        for text in (output, shown)
+    )
     for (survival, error), (shown_survival, shown_error) in zip(
         [line for line in ours if len(line) == 2], theirs, strict=True
     ):
-        assert survival == pytest.approx(shown_survival, abs=5.0) and error == pytest.approx(shown_error, abs=0.02)
+        assert survival == pytest.approx(shown_survival, abs=5.0) and error == pytest.approx(
+            shown_error, abs=0.02
+        )
     assert theirs[-2][0] + 20 < theirs[-1][0]
 
 
@@ -162,14 +188,21 @@ def test_exceptions_and_checks_belong_to_pages():
 
 @pytest.mark.parametrize("page", PAGES)
 def test_links_lead_to_files_and_headings(page):
-    text = re.sub(r"^```.*?^```", "", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL | re.MULTILINE)
+    text = re.sub(
+        r"^```.*?^```",
+        "",
+        (ROOT / page).read_text(encoding="utf-8"),
+        flags=re.DOTALL | re.MULTILINE,
+    )
     for target in re.findall(r"\]\((?!https?:)([^)]+)\)", text):
         file, _, heading = target.partition("#")
         path = (ROOT / page).parent / file if file else ROOT / page
         assert path.exists(), target
         if heading:
             titles = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), flags=re.MULTILINE)
-            assert heading in {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}, target
+            assert heading in {
+                re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles
+            }, target
 
 
 def test_the_pages_for_users_are_short():

@@ -1,4 +1,6 @@
-"""Every `sb3-quad` line of README, docs/ and --help runs, on one small rollout and a few flights of a second."""
+"""Every `sb3-quad` line of README, docs/ and --help runs, on one small rollout and a few flights of
+a second.
+"""
 
 import re
 import shlex
@@ -32,7 +34,12 @@ ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
 }
 EVALUATED = ["--eval-env-kwargs", "max_episode_steps:100", "--no-progress"]
 SHORTER = {  # flags that a command is given beside those that stand there
-    "evaluate": ["--episodes", "2", "--overwrite", "--no-report"],  # a report is written for the lines of report
+    "evaluate": [
+        "--episodes",
+        "2",
+        "--overwrite",
+        "--no-report",
+    ],  # a report is written for the lines of report
     "enjoy": ["-n", "20", "--overwrite"],
     "export": ["--overwrite"],
     "sweep": ["--dry-run"],
@@ -43,21 +50,41 @@ SHORTER = {  # flags that a command is given beside those that stand there
     "benchmark": ["--seconds", "0.02", "--sizes", "8", "--n-envs", "1"],
     "check-vehicle": ["-n", "2"],
 }
-SMALL = {"n_timesteps": 960, "n_envs": 48, "n_steps": 20, "batch_size": 240, "n_epochs": 2, "gradient_steps": 4}
+SMALL = {
+    "n_timesteps": 960,
+    "n_envs": 48,
+    "n_steps": 20,
+    "batch_size": 240,
+    "n_epochs": 2,
+    "gradient_steps": 4,
+}
 FLOWN = 100  # control steps, at most
-WITHOUT = ("-n", "--n-trials", "--max-total-trials", "--sizes", "-P")  # flags that SHORTER gives, or that need a screen
+WITHOUT = (
+    "-n",
+    "--n-trials",
+    "--max-total-trials",
+    "--sizes",
+    "-P",
+)  # flags that SHORTER gives, or that need a screen
 
 
 def documented() -> list[str]:
-    """Lines of shell blocks and of the commands' help, less remarks and folders of modules; each once."""
+    """Lines of shell blocks and of the commands' help, less remarks and folders of modules; each
+    once.
+    """
     found = []
     for page in PAGES:
-        for language, block in re.findall(r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.S | re.M):
+        for language, block in re.findall(
+            r"^```(\w*)\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.S | re.M
+        ):
             if language == "bash":
                 found += block.replace("\\\n", " ").splitlines()
     for command in COMMANDS.values():
         found += (command.__doc__ or "").splitlines()
-    called = [re.match(r"(?:\w+=\S+ +)*\s*(?:sb3-quad|python -m sb3_quad\.cli) +(\w.*)", line) for line in found]
+    called = [
+        re.match(r"(?:\w+=\S+ +)*\s*(?:sb3-quad|python -m sb3_quad\.cli) +(\w.*)", line)
+        for line in found
+    ]
     lines = [re.sub(r"\s+(#.*|&)$| {3,}[^ -].*", "", match[1]).strip() for match in called if match]
     return [*dict.fromkeys(re.sub(r" +", " ", line) for line in lines)]
 
@@ -82,7 +109,9 @@ def folder(tmp_path_factory, trained_runs):
             shutil.copy(pretrained("thesis-recovery"), run / "trimmed_model.zip")
             shutil.copy(pretrained("thesis-imitation"), run / "best_model.zip")
     for algo in ("ppo", "logs/ppo"):
-        shutil.copytree(place / "logs/ppo_bc", place / algo / "ppo_bc" if algo == "ppo" else place / algo)
+        shutil.copytree(
+            place / "logs/ppo_bc", place / algo / "ppo_bc" if algo == "ppo" else place / algo
+        )
     shutil.copytree(ROOT / "examples", place / "examples")
     for name in ("my.yaml", "my_vehicle.yaml", "mine_tuned.yaml"):
         shutil.copy(ROOT / "examples/my_quadcopter.yaml", place / name)
@@ -90,8 +119,13 @@ def folder(tmp_path_factory, trained_runs):
     best = place / "logs/tune/dagger/QuadTargetTracking-v0_1/best.yml"
     best.parent.mkdir(parents=True)
     shutil.copy(ROOT / "zoo_configs/dagger.yml", best)
-    for page, key in (("docs/evaluate.md", "my_scenarios.yaml"), ("docs/sweeps.md", "my_sweep.yaml")):
-        (block, *_) = re.findall(r"^```yaml\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M)
+    for page, key in (
+        ("docs/evaluate.md", "my_scenarios.yaml"),
+        ("docs/sweeps.md", "my_sweep.yaml"),
+    ):
+        (block, *_) = re.findall(
+            r"^```yaml\n(.*?)^```", (ROOT / page).read_text(encoding="utf-8"), flags=re.S | re.M
+        )
         (place / key).write_text(block)
     (place / "my.yml").write_text(PENDULUM)
     PPO("MlpPolicy", "Pendulum-v1", device="cpu").save(place / "teacher.zip")
@@ -99,28 +133,43 @@ def folder(tmp_path_factory, trained_runs):
 
 
 def shorter(content):
-    """Settings with one small rollout and small grids; no requirement and no trim, which an agent of one rollout fails."""
+    """Settings with one small rollout and small grids; no requirement and no trim, which an agent
+    of one rollout fails.
+    """
     if not isinstance(content, dict):
         return [shorter(each) for each in content] if isinstance(content, list) else content
     kept = {
         key: shorter(value)
         for key, value in content.items()
-        if key not in ("require", "trim", "position_scale", "leaving_cost", "trim_env_kwargs", "trims")
+        if key
+        not in ("require", "trim", "position_scale", "leaving_cost", "trim_env_kwargs", "trims")
     }
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}
-    return kept | {key: min(kept[key], most) for key, most in SMALL.items() if isinstance(kept.get(key), int)}
+    return kept | {
+        key: min(kept[key], most) for key, most in SMALL.items() if isinstance(kept.get(key), int)
+    }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
-    command, *arguments = shlex.split(line.replace("--n-envs 8", "--n-envs 2"))  # each may be a process
+    command, *arguments = shlex.split(
+        line.replace("--n-envs 8", "--n-envs 2")
+    )  # each may be a process
     read, longest = YamlFolder.read, FlightSettings.longest_episode.fget
-    monkeypatch.setattr(YamlFolder, "read", lambda self, source: (shorter(read(self, source)[0]), read(self, source)[1]))
+    monkeypatch.setattr(
+        YamlFolder,
+        "read",
+        lambda self, source: (shorter(read(self, source)[0]), read(self, source)[1]),
+    )
     monkeypatch.setattr(load, "parse_yaml", lambda text, where: shorter(parse_yaml(text, where)))
-    monkeypatch.setattr(evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1))  # processes would fly longer
-    monkeypatch.setattr(FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN)))
+    monkeypatch.setattr(
+        evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1)
+    )  # processes would fly longer
+    monkeypatch.setattr(
+        FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN))
+    )
     monkeypatch.setattr("sb3_quad.show.film.HOLD", 0.1)
     monkeypatch.setattr("sb3_quad.training.transfer.CLONE_STEPS", 100)
     monkeypatch.setattr(pipeline, "is_pipeline_run", lambda path: False)
@@ -131,8 +180,26 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
         del arguments[first : first + 1 + (arguments[first] != "-P")]
         while first < len(arguments) and arguments[first].isdigit():
             del arguments[first]
-    screen = [] if command != "enjoy" or "-o" in arguments or "--no-render" in arguments else ["--no-render"]
+    screen = (
+        []
+        if command != "enjoy" or "-o" in arguments or "--no-render" in arguments
+        else ["--no-render"]
+    )
     if command == "report":
-        main(["evaluate", "pid", "--suite", "quick", "--episodes", "2", "-o", arguments[0], "--overwrite"])
+        main(
+            [
+                "evaluate",
+                "pid",
+                "--suite",
+                "quick",
+                "--episodes",
+                "2",
+                "-o",
+                arguments[0],
+                "--overwrite",
+            ]
+        )
         arguments += [] if "--overwrite" in arguments else ["--overwrite"]
-    assert main([command, *arguments, *screen, *SHORTER.get(command, [])]) == 0, capsys.readouterr().err
+    assert main([command, *arguments, *screen, *SHORTER.get(command, [])]) == 0, (
+        capsys.readouterr().err
+    )

@@ -1,4 +1,6 @@
-"""``evaluate``: every controller on the same episodes, nothing flown twice or lost, failures in one line."""
+"""``evaluate``: every controller on the same episodes, nothing flown twice or lost, failures in one
+line.
+"""
 
 import csv
 import importlib
@@ -96,12 +98,19 @@ def times_of_change(folder):
 
 def test_the_physical_limit_stands_beside_the_time_to_stay(here, capsys):
     some = ["--suite", "thesis", "--scenario", "tracking", "tracking_15m", "--episodes", "2"]
-    assert main(["evaluate", "geometric", "crazyflie-robust", *some, "-o", "out", "--no-report"]) == 0
+    assert (
+        main(["evaluate", "geometric", "crazyflie-robust", *some, "-o", "out", "--no-report"]) == 0
+    )
     limits = [load_vehicle(name).time_optimal[10] for name in ("itm", "crazyflie")]
     assert [entry.physical_limit for entry in load_results("out").entries] == [*limits, None, None]
     lines = capsys.readouterr().out.splitlines()
-    (at,) = (number for number, line in enumerate(lines) if "physical limit of that time, s" in line)
-    assert all(f"{limit:.2f}" in lines[at] for limit in limits) and "to stay within 0.1 m, s" in lines[at - 1]
+    (at,) = (
+        number for number, line in enumerate(lines) if "physical limit of that time, s" in line
+    )
+    assert (
+        all(f"{limit:.2f}" in lines[at] for limit in limits)
+        and "to stay within 0.1 m, s" in lines[at - 1]
+    )
 
 
 def test_table_results_and_episodes_agree(here, capsys):
@@ -121,15 +130,26 @@ def test_table_results_and_episodes_agree(here, capsys):
         assert part in text
     results = load_results("out")
     assert [record.label for record in results.controllers] == ["pid", "still"]
-    assert [each.name for each in results.scenarios] == ["tracking", "course", "starts.0", "starts.60"]
+    assert [each.name for each in results.scenarios] == [
+        "tracking",
+        "course",
+        "starts.0",
+        "starts.60",
+    ]
     assert len(results.entries) == 8 and not results.failures
     episodes = rows()
     assert len(episodes) == 2 * (5 + 2 + 3 + 3)
     for entry in results.entries:
-        own = [row for row in episodes if (row["controller"], row["scenario"]) == (entry.controller, entry.scenario)]
+        own = [
+            row
+            for row in episodes
+            if (row["controller"], row["scenario"]) == (entry.controller, entry.scenario)
+        ]
         assert len(own) == entry.metrics.n
         assert np.mean([row["outcome"] == "success" for row in own]) == entry.metrics.success.value
-        assert np.mean([float(row["reward"]) for row in own]) == pytest.approx(entry.metrics.reward.value)
+        assert np.mean([float(row["reward"]) for row in own]) == pytest.approx(
+            entry.metrics.reward.value
+        )
         assert [int(row["seed"]) for row in own] == next(
             each.episode_seeds() for each in results.scenarios if each.name == entry.scenario
         )
@@ -138,30 +158,51 @@ def test_table_results_and_episodes_agree(here, capsys):
         assert arrays["position"].shape[:2] == (min(len(own), 8), len(arrays["time"]))
     # The same starts and targets for both.
     names = [name for name in episodes[0] if name.startswith(("start_", "target_"))]
-    pid, still = ([[row[name] for name in names] for row in episodes if row["controller"] == who] for who in ("pid", "still"))
+    pid, still = (
+        [[row[name] for name in names] for row in episodes if row["controller"] == who]
+        for who in ("pid", "still")
+    )
     assert pid == still
     course = results.entry("pid", "course").metrics.course
-    assert course.completed.value == 1.0 and results.entry("still", "course").metrics.course.completed.value == 0.0
-    assert [row["waypoints_reached"] for row in episodes if row["scenario"] == "course"] == ["2", "2", "0", "0"]
+    assert (
+        course.completed.value == 1.0
+        and results.entry("still", "course").metrics.course.completed.value == 0.0
+    )
+    assert [row["waypoints_reached"] for row in episodes if row["scenario"] == "course"] == [
+        "2",
+        "2",
+        "0",
+        "0",
+    ]
 
 
 def test_files_that_are_no_results_are_kept(here, capsys):
     (here / "out").mkdir()
     (here / "out" / "report.md").write_text("mine")
-    assert evaluate("a=pid", "--scenario", "tracking") == 2 and "report.md: exists already" in capsys.readouterr().err
+    assert (
+        evaluate("a=pid", "--scenario", "tracking") == 2
+        and "report.md: exists already" in capsys.readouterr().err
+    )
 
 
 def test_a_folder_of_results_is_kept_or_written_anew(here, capsys):
     assert evaluate("a=pid", "b=pid", "--scenario", "tracking", "starts") == 0
     before, shown = times_of_change(here), capsys.readouterr().out
-    assert evaluate("a=pid", "b=pid", "--scenario", "tracking", "starts") == 0  # killed after the last flight, say
-    assert times_of_change(here) == before and capsys.readouterr().out.splitlines()[:10] == shown.splitlines()[:10]
+    assert (
+        evaluate("a=pid", "b=pid", "--scenario", "tracking", "starts") == 0
+    )  # killed after the last flight, say
+    assert (
+        times_of_change(here) == before
+        and capsys.readouterr().out.splitlines()[:10] == shown.splitlines()[:10]
+    )
     assert evaluate("a=pid", "--scenario", "tracking") == 2
     error = capsys.readouterr().err
     assert "holds results already; give another folder with -o" in error and error.count("\n") == 1
     assert times_of_change(here) == before
     assert evaluate("a=pid", "--scenario", "tracking", "--seed", "7", "--overwrite") == 0
-    assert {row["seed"] for row in rows()} == {str(each) for each in row_seeds(seed_for("suite", 7), 5)}
+    assert {row["seed"] for row in rows()} == {
+        str(each) for each in row_seeds(seed_for("suite", 7), 5)
+    }
     assert len(times_of_change(here)) == len(load_results("out").entries) == 1
 
 
@@ -178,7 +219,9 @@ def test_an_interrupted_evaluation_goes_on_by_the_same_command_alone(here, capsy
         sys.modules["my_controllers"].calls = 5
         code = evaluate(*again)
         assert not half.exists()
-        kept = [path.parts[-2] for path, time in before.items() if times_of_change(here)[path] == time]
+        kept = [
+            path.parts[-2] for path, time in before.items() if times_of_change(here)[path] == time
+        ]
         if again == command[:1]:
             assert code == 2 and len(kept) == 3
             continue
@@ -208,7 +251,9 @@ def test_failures_are_one_line_each_and_the_others_fly(here, capsys):
     assert len(lines) == len(bad)
     for spec, message in bad.items():
         label = spec.removesuffix(".zip")
-        (line,) = [line for line in lines if line.startswith((f"failed: {label}:", f"failed: {label},"))]
+        (line,) = [
+            line for line in lines if line.startswith((f"failed: {label}:", f"failed: {label},"))
+        ]
         assert message in line
     results = load_results("out")
     assert [entry.controller for entry in results.entries] == ["pid"]
@@ -239,7 +284,9 @@ def test_zips_of_stock_algorithms_fly(here, capsys, backend):
         if backend == "pybullet" and algorithm not in (PPO, SAC):
             continue
         env = QuadcopterVecEnv(2, seed=0)
-        model = algorithm("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0, **arguments)
+        model = algorithm(
+            "MlpPolicy", env, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0, **arguments
+        )
         model.learn(32)
         model.save(f"{algorithm.__name__}.zip")
         with zipfile.ZipFile(f"{algorithm.__name__}.zip") as archive:
@@ -250,7 +297,9 @@ def test_zips_of_stock_algorithms_fly(here, capsys, backend):
     arguments = ["--scenario", "tracking", "--episodes", "2", "--backend", backend]
     assert evaluate(*(f"{label}.zip" for label in labels), *arguments) == 0
     results = load_results("out")
-    assert [(record.label, record.algorithm) for record in results.controllers] == [(label, label) for label in labels]
+    assert [(record.label, record.algorithm) for record in results.controllers] == [
+        (label, label) for label in labels
+    ]
     assert len(results.entries) == len(labels)
 
 
@@ -281,7 +330,15 @@ def test_each_agent_flies_its_own_vehicle_unless_another_is_asked_for(here, caps
 def test_an_agent_sees_its_own_scaling(here, capsys):
     std = np.linspace(1.0, 3.0, 18)
     env = QuadcopterVecEnv(2, seed=0, observation_std=std)
-    model = PPO("MlpPolicy", env, n_steps=16, batch_size=16, policy_kwargs={"net_arch": [8]}, device="cpu", seed=0)
+    model = PPO(
+        "MlpPolicy",
+        env,
+        n_steps=16,
+        batch_size=16,
+        policy_kwargs={"net_arch": [8]},
+        device="cpu",
+        seed=0,
+    )
     with torch.no_grad():
         model.policy.action_net.weight *= 50.0
     model.save("silent.zip")
@@ -292,11 +349,18 @@ def test_an_agent_sees_its_own_scaling(here, capsys):
     (warning,) = capsys.readouterr().err.splitlines()
     assert "silent.zip does not say how its agent flies; it flies itm" in warning
     results = load_results("out")
-    rewards = {name: results.entry(name, "tracking").metrics.reward.value for name in ("silent", "telling")}
+    rewards = {
+        name: results.entry(name, "tracking").metrics.reward.value for name in ("silent", "telling")
+    }
     (tracking,) = load_suite("small.yaml").with_changes(["tracking"], 3).scenarios
     for name, scaling in (("silent", {}), ("telling", {"observation_std": std})):
         settings = tracking.flown_as.with_changes(**scaling)
-        flights = fly_settings(model, settings, tracking.episode_seeds(), plan=sample_plan(tracking, tracking.episode_seeds()))
+        flights = fly_settings(
+            model,
+            settings,
+            tracking.episode_seeds(),
+            plan=sample_plan(tracking, tracking.episode_seeds()),
+        )
         assert rewards[name] == pytest.approx(flights.reward.mean())
     assert rewards["silent"] != pytest.approx(rewards["telling"])
 
@@ -304,7 +368,9 @@ def test_an_agent_sees_its_own_scaling(here, capsys):
 def test_nothing_flown_leaves_no_folder_and_a_bad_module_is_told_once(here, capsys):
     assert evaluate("missing.zip", "no_such_module:make") == 1
     output = capsys.readouterr()
-    assert output.err.count("missing.zip: no such file") == output.err.count("cannot be imported") == 1
+    assert (
+        output.err.count("missing.zip: no such file") == output.err.count("cannot be imported") == 1
+    )
     assert output.err.count("\n") == 2 and "results in" not in output.out
     assert not (here / "out").exists()
 
@@ -312,5 +378,7 @@ def test_nothing_flown_leaves_no_folder_and_a_bad_module_is_told_once(here, caps
 @pytest.mark.slow
 def test_workers_fly_the_same(here, capsys):
     assert evaluate("pid", "geometric", "--scenario", "starts") == 0
-    assert evaluate("pid", "geometric", "--scenario", "starts", "--workers", "2", folder="other") == 0
+    assert (
+        evaluate("pid", "geometric", "--scenario", "starts", "--workers", "2", folder="other") == 0
+    )
     assert rows() == rows("other")

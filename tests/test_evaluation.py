@@ -1,4 +1,6 @@
-"""Flights: what is measured is the true flight of the episodes that were asked for, in either environment."""
+"""Flights: what is measured is the true flight of the episodes that were asked for, in either
+environment.
+"""
 
 import io
 
@@ -44,7 +46,10 @@ def same(a: Flights, b: Flights) -> None:
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
 def test_pybullet_gives_the_same_flights(task, vehicle):
     expert = PIDExpert(vehicle)
-    flights = [fly(expert, task, 3, seed=11, vehicle=vehicle, backend=backend, max_steps=400) for backend in BACKENDS]
+    flights = [
+        fly(expert, task, 3, seed=11, vehicle=vehicle, backend=backend, max_steps=400)
+        for backend in BACKENDS
+    ]
     same(*flights)
 
 
@@ -55,7 +60,9 @@ def test_rows_do_not_depend_on_their_number(seed, n):
     alone = fly_settings(PIDExpert(), recovery, row_seeds(seed, n)[-1:])
     among = fly(PIDExpert(), "state_recovery", n, seed, max_steps=150)
     last = {
-        name: {key: times[-1:] for key, times in values.items()} if isinstance(values, dict) else values[-1:]
+        name: {key: times[-1:] for key, times in values.items()}
+        if isinstance(values, dict)
+        else values[-1:]
         for name, values in vars(among).items()
     }
     same(alone, Flights(**last))
@@ -71,7 +78,10 @@ def test_metrics_are_those_of_the_environment():
             ended.setdefault(int(row), infos[row])
     flights = fly(expert, "state_recovery", 6, seed=3, max_steps=300)
     for row, info in ended.items():
-        assert (flights.success[row], flights.survival[row]) == (info["is_success"], info["survival"])
+        assert (flights.success[row], flights.survival[row]) == (
+            info["is_success"],
+            info["survival"],
+        )
         assert flights.length[row] == info["episode"]["l"]
         assert flights.reward[row] == pytest.approx(info["episode"]["r"], abs=1e-4)
         assert flights.final_error[row] == pytest.approx(info["distance"], abs=1e-9)
@@ -80,13 +90,17 @@ def test_metrics_are_those_of_the_environment():
 def test_a_fall_is_as_long_as_it_is_high():
     flights = fly(fall, "target_tracking", 4, seed=0)
     assert not flights.survival.any() and not flights.success.any()
-    assert flights.path_length == pytest.approx(np.full(4, 15 - 0.135), abs=0.15)  # at most one step's way past contact
+    assert flights.path_length == pytest.approx(
+        np.full(4, 15 - 0.135), abs=0.15
+    )  # at most one step's way past contact
     assert (flights.length == flights.length[0]).all()
     assert np.isnan(flights.time_to[0.1]).all()
 
 
 def test_hovering_covers_no_distance_and_time_zero_is_the_start():
-    flights = fly(hover, "target_tracking", 2, seed=0, max_steps=5, task_kwargs={"target_distance": 0.3})
+    flights = fly(
+        hover, "target_tracking", 2, seed=0, max_steps=5, task_kwargs={"target_distance": 0.3}
+    )
     assert (flights.time_to[0.5] == 0.0).all()
     assert np.isnan(flights.time_to[0.2]).all()
     assert flights.survival.all() and not flights.success.any() and (flights.length == 5).all()
@@ -120,7 +134,13 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
             self.seen.append(state.distance.copy())
 
     distances = Distances()
-    flights = fly(load_pretrained("itm-robust"), n_episodes=24, max_steps=700, hooks=[distances], **env_kwargs("itm-robust"))
+    flights = fly(
+        load_pretrained("itm-robust"),
+        n_episodes=24,
+        max_steps=700,
+        hooks=[distances],
+        **env_kwargs("itm-robust"),
+    )
     leaves = []
     for row, seen in enumerate(np.array(distances.seen).T):
         within = seen <= 0.1
@@ -135,7 +155,9 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
 
 def table_of(metrics, name, beside):
     scenario = load_suite("thesis").scenario(name)
-    rows = metric_rows(scenario, [metric_cells(metrics)], [scenario.reference[each] for each in beside])
+    rows = metric_rows(
+        scenario, [metric_cells(metrics)], [scenario.reference[each] for each in beside]
+    )
     return Table([Column("agent"), *(Column(each, source="thesis") for each in beside)], rows)
 
 
@@ -164,11 +186,19 @@ def test_tables_say_how_many_arrived():
     assert (metrics.success.value, metrics.survival.value) == (0.25, 0.75)
     assert (metrics.collisions, metrics.out_of_range) == (1, 0)
     assert metrics.arrivals[-1].time.value == 5.0 and metrics.arrivals[-1].share.value == 0.75
-    assert metrics.arrivals[-1].stays.time.value == 5.0 and metrics.arrivals[-1].stays.share.value == 0.5
-    assert metrics.arrivals[-1].leaves.value == pytest.approx(2 / 3) and metrics.arrivals[0].leaves is None
+    assert (
+        metrics.arrivals[-1].stays.time.value == 5.0
+        and metrics.arrivals[-1].stays.share.value == 0.5
+    )
+    assert (
+        metrics.arrivals[-1].leaves.value == pytest.approx(2 / 3)
+        and metrics.arrivals[0].leaves is None
+    )
     assert metrics.stabilised.time.value == 2.0 and metrics.stabilised.share.value == 0.75
     assert metrics.sideways.value == pytest.approx(0.4)
-    assert metrics.final_error_95.value == pytest.approx(0.29) and metrics.final_error_95.high <= 0.3
+    assert (
+        metrics.final_error_95.value == pytest.approx(0.29) and metrics.final_error_95.high <= 0.3
+    )
     assert metrics.final_error_max == 0.3 and metrics.final_offset == pytest.approx((0.2, 0.0, 0.0))
     text = text_of(table_of(metrics, "tracking", ["expert"]))
     for part in (

@@ -40,7 +40,11 @@ def test_every_script_is_run_here_and_says_how_it_is_started():
 
 def shares(output):
     """By who flew, the percentages of success and survival that an example prints."""
-    lines = re.findall(r"^(.+): (?:mean reward .+, )?success ([\d.]+)%, survival ([\d.]+)%$", output, flags=re.MULTILINE)
+    lines = re.findall(
+        r"^(.+): (?:mean reward .+, )?success ([\d.]+)%, survival ([\d.]+)%$",
+        output,
+        flags=re.MULTILINE,
+    )
     return {name: (float(success), float(survival)) for name, success, survival in lines}
 
 
@@ -58,7 +62,9 @@ def shares(output):
     ],
 )
 def test_agents_succeed(run, name, agents, success):
-    """As the examples are shipped; 480 episodes of 15 s each, as they print. The thesis's stages: tests/test_docs.py."""
+    """As the examples are shipped; 480 episodes of 15 s each, as they print. The thesis's stages:
+    tests/test_docs.py.
+    """
     output = run(name)
     found = shares(output)
     rewards = [float(reward) for reward in re.findall(r"mean reward (-[\d.]+)", output)]
@@ -68,11 +74,17 @@ def test_agents_succeed(run, name, agents, success):
 
 
 def test_imitation_then_stage_two_then_stock_sb3(run, tmp_path):
-    assert {"agent, state_recovery", "agent, target_tracking"} < shares(run("train_dagger.py", *SHORT)).keys()
+    assert {"agent, state_recovery", "agent, target_tracking"} < shares(
+        run("train_dagger.py", *SHORT)
+    ).keys()
     output = run("train_ppo_bc.py", "dagger.zip", *SHORT)
     assert "tracking: success" in output and "saved to ppo_bc.zip" in output
-    assert (tmp_path / "best_model.zip").is_file() and (tmp_path / "evaluations_tracking.npz").is_file()
-    first, second = (PPO.load(name, device="cpu").policy.state_dict() for name in ("dagger.zip", "ppo_bc.zip"))
+    assert (tmp_path / "best_model.zip").is_file() and (
+        tmp_path / "evaluations_tracking.npz"
+    ).is_file()
+    first, second = (
+        PPO.load(name, device="cpu").policy.state_dict() for name in ("dagger.zip", "ppo_bc.zip")
+    )
     # One rollout of stage two only warms up the critic: the actor is the one that was handed over.
     assert np.array_equal(first["action_net.weight"], second["action_net.weight"])
     assert not np.array_equal(first["value_net.weight"], second["value_net.weight"])
@@ -88,14 +100,19 @@ def test_own_experts_and_vehicles_recover(run, name):
 
 
 def test_cloning_plot(run, tmp_path):
-    rows = [f'"our reward, {kind}",tracking,{error}' for kind, error in (("cloning", 0.1), ("none", 0.5), ("none", 0.6))]
+    rows = [
+        f'"our reward, {kind}",tracking,{error}'
+        for kind, error in (("cloning", 0.1), ("none", 0.5), ("none", 0.6))
+    ]
     (tmp_path / "results.csv").write_text("\n".join(["configuration,scenario,final_error", *rows]))
     run("cloning_plot.py", "results.csv", "cloning.png")
     assert Image.open(tmp_path / "cloning.png").size[0] > 500
 
 
 def test_adaptive_scaling(run, tmp_path):
-    """A PID that takes its target to lie 0.3 m off, as a policy: μ is what α, 0.5 at the target, leaves of that."""
+    """A PID that takes its target to lie 0.3 m off, as a policy: μ is what α, 0.5 at the target,
+    leaves of that.
+    """
     (tmp_path / "observing.py").write_text(
         "import numpy as np\n"
         "from sb3_quad import PIDExpert\n"
@@ -104,7 +121,9 @@ def test_adaptive_scaling(run, tmp_path):
         "    expert = PIDExpert(vehicle, observation_mean=mean)\n"
         "    return lambda observation: expert.predict(observation)[0]\n"
     )
-    printed = run("adaptive_scaling.py", "pid", "agent=observing:make", "--episodes", "2", "-o", "times.png")
+    printed = run(
+        "adaptive_scaling.py", "pid", "agent=observing:make", "--episodes", "2", "-o", "times.png"
+    )
     found = [float(x) for x in re.search(r"agent: offset μ = \((.+)\) m", printed)[1].split(",")]
     assert found == pytest.approx((-0.15, 0.0, 0.0), abs=0.01)
     assert "agent (adaptive)" in printed and "pid (adaptive)" not in printed
@@ -117,7 +136,9 @@ def test_thesis_readings(run):
 
 
 def test_own_callback(run):
-    output = run("own_callback.py", "--timesteps", "100000")  # the first episodes end in the third rollout
+    output = run(
+        "own_callback.py", "--timesteps", "100000"
+    )  # the first episodes end in the third rollout
     assert "episodes crashed, beta 0.80" in output
 
 
@@ -143,9 +164,17 @@ def test_trajectory_plots(run, tmp_path):
 
 def test_observation_statistics(run, tmp_path):
     printed = run("observation_statistics.py", "--timesteps", "4000").splitlines()
-    assert [line.split()[0] for line in printed] == ["group", "position", "rotation", "velocity", "body_rates"]
+    assert [line.split()[0] for line in printed] == [
+        "group",
+        "position",
+        "rotation",
+        "velocity",
+        "body_rates",
+    ]
     deviations = yaml.safe_load((tmp_path / "sigma.yaml").read_text())["observation_std"]
-    assert len(deviations) == 18 and np.sqrt(np.mean(np.square(deviations[:3]))) == pytest.approx(5.7, rel=0.3)  # m
+    assert len(deviations) == 18 and np.sqrt(np.mean(np.square(deviations[:3]))) == pytest.approx(
+        5.7, rel=0.3
+    )  # m
 
 
 @pytest.mark.slow
@@ -153,10 +182,17 @@ def test_tune_expert(run, tmp_path):
     poor = load_vehicle("itm").geometric_gains
     poor = poor.model_copy(update={"position": 0.9 * poor.position, "measured": None})
     slow = load_vehicle("itm").model_copy(update={"geometric_gains": poor})
-    (tmp_path / "slow.yaml").write_text(yaml.safe_dump(slow.model_dump(mode="json", exclude_none=True)))
+    (tmp_path / "slow.yaml").write_text(
+        yaml.safe_dump(slow.model_dump(mode="json", exclude_none=True))
+    )
     few = ["slow.yaml", "-o", "tuned.yaml", "--starts", "120", "--targets", "8", "--episodes", "16"]
-    printed = [run("tune_expert.py", *few, "-n", number) for number in ("3", "20")]  # 17 more, from the journal
-    costs = [float(re.search(r"\d gains tried, least cost (-?[\d.]+); saved tuned.yaml", text)[1]) for text in printed]
+    printed = [
+        run("tune_expert.py", *few, "-n", number) for number in ("3", "20")
+    ]  # 17 more, from the journal
+    costs = [
+        float(re.search(r"\d gains tried, least cost (-?[\d.]+); saved tuned.yaml", text)[1])
+        for text in printed
+    ]
     assert costs[1] <= costs[0]
     tuned = load_vehicle("tuned.yaml")
     assert tuned.geometric_gains.measured["recovery_episodes"] == 64
@@ -165,28 +201,48 @@ def test_tune_expert(run, tmp_path):
 
 @pytest.mark.slow
 def test_time_optimal(run):
-    """The least time is below the expert's, and no less than that of a point that may accelerate in any direction at once."""
+    """The least time is below the expert's, and no less than that of a point that may accelerate in
+    any direction at once.
+    """
     pytest.importorskip("casadi")
     printed = run("time_optimal.py", "hummingbird", "--distances", "10", "--directions", "2")
-    assert 1.0 < float(re.search(r"hummingbird, 10 m: ([\d.]+) s .* 2 of 2 directions solved", printed)[1]) < 1.6
+    assert (
+        1.0
+        < float(re.search(r"hummingbird, 10 m: ([\d.]+) s .* 2 of 2 directions solved", printed)[1])
+        < 1.6
+    )
 
 
 def test_publish(run, tmp_path):
     """More of it: tests/test_pretrained.py."""
     with pytest.raises(SystemExit) as left:
         run("publish.py", "itm-imitation", "--name", "mine", "--episodes", "1")
-    assert left.value.code == 0 and {"mine.zip", "mine.md"} == {path.name for path in tmp_path.iterdir()}
+    assert left.value.code == 0 and {"mine.zip", "mine.md"} == {
+        path.name for path in tmp_path.iterdir()
+    }
 
 
 def test_robustness_plot(run, tmp_path):
-    asked = ["--suite", "robustness", "--scenario", "mass", "--episodes", "2", "-o", "results", "--no-report"]
+    asked = [
+        "--suite",
+        "robustness",
+        "--scenario",
+        "mass",
+        "--episodes",
+        "2",
+        "-o",
+        "results",
+        "--no-report",
+    ]
     assert main(["evaluate", "pid", *asked]) == 0
     run("robustness_plot.py", "results", "robustness.png")
     width, height = Image.open(tmp_path / "robustness.png").size
     assert width < height  # one scenario: one column of two panels
 
 
-@pytest.mark.skipif(importlib.util.find_spec("foundation_policy") is None, reason="needs foundation-policy")
+@pytest.mark.skipif(
+    importlib.util.find_spec("foundation_policy") is None, reason="needs foundation-policy"
+)
 def test_raptor(run):
     output = run("raptor.py")
     assert output.count("survival") == 2

@@ -1,4 +1,6 @@
-"""The experts fly as the specification measured (section 8), and answer SB3's ``predict`` as they answer the true state."""
+"""The experts fly as the specification measured (section 8), and answer SB3's ``predict`` as they
+answer the true state.
+"""
 
 import sys
 import types
@@ -25,7 +27,9 @@ TO_R0 = np.array([0.0, 0.0, 15.0])
 
 
 def fly_one(expert, target, *, start=(), wrench=None, steps=1500):
-    """One flight without noise: distances to the target, path length, and the step on which it was lost (or None)."""
+    """One flight without noise: distances to the target, path length, and the step on which it was
+    lost (or None).
+    """
     env = QuadcopterVecEnv(1, noise=0.0, seed=0)
     env.reset()
     env.set_target(np.asarray(target, dtype=float))
@@ -64,7 +68,9 @@ def test_pid_recovery_figure():
     assert 100 * flights.survival.mean() == pytest.approx(31.9, abs=2.0)
 
 
-@pytest.mark.parametrize(("sign", "times", "length"), [(1, (7.23, 6.45, 4.54), 10.19), (-1, (8.18, 7.26, 5.31), 11.05)])
+@pytest.mark.parametrize(
+    ("sign", "times", "length"), [(1, (7.23, 6.45, 4.54), 10.19), (-1, (8.18, 7.26, 5.31), 11.05)]
+)
 def test_pid_fixed_targets(sign, times, length):
     distances, path, _ = fly_one(PIDExpert(), TO_R0 + sign * 10 / np.sqrt(3))
     for tolerance, seconds in zip((0.1, 0.2, 1.0), times, strict=True):
@@ -73,7 +79,8 @@ def test_pid_fixed_targets(sign, times, length):
 
 
 @pytest.mark.parametrize(
-    ("quaternion", "velocity", "seconds"), [((0, -1, 0, 0), (2, 2, 0), 1.78), ((0.42, 0.41, 0.81, 0), (2, 2, -2), 1.46)]
+    ("quaternion", "velocity", "seconds"),
+    [((0, -1, 0, 0), (2, 2, 0), 1.78), ((0.42, 0.41, 0.81, 0), (2, 2, -2), 1.46)],
 )
 def test_pid_hits_the_ground_from_the_fixed_initial_states(quaternion, velocity, seconds):
     attitude = np.array(quaternion) / np.linalg.norm(quaternion)
@@ -83,7 +90,9 @@ def test_pid_hits_the_ground_from_the_fixed_initial_states(quaternion, velocity,
 
 
 def test_pid_error_under_a_constant_force():
-    distances, _, hit = fly_one(PIDExpert(), (10, 10, 25), wrench=lambda step: {"force": (-3.0, -3.0, -3.0)})
+    distances, _, hit = fly_one(
+        PIDExpert(), (10, 10, 25), wrench=lambda step: {"force": (-3.0, -3.0, -3.0)}
+    )
     assert hit is None and distances[-1] == pytest.approx(5.6, rel=0.01)
 
 
@@ -96,16 +105,22 @@ def test_pid_gains_of_itm_are_those_of_table_a1():
 
 def test_the_scaling_is_that_of_table_a2():
     np.testing.assert_array_equal(DEFAULT_MEAN, np.zeros(18))
-    np.testing.assert_array_equal(DEFAULT_STD, np.repeat([10 / np.sqrt(3), np.sqrt(3), 5.0, 5.0], [3, 9, 3, 3]))
+    np.testing.assert_array_equal(
+        DEFAULT_STD, np.repeat([10 / np.sqrt(3), np.sqrt(3), 5.0, 5.0], [3, 9, 3, 3])
+    )
 
 
 def test_geometric_gains_come_from_the_vehicle_or_its_authority():
     itm = load_vehicle("itm")
     assert GeometricExpert().gains == itm.geometric_gains
     assert GeometricExpert(gains=derived_gains(itm)).gains.measured is None
-    slow = itm.model_copy(update={"motor_gain": 10.0, "inertia": tuple(3 * each for each in itm.inertia)})
+    slow = itm.model_copy(
+        update={"motor_gain": 10.0, "inertia": tuple(3 * each for each in itm.inertia)}
+    )
     gains = GeometricExpert(slow).gains
-    assert gains.attitude < itm.geometric_gains.attitude  # a vehicle that turns more slowly is asked for less
+    assert (
+        gains.attitude < itm.geometric_gains.attitude
+    )  # a vehicle that turns more slowly is asked for less
     assert gains.angular_deceleration == pytest.approx(derived_gains(itm).angular_deceleration / 3)
 
 
@@ -129,13 +144,19 @@ def test_actions_are_always_valid(expert, data):
     number = st.floats(-1e3, 1e3)
     array = np.array(data.draw(st.lists(number, min_size=20, max_size=20)))[:, None]
     norm = np.linalg.norm(array[QUATERNION])
-    array[QUATERNION] = array[QUATERNION] / norm if norm > 1e-3 else np.array([[1.0], [0], [0], [0]])
+    array[QUATERNION] = (
+        array[QUATERNION] / norm if norm > 1e-3 else np.array([[1.0], [0], [0], [0]])
+    )
     actions = expert.actions(QuadcopterState(array))
     assert np.isfinite(actions).all() and np.abs(actions).max() <= 1.0
 
 
-def test_a_module_of_the_present_folder_is_found_where_only_installed_ones_are_searched(tmp_path, monkeypatch):
-    """As in an installed command; it comes last on the path, so that nothing there replaces an installed module."""
+def test_a_module_of_the_present_folder_is_found_where_only_installed_ones_are_searched(
+    tmp_path, monkeypatch
+):
+    """As in an installed command; it comes last on the path, so that nothing there replaces an
+    installed module.
+    """
     (tmp_path / "my_own.py").write_text(
         "from stable_baselines3.common.callbacks import BaseCallback as Callback\nfrom sb3_quad import PIDExpert as Pilot\n"
     )
@@ -157,7 +178,9 @@ def test_a_module_of_the_present_folder_is_found_where_only_installed_ones_are_s
 
 
 def test_experts_by_name(tmp_path, monkeypatch):
-    assert isinstance(resolve_expert("pid"), PIDExpert) and isinstance(resolve_expert("geometric"), GeometricExpert)
+    assert isinstance(resolve_expert("pid"), PIDExpert) and isinstance(
+        resolve_expert("geometric"), GeometricExpert
+    )
     module = types.ModuleType("my_experts")
     module.hover = lambda vehicle: lambda observation: np.zeros((len(observation), 4))
     module.broken = lambda vehicle: 1 / 0
@@ -195,4 +218,6 @@ def test_the_readings_of_the_thesis_contain_ours_and_agree_near_level():
     state.array[QUATERNION] = np.vstack([np.ones(300), 1e-4 * rng.normal(size=(3, 300))])
     ours = PIDExpert().actions(state)
     for order in ("zyx", "zxy", "xyz"):
-        np.testing.assert_allclose(PIDReading("itm", order, "world").actions(state), ours, atol=0.02)
+        np.testing.assert_allclose(
+            PIDReading("itm", order, "world").actions(state), ours, atol=0.02
+        )

@@ -1,4 +1,6 @@
-"""Exported policies compute what the trained ones do, in physical units, and fly without this package."""
+"""Exported policies compute what the trained ones do, in physical units, and fly without this
+package.
+"""
 
 import json
 import re
@@ -43,10 +45,20 @@ needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C comp
 
 def untrained(kind, env):
     algorithm, kwargs = MODELS[kind]
-    further = {"use_sde": True} if kind == "squashed" else {"buffer_size": 10} if algorithm in (SAC, TD3) else {}
+    further = (
+        {"use_sde": True}
+        if kind == "squashed"
+        else {"buffer_size": 10}
+        if algorithm in (SAC, TD3)
+        else {}
+    )
     model = algorithm("MlpPolicy", env, policy_kwargs=kwargs, seed=1, device="cpu", **further)
-    last = {"sac": lambda: model.actor.mu, "td3": lambda: model.actor.mu[-2]}.get(kind, lambda: model.policy.action_net)()
-    with torch.no_grad():  # SB3 starts near zero, where neither order of rotors nor clipping would show
+    last = {"sac": lambda: model.actor.mu, "td3": lambda: model.actor.mu[-2]}.get(
+        kind, lambda: model.policy.action_net
+    )()
+    with (
+        torch.no_grad()
+    ):  # SB3 starts near zero, where neither order of rotors nor clipping would show
         last.weight *= 8.0 if algorithm in (SAC, TD3) else 80.0
         last.bias.copy_(torch.tensor([0.3, -0.2, 0.1, 0.0]))
     return model
@@ -63,7 +75,9 @@ def zips(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def flight():
-    """What an environment shows of random states, and the same in physical units, worked out from the true state."""
+    """What an environment shows of random states, and the same in physical units, worked out from
+    the true state.
+    """
     env = QuadcopterVecEnv(300, "recovery_and_tracking", noise=0.0, seed=7)
     return env.reset(), physical_features(env.true_state())
 
@@ -78,11 +92,21 @@ SEES = {
 
 @pytest.fixture(scope="module")
 def extended(tmp_path_factory):
-    """Zips of policies that hover, by the weights of one that came with the package, and react to all that they see."""
-    folder, old = tmp_path_factory.mktemp("extended"), PPO.load(pretrained("itm-recovery"), device="cpu").policy
+    """Zips of policies that hover, by the weights of one that came with the package, and react to
+    all that they see.
+    """
+    folder, old = (
+        tmp_path_factory.mktemp("extended"),
+        PPO.load(pretrained("itm-recovery"), device="cpu").policy,
+    )
     torch.manual_seed(0)
     for name, sees in SEES.items():
-        model = PPO("MlpPolicy", QuadcopterVecEnv(1, seed=0, **sees), policy_kwargs={"net_arch": [64, 64]}, device="cpu")
+        model = PPO(
+            "MlpPolicy",
+            QuadcopterVecEnv(1, seed=0, **sees),
+            policy_kwargs={"net_arch": [64, 64]},
+            device="cpu",
+        )
         with torch.no_grad():
             for new, known in zip(model.policy.parameters(), old.parameters(), strict=True):
                 if new.shape == known.shape:
@@ -98,30 +122,42 @@ def load(file_format, content, name):
     """The file as a function of observations and states, by what its users run it with."""
     if file_format == "onnx":
         pytest.importorskip("onnxruntime")
-    return {"torchscript": load_torchscript, "onnx": load_onnx, "c": lambda it: load_header(it, name)}[file_format](content)[0]
+    return {
+        "torchscript": load_torchscript,
+        "onnx": load_onnx,
+        "c": lambda it: load_header(it, name),
+    }[file_format](content)[0]
 
 
 compiled = [needs_compiler, pytest.mark.slow]
 CASES = [("torchscript", kind, "thrusts") for kind in SEES] + [("onnx", "all", "speeds")]
-CASES += [pytest.param("c", kind, "thrusts", marks=compiled) for kind in SEES] + [("onnx", "integral", "thrusts")]
+CASES += [pytest.param("c", kind, "thrusts", marks=compiled) for kind in SEES] + [
+    ("onnx", "integral", "thrusts")
+]
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(("file_format", "kind", "output"), CASES)
-def test_it_sees_the_frames_of_the_environment_in_whole_flights(extended, file_format, kind, output):
+def test_it_sees_the_frames_of_the_environment_in_whole_flights(
+    extended, file_format, kind, output
+):
     path, sees = extended / f"{kind}.zip", SEES[kind]
     exported = export_policy(path, file_format, output, n_observations=3000)
     assert 0 < exported.max_error < (1e-4 if output == "thrusts" else 1e-2)
     assert "3000 observations of flights" in exported.metadata["check"]
     file, policy = load(file_format, exported.content, kind), PPO.load(path, device="cpu")
     near = {"target_distance": 1.5, "nearest_target": 0.3}
-    env = QuadcopterVecEnv(4, "target_tracking", near, noise=0.0, seed=5, max_episode_steps=1000, **sees)
+    env = QuadcopterVecEnv(
+        4, "target_tracking", near, noise=0.0, seed=5, max_episode_steps=1000, **sees
+    )
     seen, state, integrated = env.reset(), None, 0
     for step in range(1000):  # the file flies
         result, state = file(physical_features(env.true_state()), state)
         actions = policy.predict(seen, deterministic=True)[0]
         thrusts = result if output == "thrusts" else ITM.thrust_coefficient * result**2
-        np.testing.assert_allclose(thrusts, ITM.action_to_thrust(actions), atol=1e-4, err_msg=f"step {step}")
+        np.testing.assert_allclose(
+            thrusts, ITM.action_to_thrust(actions), atol=1e-4, err_msg=f"step {step}"
+        )
         seen, _, ends, _ = env.step(ITM.thrust_to_action(thrusts.astype(float)))
         integrated = max(integrated, np.abs(env.batch.integral).max(initial=0.0))
         assert not ends.any() or step == 999
@@ -133,12 +169,24 @@ def test_it_sees_the_frames_of_the_environment_in_whole_flights(extended, file_f
     "wrong",
     [
         lambda reference, state: (reference, torch.cat([state[:, :4] * 0, state[:, 4:]], 1)),
-        lambda reference, state: (reference, torch.cat([state[:, :4], state[:, 4:7] * 0, state[:, 7:]], 1)),
-        lambda reference, state: (reference, torch.cat([state[:, :7], state[:, 7:8].clamp(min=1.0), state[:, 8:]], 1)),
+        lambda reference, state: (
+            reference,
+            torch.cat([state[:, :4], state[:, 4:7] * 0, state[:, 7:]], 1),
+        ),
+        lambda reference, state: (
+            reference,
+            torch.cat([state[:, :7], state[:, 7:8].clamp(min=1.0), state[:, 8:]], 1),
+        ),
         lambda reference, state: (sees(reference, history=(0, 1, 3, 5)), state),
         lambda reference, state: (sees(reference, position_integral={"gain": 2.02}), state),
-        lambda reference, state: (sees(reference, position_integral={"gain": 2.0, "distance": 0.99}), state),
-        lambda reference, state: (sees(reference, position_integral={"gain": 2.0, "speed": 1.4}), state),
+        lambda reference, state: (
+            sees(reference, position_integral={"gain": 2.0, "distance": 0.99}),
+            state,
+        ),
+        lambda reference, state: (
+            sees(reference, position_integral={"gain": 2.0, "speed": 1.4}),
+            state,
+        ),
     ],
     ids=["no action", "no integral", "begun at once", "another age", "gain", "distance", "speed"],
 )
@@ -156,7 +204,9 @@ def test_a_file_with_another_state_is_refused(extended, monkeypatch, wrong):
 
 
 def sees(reference, **changes):
-    return reference._replace(observation=type(reference.observation)(**{**dict(reference.observation), **changes}))
+    return reference._replace(
+        observation=type(reference.observation)(**{**dict(reference.observation), **changes})
+    )
 
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
@@ -176,7 +226,9 @@ def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
     actions = MODELS[kind][0].load(path, device="cpu").predict(scaled, deterministic=True)[0]
     expected = ITM.hover_thrust * (1.0 + 0.5 * actions)  # Eq. 3.18
     assert expected.std(axis=0).min() > 0.3  # all rotors at work
-    np.testing.assert_allclose(load(file_format, exported.content, kind)(physical, None)[0], expected, atol=1e-4)
+    np.testing.assert_allclose(
+        load(file_format, exported.content, kind)(physical, None)[0], expected, atol=1e-4
+    )
     assert 0 <= exported.max_error < 1e-4
     assert f"{exported.max_error:.2g} N in " in exported.metadata["check"]
 
@@ -186,9 +238,12 @@ def test_it_gives_the_thrusts_of_the_policy(zips, flight, file_format, kind):
 def test_speeds_give_the_thrusts_and_a_rotor_may_stand_still(zips, flight, file_format):
     vehicle = ITM.model_copy(update={"thrust_limits": (0.0, 1.9)})
     contents = [
-        export_policy(zips / "tanh.zip", file_format, kind, vehicle, n_observations=200) for kind in ("thrusts", "speeds")
+        export_policy(zips / "tanh.zip", file_format, kind, vehicle, n_observations=200)
+        for kind in ("thrusts", "speeds")
     ]
-    thrusts, speeds = (load(file_format, exported.content, "tanh")(flight[1], None)[0] for exported in contents)
+    thrusts, speeds = (
+        load(file_format, exported.content, "tanh")(flight[1], None)[0] for exported in contents
+    )
     assert contents[1].unit == "rad/s" and thrusts.min() == 0.0
     np.testing.assert_allclose(vehicle.thrust_coefficient * speeds**2, thrusts, atol=1e-5)
 
@@ -199,13 +254,23 @@ def test_the_run_folder_tells_vehicle_and_scaling(zips, tmp_path):
     path = run_folder / "agent.zip"
     path.write_bytes((zips / "tanh.zip").read_bytes())
     (tmp_path / "light.yaml").write_text("\n".join(f"{k}: {v}" for k, v in light().items()))
-    given = {"vehicle": str(tmp_path / "light.yaml"), "observation_mean": [0.5] * 18, "observation_std": [2.0] * 18}
+    given = {
+        "vehicle": str(tmp_path / "light.yaml"),
+        "observation_mean": [0.5] * 18,
+        "observation_std": [2.0] * 18,
+    }
     (run_folder / "Env-v0" / "config.yml").write_text(json.dumps({"env_kwargs": given}))
     exported = export_policy(path, "torchscript", n_observations=100)
     assert "light" in exported.metadata["vehicle"] and exported.settings.name == "config.yml"
-    assert "mean 0.5, 0.5, " in exported.metadata["scaling"] and "std 2, 2, " in exported.metadata["scaling"]
+    assert (
+        "mean 0.5, 0.5, " in exported.metadata["scaling"]
+        and "std 2, 2, " in exported.metadata["scaling"]
+    )
     assert str(tmp_path) not in json.dumps(exported.metadata)
-    assert "itm" in export_policy(path, "torchscript", vehicle="itm", n_observations=100).metadata["vehicle"]
+    assert (
+        "itm"
+        in export_policy(path, "torchscript", vehicle="itm", n_observations=100).metadata["vehicle"]
+    )
     (run_folder / "Env-v0" / "vecnormalize.pkl").touch()
     with pytest.raises(ConfigError, match="VecNormalize"):
         export_policy(path, "torchscript")
@@ -218,10 +283,24 @@ def light():
 
 @pytest.mark.slow
 def test_torchscript_loads_where_sb3_quad_cannot_be_imported(zips, tmp_path):
-    assert main(["export", str(zips / "relu.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 0
+    assert (
+        main(
+            [
+                "export",
+                str(zips / "relu.zip"),
+                "--format",
+                "torchscript",
+                "-o",
+                str(tmp_path / "agent.pt"),
+            ]
+        )
+        == 0
+    )
     snippet = DOCS.split("## TorchScript")[1].split("```python")[1].split("```")[0]
     code = f"import sys; sys.modules['sb3_quad'] = None\n{snippet}\nprint(thrust.shape)"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0 and "[1, 4]" in done.stdout, done.stderr
 
 
@@ -232,7 +311,19 @@ def test_a_file_that_computes_something_else_is_not_written(zips, tmp_path, caps
         return found
 
     monkeypatch.setattr(policy, "build_network", wrong)
-    assert main(["export", str(zips / "tanh.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 2
+    assert (
+        main(
+            [
+                "export",
+                str(zips / "tanh.zip"),
+                "--format",
+                "torchscript",
+                "-o",
+                str(tmp_path / "agent.pt"),
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert "differs from the trained one" in error and error.count("\n") == 1
     assert not list(tmp_path.iterdir())
@@ -249,12 +340,19 @@ def test_an_onnx_model_says_what_it_takes_and_gives(zips):
     onnx = pytest.importorskip("onnx")
     exported = export_policy(zips / "tanh.zip", "onnx", "speeds", n_observations=100)
     model = onnx.load_from_string(exported.content)
-    ports = [(each.name, each.type.tensor_type.shape.dim) for each in (*model.graph.input, *model.graph.output)]
+    ports = [
+        (each.name, each.type.tensor_type.shape.dim)
+        for each in (*model.graph.input, *model.graph.output)
+    ]
     assert [(name, first.dim_param, second.dim_value) for name, (first, second) in ports] == [
         ("observation", "batch", 18),
         ("rotor_speed", "batch", 4),
     ]
-    assert (model.opset_import[0].version, model.ir_version, model.producer_name) == (13, 7, "sb3_quad")
+    assert (model.opset_import[0].version, model.ir_version, model.producer_name) == (
+        13,
+        7,
+        "sb3_quad",
+    )
     assert {each.key: each.value for each in model.metadata_props} == exported.metadata
 
 
@@ -262,7 +360,9 @@ def test_an_onnx_model_takes_a_state_and_gives_the_next(extended):
     onnx = pytest.importorskip("onnx")
     exported = export_policy(extended / "all.zip", "onnx", n_observations=1000)
     graph = onnx.load_from_string(exported.content).graph
-    ports = [(each.name, *each.type.tensor_type.shape.dim) for each in (*graph.input, *graph.output)]
+    ports = [
+        (each.name, *each.type.tensor_type.shape.dim) for each in (*graph.input, *graph.output)
+    ]
     size = 4 + 4 + 5 * 22  # the last action, the integral, five frames
     assert [(name, first.dim_param, second.dim_value) for name, first, second in ports] == [
         ("observation", "batch", 18),
@@ -270,15 +370,32 @@ def test_an_onnx_model_takes_a_state_and_gives_the_next(extended):
         ("thrust", "batch", 4),
         ("next_state", "batch", size),
     ]
-    assert exported.metadata["state_size"] == str(size) and "history [0, 1, 2, 5]" in exported.metadata["state"]
-    assert exported.metadata["observation"].startswith("18 numbers") and exported.metadata["network"].startswith("88-64")
+    assert (
+        exported.metadata["state_size"] == str(size)
+        and "history [0, 1, 2, 5]" in exported.metadata["state"]
+    )
+    assert exported.metadata["observation"].startswith("18 numbers") and exported.metadata[
+        "network"
+    ].startswith("88-64")
 
 
 def test_settings_that_do_not_fit_the_policy_are_one_line(zips, tmp_path, capsys):
     model = PPO.load(zips / "tanh.zip", device="cpu")
     FlightSettings(history=[0, 1]).write_into(model)
     model.save(tmp_path / "agent.zip")
-    assert main(["export", str(tmp_path / "agent.zip"), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 2
+    assert (
+        main(
+            [
+                "export",
+                str(tmp_path / "agent.zip"),
+                "--format",
+                "torchscript",
+                "-o",
+                str(tmp_path / "agent.pt"),
+            ]
+        )
+        == 2
+    )
     error = capsys.readouterr().err
     assert "by its settings of shape (36,)" in error and error.count("\n") == 1
 
@@ -304,9 +421,25 @@ SEEN, DONE = spaces.Box(-np.inf, np.inf, (18,), np.float32), spaces.Box(-1.0, 1.
     ("make", "message"),
     [
         (lambda: PPO("MlpPolicy", Stub(spaces.Box(-1, 1, (3,)), DONE), device="cpu"), "of shape"),
-        (lambda: PPO("MlpPolicy", Stub(SEEN, spaces.Box(-2, 2, (4,))), device="cpu"), "actions are"),
-        (lambda: PPO("MlpPolicy", Stub(SEEN, DONE), policy_kwargs={"activation_fn": torch.nn.ELU}, device="cpu"), "ELU"),
-        (lambda: PPO("CnnPolicy", Stub(spaces.Box(0, 255, (36, 36, 3), np.uint8), DONE), device="cpu"), "CnnPolicy"),
+        (
+            lambda: PPO("MlpPolicy", Stub(SEEN, spaces.Box(-2, 2, (4,))), device="cpu"),
+            "actions are",
+        ),
+        (
+            lambda: PPO(
+                "MlpPolicy",
+                Stub(SEEN, DONE),
+                policy_kwargs={"activation_fn": torch.nn.ELU},
+                device="cpu",
+            ),
+            "ELU",
+        ),
+        (
+            lambda: PPO(
+                "CnnPolicy", Stub(spaces.Box(0, 255, (36, 36, 3), np.uint8), DONE), device="cpu"
+            ),
+            "CnnPolicy",
+        ),
         (
             lambda: SAC("MlpPolicy", Stub(SEEN, DONE), device="cpu", buffer_size=10, use_sde=True),
             "Hardtanh",
@@ -355,4 +488,6 @@ def test_the_examples_of_the_docs_agree(zips, extended, tmp_path, monkeypatch, c
     (tmp_path / "main.c").write_text(section.split("```c\n")[1].split("```")[0])
     subprocess.run([COMPILER, *FLAGS, "main.c", "-lm", "-o", "main"], check=True)
     done = subprocess.run(["./main"], check=True, capture_output=True, text=True).stdout.split()
-    np.testing.assert_allclose([float(word) for word in done], np.ravel(scope["thrust"][:1]), atol=1e-5)
+    np.testing.assert_allclose(
+        [float(word) for word in done], np.ravel(scope["thrust"][:1]), atol=1e-5
+    )

@@ -1,4 +1,6 @@
-"""The diffs of docs/extending.md, applied to a copy of the source tree: they are what they say, and fly as PyBullet does."""
+"""The diffs of docs/extending.md, applied to a copy of the source tree: they are what they say, and
+fly as PyBullet does.
+"""
 
 import functools
 import json
@@ -72,7 +74,9 @@ print(json.dumps(found))
 
 def apply(diff, root):
     """Apply a unified diff, each hunk where its old lines stand."""
-    for old, new, hunks in re.findall(r"--- (\S+)\n\+\+\+ (\S+)\n(.*?)(?=\n--- |\Z)", diff, flags=re.DOTALL):
+    for old, new, hunks in re.findall(
+        r"--- (\S+)\n\+\+\+ (\S+)\n(.*?)(?=\n--- |\Z)", diff, flags=re.DOTALL
+    ):
         path = root / new.removeprefix("b/")
         text = "" if old == "/dev/null" else path.read_text(encoding="utf-8")
         for hunk in re.split(r"(?:^|\n)@@.*\n", hunks)[1:]:
@@ -103,20 +107,37 @@ def test_each_is_small_and_fits_the_code(diff, tmp_path):
             shutil.copy(ROOT / name, tmp_path / name)
     apply(diff, tmp_path)
     assert 1 <= diff.count("\n+++ ") <= 2
-    assert len([line for line in diff.splitlines() if line[:1] in "+-" and line[:3] not in ("+++", "---")]) <= 24
+    assert (
+        len(
+            [
+                line
+                for line in diff.splitlines()
+                if line[:1] in "+-" and line[:3] not in ("+++", "---")
+            ]
+        )
+        <= 24
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1300)
 def test_the_extended_package_flies_as_pybullet_does(extended):
-    """And what it compiles computes what its cache holds, to the last bit, also the weights of a training."""
+    """And what it compiles computes what its cache holds, to the last bit, also the weights of a
+    training.
+    """
     pytest.importorskip("pybullet")
     environment = {**os.environ, "PYTHONPATH": str(extended)}
     command = [sys.executable, "-W", "ignore", "-c", SCRIPT.replace("STEPS", str(STEPS))]
-    run = functools.partial(subprocess.run, cwd=extended, env=environment, capture_output=True, text=True, timeout=600)
+    run = functools.partial(
+        subprocess.run, cwd=extended, env=environment, capture_output=True, text=True, timeout=600
+    )
     done, again = run(command, check=False), run(command, check=False)
     assert done.returncode == 0, done.stderr
-    assert "compiling" in done.stderr and "compiling" not in again.stderr and done.stdout == again.stdout
+    assert (
+        "compiling" in done.stderr
+        and "compiling" not in again.stderr
+        and done.stdout == again.stdout
+    )
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["state"] < 1e-9 and found["reward"] < 1e-9 and found["term"] < 1e-12
     assert found["feature"] < 1e-6 and found["observation"] < 1e-6  # float32

@@ -19,14 +19,26 @@ def small():
 
 
 def test_flights_of_the_expert_are_measured_as_evaluation_does():
-    """With β = 1 the expert flies the whole training: the same episodes as in an evaluation with these seeds."""
+    """With β = 1 the expert flies the whole training: the same episodes as in an evaluation with
+    these seeds.
+    """
     env = QuadcopterVecEnv(6, "target_tracking", max_episode_steps=300)
     model = DAgger(
-        "MlpPolicy", env, GeometricExpert(), n_steps=300, batch_size=1800, n_epochs=1, beta=1.0, beta_final=1.0, **small()
+        "MlpPolicy",
+        env,
+        GeometricExpert(),
+        n_steps=300,
+        batch_size=1800,
+        n_epochs=1,
+        beta=1.0,
+        beta_final=1.0,
+        **small(),
     )
     metrics = FlightMetrics(tolerance=0.5)
     model.learn(1800, callback=metrics)
-    flights = fly(GeometricExpert(), "target_tracking", 6, 0, max_steps=300)  # the model seeds its environments, from 0
+    flights = fly(
+        GeometricExpert(), "target_tracking", 6, 0, max_steps=300
+    )  # the model seeds its environments, from 0
     assert metrics.metrics() == {
         "rollout/reached_0.5m": 1.0,
         "rollout/collision_rate": 0.0,
@@ -46,7 +58,11 @@ class Falling(gymnasium.ActionWrapper):
 @pytest.mark.parametrize("algorithm", [PPO, SAC])
 def test_single_environments_and_lost_flights(algorithm, tmp_path):
     env = make_vec_env("QuadTargetTracking-v0", 2, seed=0, wrapper_class=Falling)
-    size = {"n_steps": 100, "batch_size": 200, "n_epochs": 1} if algorithm is PPO else {"learning_starts": 10_000}
+    size = (
+        {"n_steps": 100, "batch_size": 200, "n_epochs": 1}
+        if algorithm is PPO
+        else {"learning_starts": 10_000}
+    )
     model = algorithm("MlpPolicy", env, **size, **small())
     metrics = FlightMetrics()
     model.learn(600, callback=metrics)
@@ -75,4 +91,6 @@ def test_other_environments_and_numbers_are_refused():
     with pytest.raises(ConfigError, match="window 0"):
         FlightMetrics(window=0)
     with pytest.raises(ConfigError, match="no quadcopter"):
-        PPO("MlpPolicy", "Pendulum-v1", n_steps=10, batch_size=10, **small()).learn(10, callback=FlightMetrics())
+        PPO("MlpPolicy", "Pendulum-v1", n_steps=10, batch_size=10, **small()).learn(
+            10, callback=FlightMetrics()
+        )

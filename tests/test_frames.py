@@ -1,4 +1,6 @@
-"""Frames of an observation: earlier features, the action before them, and the integral of the position error."""
+"""Frames of an observation: earlier features, the action before them, and the integral of the
+position error.
+"""
 
 import gymnasium
 import numpy as np
@@ -43,10 +45,20 @@ def test_a_frame_is_what_was_seen_then_and_the_action_before_it(ages, last_actio
             ended = step > 0 and dones[step - 1, row]
             if ended:  # the last observation of the episode that ended, then the first of the next
                 check_frames(
-                    seen_last[step - 1][row], plain_last[step - 1][row], plain, actions, row, begin, step, history, size
+                    seen_last[step - 1][row],
+                    plain_last[step - 1][row],
+                    plain,
+                    actions,
+                    row,
+                    begin,
+                    step,
+                    history,
+                    size,
                 )
                 begin = step
-            check_frames(seen[step, row], plain[step, row], plain, actions, row, begin, step, history, size)
+            check_frames(
+                seen[step, row], plain[step, row], plain, actions, row, begin, step, history, size
+            )
 
 
 def check_frames(seen, now, plain, actions, row, begin, step, history, size):
@@ -73,18 +85,27 @@ def test_the_integral_is_that_of_what_is_observed_near_the_target():
         features = plain[step] * DEFAULT_STD
         if step > 0:
             integral[dones[step - 1]] = 0.0
-            near = (np.linalg.norm(features[:, :3], axis=1) < distance) & (np.linalg.norm(features[:, 12:15], axis=1) < speed)
+            near = (np.linalg.norm(features[:, :3], axis=1) < distance) & (
+                np.linalg.norm(features[:, 12:15], axis=1) < speed
+            )
             near &= ~dones[step - 1]
             used += near.sum()
             integral[near] = np.clip(integral + 0.01 * gain * features[:, :3], -limit, limit)[near]
-        np.testing.assert_allclose(seen[step, :, :3] * DEFAULT_STD[:3], features[:, :3] + integral, atol=2e-5)
+        np.testing.assert_allclose(
+            seen[step, :, :3] * DEFAULT_STD[:3], features[:, :3] + integral, atol=2e-5
+        )
         np.testing.assert_array_equal(seen[step, :, 3:], plain[step, :, 3:])
     assert used > 50
 
 
 def test_a_snapshot_keeps_the_frames_and_looking_changes_nothing():
     env = QuadcopterVecEnv(
-        5, seed=0, history=[0, 2, 7], last_action=True, position_integral={}, randomize={"mass": [0.9, 1.1]}
+        5,
+        seed=0,
+        history=[0, 2, 7],
+        last_action=True,
+        position_integral={},
+        randomize={"mass": [0.9, 1.1]},
     )
     env.reset()
     actions = np.random.default_rng(0).uniform(-0.2, 0.3, (60, 5, 4)).astype(np.float32)

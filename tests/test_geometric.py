@@ -1,4 +1,6 @@
-"""The geometric expert: its symmetries, its equilibrium, and that it keeps to what the 18 features hold."""
+"""The geometric expert: its symmetries, its equilibrium, and that it keeps to what the 18 features
+hold.
+"""
 
 import numpy as np
 import pytest
@@ -8,7 +10,15 @@ from hypothesis import strategies as st
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.geometric import GeometricExpert, derived_gains, told_derived
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    ROTOR_SPEEDS,
+    TARGET,
+    VELOCITY,
+    QuadcopterState,
+)
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM = load_vehicle("itm")
@@ -54,7 +64,9 @@ def test_turning_the_world_about_the_vertical_changes_nothing(seed: int, angle: 
 
 @given(seeds)
 def test_the_mirrored_vehicle_gives_mirrored_actions(seed: int) -> None:
-    """Left and right exchanged: y, roll, yaw and their rates change sign, rotors 0 and 1, 2 and 3 change places."""
+    """Left and right exchanged: y, roll, yaw and their rates change sign, rotors 0 and 1, 2 and 3
+    change places.
+    """
     array = random_states(seed)
     mirrored = array.copy()
     for rows in (POSITION, TARGET, VELOCITY):
@@ -68,7 +80,9 @@ def test_the_mirrored_vehicle_gives_mirrored_actions(seed: int) -> None:
 def test_what_cannot_be_observed_does_not_matter(seed: int) -> None:
     array = random_states(seed)
     other = array.copy()
-    other[ROTOR_SPEEDS] = np.random.default_rng(seed + 1).uniform(*ITM.rotor_speed_range, (4, array.shape[1]))
+    other[ROTOR_SPEEDS] = np.random.default_rng(seed + 1).uniform(
+        *ITM.rotor_speed_range, (4, array.shape[1])
+    )
     other[QUATERNION] *= -1
     np.testing.assert_array_equal(actions(other), actions(array))
 
@@ -125,7 +139,9 @@ def changed(**changes: object) -> GeometricExpert:
     ],
     ids=["slow motors", "heavy arms", "weak", "late", "palm-sized plus"],
 )
-def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(expert: GeometricExpert) -> None:
+def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(
+    expert: GeometricExpert,
+) -> None:
     vehicle = expert.vehicle
     assert expert.gains == derived_gains(vehicle)
     tracking = fly(expert, "target_tracking", 32, 3, vehicle=vehicle, max_steps=900, noise=0.0)
@@ -136,17 +152,22 @@ def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(expert: G
 
 @pytest.mark.parametrize(("name", "late"), [("hummingbird", False), ("cf2x_L250", True)])
 def test_told_derived_is_gentler_where_commands_act_late(name: str, late: bool) -> None:
-    """A quick vehicle flies by its derived gains; a slow one comes to rest within 0.1 m, too, but by other ones."""
+    """A quick vehicle flies by its derived gains; a slow one comes to rest within 0.1 m, too, but
+    by other ones.
+    """
     vehicle = load_vehicle(name)
     bold = GeometricExpert(vehicle, derived_gains(vehicle), told=True)
     gentle, plain = (
-        fly(expert, seed=3, n_episodes=24, vehicle=vehicle, max_steps=900) for expert in (told_derived(name), bold)
+        fly(expert, seed=3, n_episodes=24, vehicle=vehicle, max_steps=900)
+        for expert in (told_derived(name), bold)
     )
     assert gentle.success.all() and not np.isnan(gentle.time_to_stay[0.1]).any()
     assert (np.abs(gentle.reward - plain.reward) > 1e-9).any() == late
 
 
 @pytest.mark.parametrize(("told", "name"), [(False, "attitude"), (True, "atitude")])
-def test_gains_where_commands_act_late_are_known_ones_of_a_told_expert(told: bool, name: str) -> None:
+def test_gains_where_commands_act_late_are_known_ones_of_a_told_expert(
+    told: bool, name: str
+) -> None:
     with pytest.raises(ConfigError, match=f"late {name}"):
         GeometricExpert(told=told, late={name: 0.5})

@@ -19,7 +19,12 @@ from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
 
 def make(num_envs=8, **kwargs):
-    return gymnasium.make_vec("QuadTargetTracking-v0", num_envs=num_envs, vectorization_mode="vector_entry_point", **kwargs)
+    return gymnasium.make_vec(
+        "QuadTargetTracking-v0",
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        **kwargs,
+    )
 
 
 def test_it_is_made_by_gymnasium():
@@ -27,7 +32,9 @@ def test_it_is_made_by_gymnasium():
     assert env.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     assert (env.unwrapped.batch.max_steps == 1500).all() and env.spec.max_episode_steps == 1500
     observations, infos = env.reset(seed=1)
-    assert observations in env.observation_space and infos["distance"].tolist() == pytest.approx([10.0] * 3)
+    assert observations in env.observation_space and infos["distance"].tolist() == pytest.approx(
+        [10.0] * 3
+    )
     assert env.observation_space.shape == (3, 18) and env.action_space.shape == (3, 4)
     batch = QuadcopterVecEnv(3, seed=1, noise=0.0)
     np.testing.assert_array_equal(observations, batch.reset())
@@ -36,7 +43,9 @@ def test_it_is_made_by_gymnasium():
         for ours, theirs in zip(env.step(actions)[:2], batch.step(actions)[:2], strict=True):
             np.testing.assert_array_equal(ours, theirs)
     env.close()
-    recovery = gymnasium.make_vec("QuadStateRecovery-v0", num_envs=2, vectorization_mode="vector_entry_point")
+    recovery = gymnasium.make_vec(
+        "QuadStateRecovery-v0", num_envs=2, vectorization_mode="vector_entry_point"
+    )
     recovery.reset(seed=0)
     assert recovery.unwrapped.true_state().velocity.any()
 
@@ -65,13 +74,20 @@ def same(ours, theirs):
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_an_autoreset_mode_is_that_of_gymnasiums_own_vector_environment(mode):
-    kwargs = {"task_kwargs": {"max_distance": 10.02}, "max_episode_steps": 25}  # some fall out of range, others stay
+    kwargs = {
+        "task_kwargs": {"max_distance": 10.02},
+        "max_episode_steps": 25,
+    }  # some fall out of range, others stay
     env = make(4, autoreset_mode=mode, **kwargs)
     singles = gymnasium.vector.SyncVectorEnv(
-        [lambda: gymnasium.make("QuadTargetTracking-v0", **kwargs) for _ in range(4)], autoreset_mode=mode
+        [lambda: gymnasium.make("QuadTargetTracking-v0", **kwargs) for _ in range(4)],
+        autoreset_mode=mode,
     )
     assert env.metadata["autoreset_mode"] is mode
-    (ours, our_infos), (theirs, their_infos) = env.reset(seed=3), singles.reset(seed=row_seeds(3, 4))
+    (ours, our_infos), (theirs, their_infos) = (
+        env.reset(seed=3),
+        singles.reset(seed=row_seeds(3, 4)),
+    )
     np.testing.assert_allclose(ours, theirs, atol=2e-6)
     same(our_infos, their_infos)
     terminations, truncations, actions = 0, 0, -np.ones((4, 4), dtype=np.float32)
@@ -95,7 +111,9 @@ def test_gymnasiums_wrappers_count_each_episode_once(mode):
     for _ in range(35):
         observations, rewards, *_ = wrapped.step(np.zeros((4, 4)))
         assert np.isfinite(observations).all() and np.isfinite(rewards).all()
-    assert list(env.length_queue) == [10] * 12 and env.return_queue[0] == pytest.approx(-0.3, abs=0.01)
+    assert list(env.length_queue) == [10] * 12 and env.return_queue[0] == pytest.approx(
+        -0.3, abs=0.01
+    )
     assert len(DictInfoToList(make(4)).reset(seed=0)[1]) == 4
 
 

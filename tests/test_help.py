@@ -1,4 +1,6 @@
-"""Every command's help shows examples, and these are command lines that the command takes; what none takes is answered."""
+"""Every command's help shows examples, and these are command lines that the command takes; what
+none takes is answered.
+"""
 
 import re
 import shlex
@@ -32,10 +34,14 @@ def test_examples_are_taken(name):
     for arguments in found:
         if "--help" in arguments:
             continue
-        options = make_parser().parse_args(arguments)  # raises on a flag that there is not, or a bad value
+        options = make_parser().parse_args(
+            arguments
+        )  # raises on a flag that there is not, or a bad value
         assert options.command in COMMANDS
         if getattr(options, "algo", None) is not None:
-            assert {*([options.algo] if isinstance(options.algo, str) else options.algo)} <= {*ALGORITHMS}
+            assert {*([options.algo] if isinstance(options.algo, str) else options.algo)} <= {
+                *ALGORITHMS
+            }
         if getattr(options, "env", None) is not None:
             assert options.env in (*ENVIRONMENTS, "Pendulum-v1")
         files = getattr(options, "conf_file", None) or []
@@ -70,8 +76,12 @@ TASKS = ("far_tracking", "state_recovery", "target_tracking")
         ("anything", (), []),
     ],
 )
-def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_random(given, valid, meant):
-    assert did_you_mean(given, valid) == (f"did you mean {' or '.join(map(repr, meant))}? " if meant else "")
+def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_random(
+    given, valid, meant
+):
+    assert did_you_mean(given, valid) == (
+        f"did you mean {' or '.join(map(repr, meant))}? " if meant else ""
+    )
 
 
 @pytest.mark.parametrize(
@@ -82,7 +92,10 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
             "train --learning-rate 1e-3",
             "option '--learning-rate': a hyperparameter is given as --hyperparams learning_rate:1e-3,",
         ),
-        ("tune --gamma=0.9 -n 5", "--hyperparams gamma:0.9, a keyword of the environment as --env-kwargs gamma:0.9"),
+        (
+            "tune --gamma=0.9 -n 5",
+            "--hyperparams gamma:0.9, a keyword of the environment as --env-kwargs gamma:0.9",
+        ),
         ("train --gamma -n 5", "--hyperparams gamma:VALUE,"),
         ("train -optimize", "option '-optimize': the command sb3-quad tune does that"),
         ("train --optimize-hyperparameters", "the command sb3-quad tune does that"),
@@ -90,8 +103,14 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
         ("report folder --nothing", "option '--nothing': see --help, and docs/zoo.md"),
         ("train 5", "argument '5': see --help"),
         ("train --algo a2c", "algorithm 'a2c': (valid: dagger,"),
-        ("train --conf-file nothere.yml", "settings file 'nothere.yml': (valid: any_quadcopter/dagger.yml,"),
-        ("train --hyperparams bc_coef:1 --algo dagger", "key of dagger 'bc_coef': (valid: aux_coef,"),
+        (
+            "train --conf-file nothere.yml",
+            "settings file 'nothere.yml': (valid: any_quadcopter/dagger.yml,",
+        ),
+        (
+            "train --hyperparams bc_coef:1 --algo dagger",
+            "key of dagger 'bc_coef': (valid: aux_coef,",
+        ),
         (
             "enjoy pid --task tracking --no-render",
             "did you mean 'far_tracking' or 'recovery_and_tracking' or 'target_tracking'?",
@@ -102,7 +121,9 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
         ),
     ],
 )
-def test_what_is_unknown_is_answered_by_what_helps(arguments, message, tmp_path, monkeypatch, capsys):
+def test_what_is_unknown_is_answered_by_what_helps(
+    arguments, message, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     assert main(shlex.split(arguments)) == 2
     said = capsys.readouterr().err

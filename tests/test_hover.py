@@ -1,4 +1,6 @@
-"""Trimming at the hover: the agent gives hover thrust at its target with every heading, and flies elsewhere as before."""
+"""Trimming at the hover: the agent gives hover thrust at its target with every heading, and flies
+elsewhere as before.
+"""
 
 import numpy as np
 import pytest
@@ -39,7 +41,10 @@ def test_the_agent_hovers_at_its_target_with_every_heading(model):
     result = trim_hover(model, seed=3, settings=FlightSettings(noise=0.0))
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after).mean() < 0.1 * np.square(before).mean()
-    assert result.before == pytest.approx(np.sqrt(np.square(before).mean()), rel=0.05) and result.after < result.before
+    assert (
+        result.before == pytest.approx(np.sqrt(np.square(before).mean()), rel=0.05)
+        and result.after < result.before
+    )
 
 
 def test_hover_of_a_vehicle_whose_middle_thrust_is_another(model):
@@ -55,26 +60,41 @@ def test_hover_of_a_vehicle_whose_middle_thrust_is_another(model):
 def test_only_the_last_layer_changes_and_the_zip_stays_stock(model, tmp_path):
     before = {key: value.clone() for key, value in model.policy.state_dict().items()}
     trim_hover(model, seed=3)
-    changed = {key for key, value in model.policy.state_dict().items() if not th.equal(value, before[key])}
+    changed = {
+        key for key, value in model.policy.state_dict().items() if not th.equal(value, before[key])
+    }
     assert changed == {"action_net.weight", "action_net.bias"}
     model.save(tmp_path / "agent.zip")
     observation = np.random.default_rng(0).normal(size=(5, 18)).astype(np.float32)
-    np.testing.assert_array_equal(PPO.load(tmp_path / "agent.zip").predict(observation)[0].shape, (5, 4))
+    np.testing.assert_array_equal(
+        PPO.load(tmp_path / "agent.zip").predict(observation)[0].shape, (5, 4)
+    )
 
 
 def test_what_is_trimmed_already_is_left_alone(model):
     trim_hover(model, seed=3)
     weight = model.policy.action_net.weight.clone()
     again = trim_hover(model, seed=3)
-    assert again.before < 0.05 and (model.policy.action_net.weight - weight).norm() < 0.05 * weight.norm()
+    assert (
+        again.before < 0.05
+        and (model.policy.action_net.weight - weight).norm() < 0.05 * weight.norm()
+    )
 
 
 @pytest.mark.parametrize("shifted", ["observation_mean", "observation_std"])
 def test_the_scaling_that_the_agent_flies_with_is_taken_into_account(model, shifted):
-    """Observations at the target are other numbers with another μ or σ; there, too, the agent hovers afterwards."""
-    scaling = {"observation_mean": np.zeros(18), "observation_std": DEFAULT_STD, shifted: np.linspace(0.5, 2.0, 18)}
+    """Observations at the target are other numbers with another μ or σ; there, too, the agent
+    hovers afterwards.
+    """
+    scaling = {
+        "observation_mean": np.zeros(18),
+        "observation_std": DEFAULT_STD,
+        shifted: np.linspace(0.5, 2.0, 18),
+    }
     heading = at_target(np.linspace(-np.pi, np.pi, 50)) * DEFAULT_STD
-    observations = ((heading - scaling["observation_mean"]) / scaling["observation_std"]).astype(np.float32)
+    observations = ((heading - scaling["observation_mean"]) / scaling["observation_std"]).astype(
+        np.float32
+    )
     before = model.predict(observations, deterministic=True)[0]
     trim_hover(model, seed=3, settings=FlightSettings(noise=0.0, **scaling))
     after = model.predict(observations, deterministic=True)[0]

@@ -1,4 +1,6 @@
-"""Vehicles that number their rotors in another way, or whose body axes lie otherwise, flown by agents and exported files."""
+"""Vehicles that number their rotors in another way, or whose body axes lie otherwise, flown by
+agents and exported files.
+"""
 
 import itertools
 import json
@@ -20,16 +22,22 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 
 ITM, CRAZYFLIE = load_vehicle("itm"), load_vehicle("crazyflie")
 ORDERS = list(itertools.permutations(range(4)))
-LAYOUTS = list(itertools.product((0, 45), (1, -1)))  # X and plus, with the directions of all rotors kept or changed
+LAYOUTS = list(
+    itertools.product((0, 45), (1, -1))
+)  # X and plus, with the directions of all rotors kept or changed
 LONG = ((0.06, -0.01), (-0.06, -0.01), (-0.06, 0.01), (0.06, 0.01))  # no turn brings these to an X
 
 
 def renumbered(base, order, turn=0, sign=1):
     """A vehicle with the rotors of another in some order, its body axes turned by some degrees."""
-    places = (np.array(base.rotor_positions) @ (1.0, 1.0j) * np.exp(1j * np.radians(turn)))[[*order]]
+    places = (np.array(base.rotor_positions) @ (1.0, 1.0j) * np.exp(1j * np.radians(turn)))[
+        [*order]
+    ]
     positions = tuple((float(each.real), float(each.imag)) for each in places)
     directions = tuple(sign * base.rotor_directions[k] for k in order)
-    return base.model_copy(update={"name": "own", "rotor_positions": positions, "rotor_directions": directions})
+    return base.model_copy(
+        update={"name": "own", "rotor_positions": positions, "rotor_directions": directions}
+    )
 
 
 def written(vehicle, path):
@@ -52,7 +60,9 @@ def test_thrusts_give_the_same_forces_and_moments_in_any_layout(turn):
 
 
 def test_a_wider_vehicle_with_the_same_rotors_is_not_turned():
-    wide = ITM.model_copy(update={"rotor_positions": ((0.2, 0.15), (0.2, -0.15), (-0.2, -0.15), (-0.2, 0.15))})
+    wide = ITM.model_copy(
+        update={"rotor_positions": ((0.2, 0.15), (0.2, -0.15), (-0.2, -0.15), (-0.2, 0.15))}
+    )
     assert wide.in_layout_of(ITM) is wide
 
 
@@ -69,8 +79,12 @@ class File:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def assert_it_flies(agent, vehicle, file_format="torchscript"):
-    exported = export_policy(pretrained(agent), file_format, vehicle=vehicle, name="own", n_observations=1000)
-    first = "0 at x {:.4g} m, y {:.4g} m, yaw moment {:+d}".format(*vehicle.rotor_positions[0], vehicle.rotor_directions[0])
+    exported = export_policy(
+        pretrained(agent), file_format, vehicle=vehicle, name="own", n_observations=1000
+    )
+    first = "0 at x {:.4g} m, y {:.4g} m, yaw moment {:+d}".format(
+        *vehicle.rotor_positions[0], vehicle.rotor_directions[0]
+    )
     assert exported.metadata["rotors"].startswith(first[:-1])
     file = File(load(file_format, exported.content, "own"), vehicle)
     flights = fly(file, "state_recovery", 8, 3, vehicle, noise=0.0, max_steps=500)
@@ -83,32 +97,47 @@ def assert_it_flies(agent, vehicle, file_format="torchscript"):
     [
         ("crazyflie-robust", "crazyflie", (3, 0, 1, 2), 0, "torchscript"),
         ("any-quadcopter", "hummingbird", (0, 1, 2, 3), 0, "torchscript"),
-        pytest.param("hummingbird-robust", "hummingbird", (1, 3, 2, 0), 20, "onnx", marks=pytest.mark.slow),
-        pytest.param("any-quadcopter", "hummingbird", (2, 0, 3, 1), 0, "onnx", marks=pytest.mark.slow),
+        pytest.param(
+            "hummingbird-robust", "hummingbird", (1, 3, 2, 0), 20, "onnx", marks=pytest.mark.slow
+        ),
+        pytest.param(
+            "any-quadcopter", "hummingbird", (2, 0, 3, 1), 0, "onnx", marks=pytest.mark.slow
+        ),
         pytest.param("any-quadcopter", "hummingbird", (3, 0, 2, 1), 45, "c", marks=compiled),
         pytest.param("crazyflie-robust", "crazyflie", (2, 1, 3, 0), 45, "c", marks=compiled),
     ],
 )
-def test_an_exported_file_flies_the_vehicle_that_it_was_exported_for(agent, base, order, turn, file_format):
+def test_an_exported_file_flies_the_vehicle_that_it_was_exported_for(
+    agent, base, order, turn, file_format
+):
     assert_it_flies(agent, renumbered(load_vehicle(base), order, turn), file_format)
 
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(("turn", "sign"), LAYOUTS)
-@pytest.mark.parametrize(("agent", "base"), [("crazyflie-robust", "crazyflie"), ("any-quadcopter", "hummingbird")])
+@pytest.mark.parametrize(
+    ("agent", "base"), [("crazyflie-robust", "crazyflie"), ("any-quadcopter", "hummingbird")]
+)
 def test_an_exported_file_flies_every_order_and_layout(agent, base, turn, sign):
     first = LAYOUTS.index((turn, sign)) + len(LAYOUTS) * (base == "hummingbird")
-    for order in ORDERS[first :: 2 * len(LAYOUTS)]:  # all orders in all, three for each layout and agent
+    for order in ORDERS[
+        first :: 2 * len(LAYOUTS)
+    ]:  # all orders in all, three for each layout and agent
         assert_it_flies(agent, renumbered(load_vehicle(base), order, turn, sign))
 
 
 def test_a_model_flies_its_own_vehicle_in_another_layout():
     for name in ("crazyflie", "hummingbird"):
         own = renumbered(load_vehicle(name), (3, 0, 1, 2), 45)
-        agent, expert = sb3_quad.load_pretrained(f"{name}-recovery"), resolve_expert("geometric", own, layout="itm")
+        agent, expert = (
+            sb3_quad.load_pretrained(f"{name}-recovery"),
+            resolve_expert("geometric", own, layout="itm"),
+        )
         assert fly(agent, "state_recovery", 24, vehicle=own, max_steps=500).success.mean() > 0.9
-        assert fly(expert, "state_recovery", 24, vehicle=own, rotor_layout="itm", max_steps=500).survival.all()
+        assert fly(
+            expert, "state_recovery", 24, vehicle=own, rotor_layout="itm", max_steps=500
+        ).survival.all()
 
 
 def test_commands_fly_vehicles_of_another_layout(tmp_path, monkeypatch, capsys):
@@ -117,11 +146,29 @@ def test_commands_fly_vehicles_of_another_layout(tmp_path, monkeypatch, capsys):
         written(renumbered(CRAZYFLIE, (3, 0, 1, 2), 45), tmp_path / "own.yaml"),
         ["crazyflie-robust", "any-quadcopter"],
     )
-    evaluated = ["--suite", "quick", "--scenario", "recovery", "--episodes", "8", "--no-report", "-o", "out"]
+    evaluated = [
+        "--suite",
+        "quick",
+        "--scenario",
+        "recovery",
+        "--episodes",
+        "8",
+        "--no-report",
+        "-o",
+        "out",
+    ]
     assert main(["evaluate", *agents, "geometric", "--vehicle", file, *evaluated]) == 0
     entries = json.loads((tmp_path / "out" / "results.json").read_text())["entries"]
     assert [entry["metrics"]["survival"]["value"] for entry in entries] == [1.0] * 3
-    kwargs = ["--env-kwargs", f"vehicle:{file}", "--task", "state_recovery", "--no-render", "-n", "200"]
+    kwargs = [
+        "--env-kwargs",
+        f"vehicle:{file}",
+        "--task",
+        "state_recovery",
+        "--no-render",
+        "-n",
+        "200",
+    ]
     assert main(["enjoy", *agents, "geometric", *kwargs]) == 0
     assert main(["enjoy", "geometric", *kwargs[:2], "rotor_layout:itm", *kwargs[2:]]) == 0
     assert capsys.readouterr().out.count("m from its target after 2.00 s") == 4
@@ -129,14 +176,30 @@ def test_commands_fly_vehicles_of_another_layout(tmp_path, monkeypatch, capsys):
 
 def test_a_vehicle_whose_rotors_lie_elsewhere_is_refused_in_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    file = written(CRAZYFLIE.model_copy(update={"name": "long", "rotor_positions": LONG}), tmp_path / "long.yaml")
-    with pytest.raises(ConfigError, match="no turn brings the rotors of long to where those of crazyflie are"):
+    file = written(
+        CRAZYFLIE.model_copy(update={"name": "long", "rotor_positions": LONG}),
+        tmp_path / "long.yaml",
+    )
+    with pytest.raises(
+        ConfigError, match="no turn brings the rotors of long to where those of crazyflie are"
+    ):
         fly(sb3_quad.load_pretrained("crazyflie-recovery"), vehicle=file)
     for command in (
         ["export", "crazyflie-robust", "--format", "torchscript", "--vehicle", file],
         ["export", "any-quadcopter", "--format", "torchscript", "--vehicle", file],
         ["enjoy", "crazyflie-robust", "--env-kwargs", f"vehicle:{file}", "--no-render"],
-        ["evaluate", "crazyflie-robust", "--vehicle", file, "--suite", "quick", "--episodes", "2", "-o", "out"],
+        [
+            "evaluate",
+            "crazyflie-robust",
+            "--vehicle",
+            file,
+            "--suite",
+            "quick",
+            "--episodes",
+            "2",
+            "-o",
+            "out",
+        ],
     ):
         assert main(command) != 0
         error = capsys.readouterr().err

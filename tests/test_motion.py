@@ -1,10 +1,19 @@
-"""When a flight is stable again and how far beside its way it gets, on made-up flights whose answer is known."""
+"""When a flight is stable again and how far beside its way it gets, on made-up flights whose answer
+is known.
+"""
 
 import numpy as np
 import pytest
 
 from sb3_quad.evaluation.flights import Motion
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, TARGET, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    TARGET,
+    QuadcopterState,
+)
 
 
 def state(position=(0, 0, 0), target=(10, 0, 0), tilt=0.0, rate=0.0):
@@ -37,4 +46,6 @@ def test_a_lost_flight_gets_stable_no_more():
 def test_sideways_is_across_the_way_only():
     states = [state(), state(position=(4, 3, 4)), state(position=(12, 0, 1))]
     assert watched(states).sideways[0] == pytest.approx(5.0)
-    assert np.isnan(watched([state(target=(0, 0, 0)), state(position=(1, 2, 3), target=(0, 0, 0))]).sideways[0])
+    assert np.isnan(
+        watched([state(target=(0, 0, 0)), state(position=(1, 2, 3), target=(0, 0, 0))]).sideways[0]
+    )

@@ -33,8 +33,13 @@ def perceptron(widths, activation="tanh", seed=0):
 def cloning(net, x, labels, index):
     """The loss "mse" over some rows, and its gradient by each parameter, from compiled code."""
     log_std = nn.Parameter(th.zeros(labels.shape[1]))
-    terms = Perceptron([*net]).gradient(x.numpy(), index, labels.numpy(), Loss(bc_coef=1.0), log_std)
-    return [th.tensor(terms[losses.CLONING] / len(index)), *(parameter.grad.clone() for parameter in net.parameters())]
+    terms = Perceptron([*net]).gradient(
+        x.numpy(), index, labels.numpy(), Loss(bc_coef=1.0), log_std
+    )
+    return [
+        th.tensor(terms[losses.CLONING] / len(index)),
+        *(parameter.grad.clone() for parameter in net.parameters()),
+    ]
 
 
 @settings(max_examples=settings().max_examples // 2)
@@ -56,8 +61,12 @@ def test_outputs_and_gradients_are_those_of_the_layers(widths, activation, rows,
     net.zero_grad()
     loss = (net(x[index]) - labels[index]).square().mean()
     loss.backward()
-    for one, other in zip(ours, [loss.detach(), *(parameter.grad for parameter in net.parameters())], strict=True):
-        th.testing.assert_close(one.float(), other, rtol=1e-4, atol=1e-5 * float(other.abs().max()) + 1e-7)
+    for one, other in zip(
+        ours, [loss.detach(), *(parameter.grad for parameter in net.parameters())], strict=True
+    ):
+        th.testing.assert_close(
+            one.float(), other, rtol=1e-4, atol=1e-5 * float(other.abs().max()) + 1e-7
+        )
 
 
 @pytest.fixture
@@ -68,31 +77,45 @@ def threads():
 
 
 def test_the_number_of_threads_changes_no_bit(threads):
-    net, x, labels, index = perceptron([18, 64, 64, 4]), th.randn(4096, 18), th.randn(4096, 4), np.arange(4096)
+    net, x, labels, index = (
+        perceptron([18, 64, 64, 4]),
+        th.randn(4096, 18),
+        th.randn(4096, 4),
+        np.arange(4096),
+    )
     alone = cloning(net, x, labels, index)
     for count in (2, 3, 8):
         threads(count)
         with one_torch_thread(compiled=True):
             assert th.get_num_threads() == 1
             for _ in range(20):
-                assert all(th.equal(*pair) for pair in zip(alone, cloning(net, x, labels, index), strict=True))
+                assert all(
+                    th.equal(*pair)
+                    for pair in zip(alone, cloning(net, x, labels, index), strict=True)
+                )
         assert th.get_num_threads() == count
 
 
 @pytest.mark.parametrize("algorithm", [DAgger, PPOBC])
-def test_from_the_seed_to_the_trained_weights_the_number_of_threads_changes_no_bit(algorithm, threads):
+def test_from_the_seed_to_the_trained_weights_the_number_of_threads_changes_no_bit(
+    algorithm, threads
+):
     found = []
     for count in (1, 2, 3):
         threads(count)
         env = QuadcopterVecEnv(48, "state_recovery", max_episode_steps=20, seed=0)
         rollout = {"n_steps": 25, "batch_size": 600, "n_epochs": 2}
-        model = algorithm("MlpPolicy", env, expert=GeometricExpert(), **rollout, seed=0, device="cpu")
+        model = algorithm(
+            "MlpPolicy", env, expert=GeometricExpert(), **rollout, seed=0, device="cpu"
+        )
         begun = parameters_to_vector(model.policy.parameters())
         model.learn(2400)
         found.append((begun, parameters_to_vector(model.policy.parameters())))
         assert th.get_num_threads() == count and not th.equal(*found[-1])
     for stage, alone in enumerate(found[0]):
-        assert all(th.equal(alone, other[stage]) for other in found[1:]), ("begun", "trained")[stage]
+        assert all(th.equal(alone, other[stage]) for other in found[1:]), ("begun", "trained")[
+            stage
+        ]
 
 
 def test_a_forked_child_computes_alone(threads):
@@ -113,14 +136,33 @@ def test_what_is_not_finite_stays_so(value, activation):
     x[7, 1] = value
     rows = np.isfinite(Perceptron([*net])(x.numpy())).all(axis=1)
     assert not rows[7] and rows.sum() == 299
-    assert not all(th.isfinite(each).all() for each in cloning(net, x, th.zeros(300, 2), np.arange(300))[1:])
+    assert not all(
+        th.isfinite(each).all() for each in cloning(net, x, th.zeros(300, 2), np.arange(300))[1:]
+    )
 
 
 N, A = 700, 4  # rows and actions
 LOSSES = [
     *(Loss(bc_coef=2.0, bc_loss=kind, vf_coef=0.5) for kind in range(len(losses.CLONING_LOSSES))),
-    *(Loss(policy_coef=1.0, bc_coef=0.5, bc_loss=kind, bc_filter=kind, vf_coef=0.5, clip_range_vf=0.1) for kind in (0, 1)),
-    Loss(policy_coef=1.0, normalize_advantage=True, vf_coef=0.5, clip_range_vf=0.1, max_clipped_value=False, ent_coef=0.01),
+    *(
+        Loss(
+            policy_coef=1.0,
+            bc_coef=0.5,
+            bc_loss=kind,
+            bc_filter=kind,
+            vf_coef=0.5,
+            clip_range_vf=0.1,
+        )
+        for kind in (0, 1)
+    ),
+    Loss(
+        policy_coef=1.0,
+        normalize_advantage=True,
+        vf_coef=0.5,
+        clip_range_vf=0.1,
+        max_clipped_value=False,
+        ent_coef=0.01,
+    ),
     Loss(policy_coef=1.0, bc_coef=1.0, ent_coef=0.01, l2_coef=0.1),
     Loss(bc_coef=0.7, bc_loss=losses.NLL, aux_coef=0.5, aux_layer=1),
     Loss(bc_coef=0.7, aux_coef=0.5, aux_layer=2, vf_coef=0.5),
@@ -128,28 +170,45 @@ LOSSES = [
 
 
 def batches(seed=0):
-    """Mini-batches of actor and critic: labels, actions, log-probabilities and advantages; values and returns."""
+    """Mini-batches of actor and critic: labels, actions, log-probabilities and advantages; values
+    and returns.
+    """
     rng = np.random.default_rng(seed)
     observations, rows = rng.normal(size=(N, 18)).astype(np.float32), rng.integers(0, N, 500)
-    for_actor = np.hstack([0.3 * rng.normal(size=(N, A)), 0.3 * rng.normal(size=(N, A)), rng.normal(size=(N, 2)) - [2.0, 0.0]])
+    for_actor = np.hstack(
+        [
+            0.3 * rng.normal(size=(N, A)),
+            0.3 * rng.normal(size=(N, A)),
+            rng.normal(size=(N, 2)) - [2.0, 0.0],
+        ]
+    )
     for_critic = rng.normal(size=(N, 2)).astype(np.float32)
-    return Batch(rows, observations, for_actor.astype(np.float32)), Batch(rows, observations, for_critic)
+    return Batch(rows, observations, for_actor.astype(np.float32)), Batch(
+        rows, observations, for_critic
+    )
 
 
 @pytest.mark.parametrize("with_critic", [True, False])
 @pytest.mark.parametrize("loss", LOSSES)
 def test_compiled_gradients_are_those_of_autograd(loss, with_critic):
-    policy = PPO("MlpPolicy", QuadcopterVecEnv(2), policy_kwargs={"log_std_init": -0.5}, seed=0, device="cpu").policy
+    policy = PPO(
+        "MlpPolicy", QuadcopterVecEnv(2), policy_kwargs={"log_std_init": -0.5}, seed=0, device="cpu"
+    ).policy
     network, (actor, critic) = networks.network_of(policy), batches()
     assert isinstance(network, Perceptrons)
     found = []
     for each in (network, policy):
         terms = networks.gradients(each, loss, actor, critic if with_critic else None)
-        found.append((terms, {name: parameter.grad for name, parameter in policy.named_parameters()}))
+        found.append(
+            (terms, {name: parameter.grad for name, parameter in policy.named_parameters()})
+        )
     (ours, compiled), (theirs, plain) = found
     assert ours == pytest.approx(theirs, rel=1e-4, abs=1e-6)
     for name, parameter in policy.named_parameters():  # no gradient is one of zero
-        one, other = (th.zeros_like(parameter) if each[name] is None else each[name] for each in (compiled, plain))
+        one, other = (
+            th.zeros_like(parameter) if each[name] is None else each[name]
+            for each in (compiled, plain)
+        )
         th.testing.assert_close(one, other, rtol=1e-3, atol=1e-5 * float(other.abs().max()) + 1e-8)
 
 
@@ -160,7 +219,9 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
         parameter.data.zero_()  # so that every mean action is zero
     labels, advantages = np.array([[0.1], [-0.2], [0.4]]), np.array([[1.0], [-1.0], [0.0]])
     batch = Batch(
-        np.arange(3), np.zeros((3, 3), np.float32), np.hstack([labels, 0 * labels, 0 * labels, advantages], dtype=np.float32)
+        np.arange(3),
+        np.zeros((3, 3), np.float32),
+        np.hstack([labels, 0 * labels, 0 * labels, advantages], dtype=np.float32),
     )
     loss = Loss(bc_coef=1.0, bc_filter=losses.BC_FILTERS.index(bc_filter))
     for network in (policy, networks.network_of(policy)):
@@ -171,24 +232,52 @@ def test_rows_that_are_filtered_out_count_as_zero(bc_filter, kept):
 @pytest.mark.parametrize(
     ("algorithm", "module", "keywords"),
     [
-        (PPOBC, ppo_bc, {"bc_loss": "huber_mse", "bc_coef": 1.0, "critic_warmup": 1, "clip_range_vf": 0.2}),
-        (DAgger, dagger, {"bc_loss": "nll", "dataset_capacity": 2000, "gradient_steps": 30, "max_grad_norm": None}),
+        (
+            PPOBC,
+            ppo_bc,
+            {"bc_loss": "huber_mse", "bc_coef": 1.0, "critic_warmup": 1, "clip_range_vf": 0.2},
+        ),
+        (
+            DAgger,
+            dagger,
+            {
+                "bc_loss": "nll",
+                "dataset_capacity": 2000,
+                "gradient_steps": 30,
+                "max_grad_norm": None,
+            },
+        ),
     ],
 )
 def test_a_training_is_the_one_by_autograd(monkeypatch, algorithm, module, keywords):
     def train():
         sizes = {"n_steps": 50, "batch_size": 400, "n_epochs": 3, "learning_rate": 1e-3}
         env, policy_kwargs = QuadcopterVecEnv(16, seed=0), {"log_std_init": -1.0}
-        model = algorithm("MlpPolicy", env, expert=GeometricExpert(), policy_kwargs=policy_kwargs, seed=0, **sizes, **keywords)
+        model = algorithm(
+            "MlpPolicy",
+            env,
+            expert=GeometricExpert(),
+            policy_kwargs=policy_kwargs,
+            seed=0,
+            **sizes,
+            **keywords,
+        )
         model.learn(1600)
-        logged = {name: value for name, value in model.logger.name_to_value.items() if name.startswith("train/")}
+        logged = {
+            name: value
+            for name, value in model.logger.name_to_value.items()
+            if name.startswith("train/")
+        }
         return logged, [parameter.detach() for parameter in model.policy.parameters()]
 
     ours, compiled = train()
     monkeypatch.setattr(module, "network_of", lambda policy: policy)
     theirs, plain = train()
     assert "train/loss" in ours and ours == pytest.approx(theirs, rel=1e-2, abs=1e-4)
-    assert max(float((one - other).abs().max()) for one, other in zip(compiled, plain, strict=True)) < 1e-4
+    assert (
+        max(float((one - other).abs().max()) for one, other in zip(compiled, plain, strict=True))
+        < 1e-4
+    )
 
 
 @pytest.mark.parametrize(
@@ -201,10 +290,15 @@ def test_a_training_is_the_one_by_autograd(monkeypatch, algorithm, module, keywo
     ],
 )
 def test_policies_give_what_their_own_methods_give(keywords, computed):
-    policy = PPO("MlpPolicy", QuadcopterVecEnv(4, seed=0), policy_kwargs=keywords, device="cpu").policy
+    policy = PPO(
+        "MlpPolicy", QuadcopterVecEnv(4, seed=0), policy_kwargs=keywords, device="cpu"
+    ).policy
     network, x = networks.network_of(policy), th.randn(500, 18)
     assert isinstance(network, Perceptrons) == computed
-    means, values = policy.get_distribution(x).mode().detach(), policy.predict_values(x).detach()[:, 0]
+    means, values = (
+        policy.get_distribution(x).mode().detach(),
+        policy.predict_values(x).detach()[:, 0],
+    )
     np.testing.assert_allclose(networks.mean_actions(network, x.numpy()), means, atol=1e-6)
     np.testing.assert_allclose(networks.state_values(network, x.numpy()), values, atol=1e-6)
     th.manual_seed(1)

@@ -1,4 +1,6 @@
-"""The notebooks of docs/notebooks run from top to bottom, with few and short episodes and one rollout of each training."""
+"""The notebooks of docs/notebooks run from top to bottom, with few and short episodes and one
+rollout of each training.
+"""
 
 import re
 from pathlib import Path
@@ -10,7 +12,9 @@ from sb3_quad.simulation.settings import FlightSettings
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "notebooks"
 NOTEBOOKS = {path.stem: path for path in sorted(FOLDER.glob("*.py"))}
-PARAMETERS = re.compile(r'(?<=^# %% tags=\["parameters"\]\n).*?(?=^# %%)', flags=re.DOTALL | re.MULTILINE)
+PARAMETERS = re.compile(
+    r'(?<=^# %% tags=\["parameters"\]\n).*?(?=^# %%)', flags=re.DOTALL | re.MULTILINE
+)
 
 
 def shortened(text):
@@ -32,7 +36,9 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", show)
     monkeypatch.setattr(FlightSettings, "longest_episode", 100)
-    monkeypatch.setattr("sb3_quad.training.trim.trim", lambda model: None)  # which needs an agent that flies
+    monkeypatch.setattr(
+        "sb3_quad.training.trim.trim", lambda model: None
+    )  # which needs an agent that flies
     with plt.rc_context():
         exec(compile(shortened(text), str(NOTEBOOKS[name]), "exec"), {"__name__": name})
     assert drawn and all(figure.axes for figure in drawn)
@@ -40,7 +46,9 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_is_in_jupytexts_form(name):
-    """Its head names the form and the kernel, its first cell is its title, and its numbers are shortened by the test above."""
+    """Its head names the form and the kernel, its first cell is its title, and its numbers are
+    shortened by the test above.
+    """
     text = NOTEBOOKS[name].read_text(encoding="utf-8")
     _, head, cells = text.split("# ---\n", 2)
     assert "format_name: percent" in head and "name: python3" in head

@@ -1,4 +1,6 @@
-"""Training, flying and evaluating a vehicle that is not the default one: by name, or by the file of a user's own."""
+"""Training, flying and evaluating a vehicle that is not the default one: by name, or by the file of
+a user's own.
+"""
 
 import json
 import re
@@ -51,12 +53,24 @@ def here(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["my.yaml", "hummingbird"])
-def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(vehicle, here, tmp_path, monkeypatch, capsys):
-    command = ["train", "--conf-file", "stages.yml", "--env-kwargs", f"vehicle:{vehicle}", "--eval-episodes", "0"]
+def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(
+    vehicle, here, tmp_path, monkeypatch, capsys
+):
+    command = [
+        "train",
+        "--conf-file",
+        "stages.yml",
+        "--env-kwargs",
+        f"vehicle:{vehicle}",
+        "--eval-episodes",
+        "0",
+    ]
     assert main([*command, "-f", str(here / "logs")]) == 0
     printed = capsys.readouterr().out
     assert printed.count("fresh episodes, the same for all") == 2 and "thesis" not in printed
-    settings = yaml.safe_load((here / "logs" / "ppo_bc" / f"{ENV}_1" / ENV / "config.yml").read_text())
+    settings = yaml.safe_load(
+        (here / "logs" / "ppo_bc" / f"{ENV}_1" / ENV / "config.yml").read_text()
+    )
     flown = load_vehicle(settings["env_kwargs"]["vehicle"])
     assert flown == load_vehicle(vehicle)
     status = yaml.safe_load(next((here / "logs" / "stages").rglob("pipeline.yml")).read_text())
@@ -65,14 +79,32 @@ def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(vehicle, h
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     monkeypatch.chdir(elsewhere)
-    assert main(["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", str(here / "logs"), "--no-render", "-n", "20"]) == 0
+    assert (
+        main(
+            [
+                "enjoy",
+                "--algo",
+                "ppo_bc",
+                "--env",
+                ENV,
+                "-f",
+                str(here / "logs"),
+                "--no-render",
+                "-n",
+                "20",
+            ]
+        )
+        == 0
+    )
     agent = here / "logs" / "ppo_bc" / f"{ENV}_1" / "trimmed_model.zip"
     assert main(["export", str(agent), "--format", "torchscript", "-o", "agent.pt"]) == 0
     assert f'"vehicle": "{flown.name}:'.encode() in (elsewhere / "agent.pt").read_bytes()
 
 
 def test_the_file_that_the_documentation_writes_flies(here, capsys):
-    text = (Path(__file__).resolve().parent.parent / "docs" / "vehicles.md").read_text(encoding="utf-8")
+    text = (Path(__file__).resolve().parent.parent / "docs" / "vehicles.md").read_text(
+        encoding="utf-8"
+    )
     (block,) = re.findall(r"```yaml\n(.*?)```", text, flags=re.DOTALL)
     (here / "mine.yaml").write_text(block)
     assert main(["check-vehicle", "mine.yaml", "-n", "48"]) == 0
@@ -81,19 +113,39 @@ def test_the_file_that_the_documentation_writes_flies(here, capsys):
 
 def test_the_path_of_a_vehicle_is_kept_whole_and_a_name_is_a_name(here):
     config = load_config("dagger", ENV, None, {"env_kwargs": {"vehicle": "my.yaml"}})
-    assert config.settings["env_kwargs"]["vehicle"] == config.env_kwargs["vehicle"] == str(here / "my.yaml")
+    assert (
+        config.settings["env_kwargs"]["vehicle"]
+        == config.env_kwargs["vehicle"]
+        == str(here / "my.yaml")
+    )
     (here / "itm").write_text("a file that only happens to be called so")
-    assert load_config("dagger", ENV, None, {"env_kwargs": {"vehicle": "itm"}}).env_kwargs["vehicle"] == "itm"
+    assert (
+        load_config("dagger", ENV, None, {"env_kwargs": {"vehicle": "itm"}}).env_kwargs["vehicle"]
+        == "itm"
+    )
 
 
 def test_a_suite_flown_by_another_vehicle(here, capsys):
-    command = ["evaluate", "pid", "geometric", "--suite", "quick", "--scenario", "tracking", "--episodes", "4", "--no-report"]
+    command = [
+        "evaluate",
+        "pid",
+        "geometric",
+        "--suite",
+        "quick",
+        "--scenario",
+        "tracking",
+        "--episodes",
+        "4",
+        "--no-report",
+    ]
     assert main([*command, "--vehicle", "my.yaml", "-o", "out"]) == 0
     assert "thesis" not in capsys.readouterr().out
     results = json.loads((here / "out" / "results.json").read_text())
     assert results["scenarios"][0]["vehicle"] == load_vehicle("my.yaml").model_dump(mode="json")
     assert results["scenarios"][0]["reference"] == {}
-    assert main([*command, "--vehicle", "hummingbird", "-o", "out"]) == 2  # other flights of the same name
+    assert (
+        main([*command, "--vehicle", "hummingbird", "-o", "out"]) == 2
+    )  # other flights of the same name
     assert "holds results already" in capsys.readouterr().err
 
 
@@ -103,5 +155,7 @@ def test_scenarios_that_a_vehicle_cannot_fly_are_named(here):
         suite.with_changes(vehicle="humingbird")
     data = yaml.safe_load((here / "my.yaml").read_text())
     (here / "huge.yaml").write_text(yaml.safe_dump({**data, "collision_radius": 16.0}))
-    with pytest.raises(ConfigError, match=r"scenario tracking, flown by huge\.yaml: .*touches the ground"):
+    with pytest.raises(
+        ConfigError, match=r"scenario tracking, flown by huge\.yaml: .*touches the ground"
+    ):
         suite.with_changes(vehicle="huge.yaml")

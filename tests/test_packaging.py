@@ -20,12 +20,19 @@ import sb3_quad
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
 DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
-APART = ("zoo", "ray", "track", "pybullet")  # extras in the environment of make test-zoo, and one that most have anyway
+APART = (
+    "zoo",
+    "ray",
+    "track",
+    "pybullet",
+)  # extras in the environment of make test-zoo, and one that most have anyway
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 
 def run(*command, cwd):
-    """Standard output of a command that must succeed; nothing of this process's own import path reaches it."""
+    """Standard output of a command that must succeed; nothing of this process's own import path
+    reaches it.
+    """
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     result = subprocess.run(
         [str(part) for part in command],
@@ -48,12 +55,18 @@ def module_name(path):
 
 def package_folders():
     """Every folder of code in the checkout, by the name it is imported under."""
-    return {module_name(init.parent): init.parent for name in CODE for init in (ROOT / name).rglob("__init__.py")}
+    return {
+        module_name(init.parent): init.parent
+        for name in CODE
+        for init in (ROOT / name).rglob("__init__.py")
+    }
 
 
 def requirements(text):
     """The names in lines such as ``rl_zoo3[plots]>=2.9``."""
-    return {re.split(r"[\[>=;]", line)[0].strip().lower() for line in text.splitlines() if line.strip()}
+    return {
+        re.split(r"[\[>=;]", line)[0].strip().lower() for line in text.splitlines() if line.strip()
+    }
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +78,9 @@ def options():
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """A wheel made from a source distribution, made from a copy, so that nothing built earlier can slip in."""
+    """A wheel made from a source distribution, made from a copy, so that nothing built earlier can
+    slip in.
+    """
     folder = tmp_path_factory.mktemp("build")
     source = folder / "source"
     source.mkdir()
@@ -73,10 +88,25 @@ def wheel(tmp_path_factory):
         if path.is_file():
             shutil.copy(path, source)
     for name in (*CODE, "tests"):
-        shutil.copytree(ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info"))
-    run(sys.executable, "-c", f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})", cwd=source)
+        shutil.copytree(
+            ROOT / name, source / name, ignore=shutil.ignore_patterns("__pycache__", "*.egg-info")
+        )
+    run(
+        sys.executable,
+        "-c",
+        f"from setuptools import build_meta; build_meta.build_sdist({str(folder)!r})",
+        cwd=source,
+    )
     (archive,) = folder.glob("*.tar.gz")
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "wheel", "--no-deps", "--no-build-isolation")
+    pip = (
+        sys.executable,
+        "-m",
+        "pip",
+        "--disable-pip-version-check",
+        "wheel",
+        "--no-deps",
+        "--no-build-isolation",
+    )
     run(*pip, "--wheel-dir", folder, archive, cwd=folder)
     (built,) = folder.glob("*.whl")
     return built
@@ -84,21 +114,35 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory):
-    """The folder of commands of a new environment that holds the wheel, and uses what it depends on from ours."""
+    """The folder of commands of a new environment that holds the wheel, and uses what it depends on
+    from ours.
+    """
     folder = tmp_path_factory.mktemp("environment")
     venv.create(folder, with_pip=False, symlinks=os.name != "nt")
-    paths = {name: Path(path) for name, path in sysconfig.get_paths("venv", {"base": folder}).items()}
-    # A line in a .pth file lends the packages there, but not the link to this checkout, which is a .pth file itself.
+    paths = {
+        name: Path(path) for name, path in sysconfig.get_paths("venv", {"base": folder}).items()
+    }
+    # A line in a .pth file lends the packages there, but not the link to this checkout, which is a
+    # .pth file itself.
     lent = [path for path in sys.path if Path(path).name in ("site-packages", "dist-packages")]
     (paths["purelib"] / "lent.pth").write_text("\n".join(lent))
-    pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "--python", paths["scripts"] / "python")
+    pip = (
+        sys.executable,
+        "-m",
+        "pip",
+        "--disable-pip-version-check",
+        "--python",
+        paths["scripts"] / "python",
+    )
     run(*pip, "install", "--no-deps", "--no-index", "--ignore-installed", wheel, cwd=folder)
     _lend_compiled_code(paths["purelib"])
     return paths["scripts"]
 
 
 def _lend_compiled_code(purelib):
-    """Numba takes what it has compiled for the checkout, if there is any, where the files' times are the same."""
+    """Numba takes what it has compiled for the checkout, if there is any, where the files' times
+    are the same.
+    """
     for name, source in package_folders().items():
         target = purelib.joinpath(*name.split("."))
         for path in source.glob("*.py"):
@@ -116,33 +160,52 @@ def test_every_code_folder_is_a_package_and_listed(options):
 
 
 def test_package_dir_leads_to_the_package(options):
-    mapping = dict(line.split(" = ") for line in options["options"]["package_dir"].strip().splitlines())
+    mapping = dict(
+        line.split(" = ") for line in options["options"]["package_dir"].strip().splitlines()
+    )
     for name, folder in package_folders().items():
         prefix = max((key for key in mapping if f"{name}.".startswith(f"{key}.")), key=len)
         assert (ROOT / mapping[prefix]).joinpath(*name.removeprefix(prefix).split(".")) == folder
 
 
 def test_each_dependency_is_pinned(options):
-    wanted = "".join([options["options"]["install_requires"], *options["options.extras_require"].values()])
-    pins = [line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    wanted = "".join(
+        [options["options"]["install_requires"], *options["options.extras_require"].values()]
+    )
+    pins = [
+        line.split("==")[0]
+        for line in (ROOT / "constraints.txt").read_text().splitlines()
+        if "==" in line
+    ]
     assert requirements(wanted) <= set(pins)
     assert len(pins) == len(set(pins))
 
 
 def test_the_extra_for_developers_holds_all_but_those_apart(options):
     extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
-    assert extras["dev"] >= set().union(*(extras[name] for name in extras if name not in ("dev", *APART))) - {"torch"}
+    assert extras["dev"] >= set().union(
+        *(extras[name] for name in extras if name not in ("dev", *APART))
+    ) - {"torch"}
     assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
-    page, tried = ((ROOT / name).read_text(encoding="utf-8") for name in ("docs/installation.md", ".ci/extras"))
-    assert all(f"| `[{name}]` |" in page and re.search(rf"^ +{name}\)", tried, re.MULTILINE) for name in extras)
+    page, tried = (
+        (ROOT / name).read_text(encoding="utf-8") for name in ("docs/installation.md", ".ci/extras")
+    )
+    assert all(
+        f"| `[{name}]` |" in page and re.search(rf"^ +{name}\)", tried, re.MULTILINE)
+        for name in extras
+    )
 
 
 def test_extras_are_installed_from_a_clone(options):
     """The package is on no index, and zsh wants the brackets quoted."""
     code = [path for name in CODE for path in (ROOT / name).rglob("*.py")]
     for path in [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *code]:
-        for written in re.findall(r"pip install [^`\n]*\[[^`\n]*", path.read_text(encoding="utf-8")):
-            named = re.match(r"pip install (?:-c constraints.txt )?'\.\[(\w+|\{extra\})\]'", written)
+        for written in re.findall(
+            r"pip install [^`\n]*\[[^`\n]*", path.read_text(encoding="utf-8")
+        ):
+            named = re.match(
+                r"pip install (?:-c constraints.txt )?'\.\[(\w+|\{extra\})\]'", written
+            )
             assert named, f"{path}: {written}"
             assert named[1] in (*options["options.extras_require"], "{extra}"), f"{path}: {written}"
 
@@ -153,7 +216,12 @@ def test_the_version_stands_in_one_place(options):
 
 
 def test_what_the_code_imports_is_declared(options):
-    distributions = {"yaml": "pyyaml", "stable_baselines3": "stable-baselines3", "PIL": "pillow", "sb3_contrib": "sb3-contrib"}
+    distributions = {
+        "yaml": "pyyaml",
+        "stable_baselines3": "stable-baselines3",
+        "PIL": "pillow",
+        "sb3_contrib": "sb3-contrib",
+    }
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
     extras = [text for name, text in options["options.extras_require"].items() if name != "dev"]
     wanted = "\n".join([options["options"]["install_requires"], *extras])
@@ -162,8 +230,12 @@ def test_what_the_code_imports_is_declared(options):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             names += [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-            for name in {name.split(".")[0] for name in names} - {"sb3_quad"} - set(sys.stdlib_module_names):
-                assert brought.get(name, distributions.get(name, name)) in declared, f"{path} imports {name}"
+            for name in (
+                {name.split(".")[0] for name in names} - {"sb3_quad"} - set(sys.stdlib_module_names)
+            ):
+                assert brought.get(name, distributions.get(name, name)) in declared, (
+                    f"{path} imports {name}"
+                )
 
 
 @pytest.mark.slow
@@ -188,7 +260,9 @@ def test_the_wheel_holds_all_code_and_data(wheel):
 
 
 def test_no_data_file_is_outside_a_package():
-    """Package data is listed by package: a YAML file in a folder that is none would be missing from the wheel."""
+    """Package data is listed by package: a YAML file in a folder that is none would be missing from
+    the wheel.
+    """
     folders = set(package_folders().values())
     for path in (path for name in CODE for path in (ROOT / name).rglob("*")):
         assert path.suffix not in DATA or path.parent in folders, path
@@ -203,21 +277,41 @@ for name in names: importlib.import_module(name)
 configs = importlib.resources.files("sb3_quad.zoo_configs")
 print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs.joinpath("dagger.yml").read_text()]))
 """
-    names, files, config = json.loads(run(installed / "python", "-c", code, cwd=tmp_path).splitlines()[-1])
-    assert {"sb3_quad.envs.quadcopter_env", "sb3_quad.callbacks", "sb3_quad.zoo_configs.thesis"} <= set(names)
+    names, files, config = json.loads(
+        run(installed / "python", "-c", code, cwd=tmp_path).splitlines()[-1]
+    )
+    assert {
+        "sb3_quad.envs.quadcopter_env",
+        "sb3_quad.callbacks",
+        "sb3_quad.zoo_configs.thesis",
+    } <= set(names)
     assert not [file for file in files if not Path(file).is_relative_to(installed.parent)]
     assert config == (ROOT / "zoo_configs" / "dagger.yml").read_text()
     assert "train" in run(installed / "sb3-quad", "--help", cwd=tmp_path)
-    assert "--algo" in run(installed / "python", "-m", "sb3_quad.cli", "train", "--help", cwd=tmp_path)
+    assert "--algo" in run(
+        installed / "python", "-m", "sb3_quad.cli", "train", "--help", cwd=tmp_path
+    )
 
 
 @pytest.mark.slow
 def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
-    """From another folder, what a newcomer does after ``pip install``; in one process, which compiles once.
+    """From another folder, what a newcomer does after ``pip install``; in one process, which
+    compiles once.
 
-    The closing tables are of few episodes, and PyTorch has one thread: its others only wait for each other here.
+    The closing tables are of few episodes, and PyTorch has one thread: its others only wait for
+    each other here.
     """
-    algo = ["--algo", "dagger", "--num-threads", "1", "-n", "1600", "--n-envs", "16", "--eval-episodes"]
+    algo = [
+        "--algo",
+        "dagger",
+        "--num-threads",
+        "1",
+        "-n",
+        "1600",
+        "--n-envs",
+        "16",
+        "--eval-episodes",
+    ]
     small = ["--seed", "0", "--hyperparams", "n_steps:50", "gradient_steps:5", "batch_size:256"]
     search = ["--n-trials", "2", "--n-evaluations", "1", "--search-space", "space.yml"]
     zip_file, best = (
@@ -243,5 +337,7 @@ def test_the_installed_package_works_from_the_checkout(installed):
     """There the checkout's sb3_quad/ comes first, whose envs/ and the like lie beside it."""
     assert "train" in run(installed / "python", "-m", "sb3_quad.cli", "--help", cwd=ROOT)
     code = "import sb3_quad.envs.registration as r, sb3_quad.callbacks, sb3_quad.zoo_configs.thesis; print(r.__file__)"
-    assert run(installed / "python", "-c", code, cwd=ROOT).strip() == str(ROOT / "envs" / "registration.py")
+    assert run(installed / "python", "-c", code, cwd=ROOT).strip() == str(
+        ROOT / "envs" / "registration.py"
+    )
     assert "train" in run(installed / "sb3-quad", "--help", cwd=ROOT)

@@ -8,7 +8,14 @@ from hypothesis import strategies as st
 
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, STATE_SIZE, VELOCITY
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    ROTOR_SPEEDS,
+    STATE_SIZE,
+    VELOCITY,
+)
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 URDF = """<robot name="body"><link name="base"><inertial><mass value="{m!r}"/>
@@ -25,10 +32,14 @@ class BulletReference:
         self.vehicle, self.client = vehicle, {"physicsClientId": pybullet.connect(pybullet.DIRECT)}
         pybullet.setGravity(0, 0, -vehicle.gravity, **self.client)
         pybullet.setTimeStep(vehicle.physics_step, **self.client)
-        self.body = pybullet.loadURDF(str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, **self.client)
+        self.body = pybullet.loadURDF(
+            str(path), flags=pybullet.URDF_USE_INERTIA_FROM_FILE, **self.client
+        )
         pybullet.changeDynamics(self.body, -1, linearDamping=0, angularDamping=0, **self.client)
         w, x, y, z = state[QUATERNION]
-        pybullet.resetBasePositionAndOrientation(self.body, state[POSITION], (x, y, z, w), **self.client)
+        pybullet.resetBasePositionAndOrientation(
+            self.body, state[POSITION], (x, y, z, w), **self.client
+        )
         rates = self.rotation((x, y, z, w)) @ state[BODY_RATES]
         pybullet.resetBaseVelocity(self.body, state[VELOCITY], rates, **self.client)
         self.speeds = state[ROTOR_SPEEDS].copy()
@@ -44,24 +55,35 @@ class BulletReference:
         self.waiting.append(np.sqrt(thrust / vehicle.thrust_coefficient))
         wanted = self.waiting.pop(0)
         for _ in range(vehicle.substeps):
-            share = np.where(wanted > self.speeds, vehicle.motor_gain_up, vehicle.motor_gain_down) * vehicle.physics_step
+            share = (
+                np.where(wanted > self.speeds, vehicle.motor_gain_up, vehicle.motor_gain_down)
+                * vehicle.physics_step
+            )
             before, exact = self.speeds, vehicle.motor_integration == "exact"
             share = share / (1 + share / 2 + share**2 / 12) if exact else share
             self.speeds = before + (wanted - before) * share
             thrust = vehicle.thrust_coefficient * self.speeds * (before if exact else self.speeds)
             lift, *moments = vehicle.mixer @ thrust
             centre, attitude = pybullet.getBasePositionAndOrientation(body, **client)
-            airspeed = self.rotation(attitude).T @ (np.array(pybullet.getBaseVelocity(body, **client)[0]) - wind)
+            airspeed = self.rotation(attitude).T @ (
+                np.array(pybullet.getBaseVelocity(body, **client)[0]) - wind
+            )
             force = wrench[3:6] + np.array([0.0, 0.0, lift]) - np.array(vehicle.drag) * airspeed
-            pybullet.applyExternalForce(body, -1, wrench[:3], centre, pybullet.WORLD_FRAME, **client)
+            pybullet.applyExternalForce(
+                body, -1, wrench[:3], centre, pybullet.WORLD_FRAME, **client
+            )
             pybullet.applyExternalForce(body, -1, force, (0, 0, 0), pybullet.LINK_FRAME, **client)
             pybullet.applyExternalTorque(body, -1, wrench[6:9], pybullet.WORLD_FRAME, **client)
-            pybullet.applyExternalTorque(body, -1, wrench[9:] + moments, pybullet.LINK_FRAME, **client)
+            pybullet.applyExternalTorque(
+                body, -1, wrench[9:] + moments, pybullet.LINK_FRAME, **client
+            )
             pybullet.stepSimulation(**client)
         position, quaternion = pybullet.getBasePositionAndOrientation(body, **client)
         velocity, rates = pybullet.getBaseVelocity(body, **client)
         x, y, z, w = quaternion
-        return np.concatenate([position, (w, x, y, z), velocity, self.rotation(quaternion).T @ rates, self.speeds])
+        return np.concatenate(
+            [position, (w, x, y, z), velocity, self.rotation(quaternion).T @ rates, self.speeds]
+        )
 
     def close(self):
         pybullet.disconnect(**self.client)
@@ -125,7 +147,9 @@ def vehicles(draw):
     size = draw(st.floats(0.3, 3.0))
     spread = draw(st.tuples(st.floats(0.8, 1.2), st.floats(0.8, 1.2), st.floats(0.8, 1.2)))
     arm = 0.17 * size
-    least = draw(st.just(0.0) | st.floats(0.01, 0.8))  # a rotor's speed is a root, which magnifies the rounding of almost 0
+    least = draw(
+        st.just(0.0) | st.floats(0.01, 0.8)
+    )  # a rotor's speed is a root, which magnifies the rounding of almost 0
     return Vehicle(
         name="random",
         mass=1.7 * size**3,
@@ -145,7 +169,10 @@ def vehicles(draw):
     )
 
 
-@settings(max_examples=settings().max_examples // 8, suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much])
+@settings(
+    max_examples=settings().max_examples // 8,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.filter_too_much],
+)
 @given(vehicle=vehicles(), seed=st.integers(0, 2**32 - 1), pushed=st.booleans())
 def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
     rng = np.random.default_rng(seed)
@@ -155,19 +182,31 @@ def test_flight_is_pybullets(vehicle, seed, pushed, tmp_path_factory):
     wrench, wind = pushed * scale * rng.normal(size=12), pushed * 5.0 * rng.normal(size=3)
     folder = tmp_path_factory.mktemp("bullet")
     # Where PyBullet cuts velocities at 100 rad/s rounding grows fast; another test is about that.
-    assume(np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None], wind)[:, BODY_RATES]).max() <= 60.0)
+    assume(
+        np.abs(
+            fly(vehicle, state[:, None], actions[:, None], wrench[:, None], wind)[:, BODY_RATES]
+        ).max()
+        <= 60.0
+    )
     assert worst_difference(vehicle, folder, state, actions, wrench, wind).max() < 1e-9
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird", "itm"])
 @pytest.mark.parametrize("seed", range(3))
 def test_flight_of_the_shipped_vehicles_is_pybullets(name, seed, tmp_path):
-    """Full deflection for 0.1 s at most at a time: longer, and a small vehicle spins faster than PyBullet is exact at."""
+    """Full deflection for 0.1 s at most at a time: longer, and a small vehicle spins faster than
+    PyBullet is exact at.
+    """
     vehicle, rng = load_vehicle(name), np.random.default_rng(seed)
     state = random_state(rng, vehicle)
-    actions = np.clip(random_actions(rng, 200)[::2] * rng.choice([-1.0, 1.0], size=(100, 4)), -1, 1).astype(np.float32)
+    actions = np.clip(
+        random_actions(rng, 200)[::2] * rng.choice([-1.0, 1.0], size=(100, 4)), -1, 1
+    ).astype(np.float32)
     wrench = np.zeros(12)
-    assert np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, BODY_RATES]).max() < 60.0
+    assert (
+        np.abs(fly(vehicle, state[:, None], actions[:, None], wrench[:, None])[:, BODY_RATES]).max()
+        < 60.0
+    )
     assert worst_difference(vehicle, tmp_path, state, actions, wrench).max() < 1e-9
 
 

@@ -1,4 +1,6 @@
-"""Pipelines: stages hand their agents on, interruptions go on where they were, and trimming cancels an offset."""
+"""Pipelines: stages hand their agents on, interruptions go on where they were, and trimming cancels
+an offset.
+"""
 
 import argparse
 import os
@@ -22,15 +24,33 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.training import arrival
 from sb3_quad.training import pipeline as pipeline_module
-from sb3_quad.training.pipeline import load_pipeline, resume_pipeline, run_pipeline, stage_jobs, with_settings
+from sb3_quad.training.pipeline import (
+    load_pipeline,
+    resume_pipeline,
+    run_pipeline,
+    stage_jobs,
+    with_settings,
+)
 from sb3_quad.training.trainer import train
 from sb3_quad.training.trim import Trim, hover_offset, scale_position, shift_position, trim
 
-TINY = {"n_envs": 8, "n_steps": 16, "batch_size": 64, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
+TINY = {
+    "n_envs": 8,
+    "n_steps": 16,
+    "batch_size": 64,
+    "n_timesteps": 256,
+    "env_kwargs": {"max_episode_steps": 12},
+}
 TINY["policy_kwargs"] = {"net_arch": [8, 8]}
 STAGES = [
     {"name": "one", "algo": "dagger", "env": "QuadTargetTracking-v0", "pass_on": "last"},
-    {"name": "two", "algo": "ppo_bc", "env": "QuadStateRecovery-v0", "pass_on": "last", "settings": {"n_epochs": 1}},
+    {
+        "name": "two",
+        "algo": "ppo_bc",
+        "env": "QuadStateRecovery-v0",
+        "pass_on": "last",
+        "settings": {"n_epochs": 1},
+    },
 ]
 
 
@@ -61,14 +81,21 @@ def test_each_stage_starts_from_the_agent_of_the_one_before(tmp_path, job):
     stages = [STAGES[0], {**STAGES[1], "settings": {"learning_rate": 0.0, "n_epochs": 1}}]
     result = run_pipeline(tiny(tmp_path, stages), job, "stages", quiet)
     one, two = (policy(entry.agent) for entry in result.stages.values())
-    assert result.exit_code == 0 and all(np.array_equal(one[key], two[key]) for key in one if key != "log_std")
+    assert result.exit_code == 0 and all(
+        np.array_equal(one[key], two[key]) for key in one if key != "log_std"
+    )
     status = yaml.safe_load((result.folder / "pipeline.yml").read_text(encoding="utf-8"))
     assert status["runs"] == [entry.run for entry in result.stages.values()]
 
 
 def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
     with pytest.raises(TrainingError, match=r"stage 'one'.*mean_reward 1.*logs/dagger"):
-        run_pipeline(tiny(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]]), job, "stages", quiet)
+        run_pipeline(
+            tiny(tmp_path, [{**STAGES[0], "require": {"mean_reward": 1.0}}, STAGES[1]]),
+            job,
+            "stages",
+            quiet,
+        )
     assert not (tmp_path / "logs" / "ppo_bc").exists()
 
 
@@ -79,16 +106,27 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "algo": "daggr"}], "did you mean 'dagger'"),
         ([{**STAGES[0], "settings": {"n_stepz": 3}}], "did you mean 'n_steps'"),
         ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
-        ([{**STAGES[0], "trim": "hover", "conf_file": "robust/dagger.yml"}], "see the 18 features alone"),
+        (
+            [{**STAGES[0], "trim": "hover", "conf_file": "robust/dagger.yml"}],
+            "see the 18 features alone",
+        ),
         ([{**STAGES[0], "position_scale": 0.6}], "position_scale goes with trim: position"),
-        ([{**STAGES[0], "trim": "hover", "leaving_cost": 2.0}], "leaving_cost goes with trim: arrival"),
-        ([{**STAGES[0], "trim": "arrival", "trim_env_kwargs": {"randomize": {"gust": {}}}}], "did you mean 'gusts'"),
+        (
+            [{**STAGES[0], "trim": "hover", "leaving_cost": 2.0}],
+            "leaving_cost goes with trim: arrival",
+        ),
+        (
+            [{**STAGES[0], "trim": "arrival", "trim_env_kwargs": {"randomize": {"gust": {}}}}],
+            "did you mean 'gusts'",
+        ),
         ([], "at least 1"),
         ([STAGES[0], STAGES[0]], "one, one: give each a name of its own"),
     ],
 )
 def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, message, capsys):
-    code = main(["train", "--conf-file", str(write(tmp_path, stages)), "-f", str(tmp_path / "logs")])
+    code = main(
+        ["train", "--conf-file", str(write(tmp_path, stages)), "-f", str(tmp_path / "logs")]
+    )
     error = capsys.readouterr().err
     assert code == 2 and message in error and error.count("\n") == 1
     assert not (tmp_path / "logs").exists()
@@ -100,7 +138,10 @@ def test_bad_stages_are_named_before_anything_is_trained(tmp_path, stages, messa
         (["-n", "100"], "--n-timesteps goes with a single run"),
         (["--conf-file", "two_stage.yml", "--algo", "dagger"], "--algo goes with a single run"),
         (["--thesis", "--conf-file", "two_stage.yml"], "--thesis is --conf-file"),
-        (["--algo", "dagger", "--env-kwargs", "noise:0", "--env-kwargs", "noise:1"], "noise is given twice"),
+        (
+            ["--algo", "dagger", "--env-kwargs", "noise:0", "--env-kwargs", "noise:1"],
+            "noise is given twice",
+        ),
     ],
 )
 def test_flags_that_would_be_ignored_are_refused(flags, message, capsys):
@@ -110,7 +151,11 @@ def test_flags_that_would_be_ignored_are_refused(flags, message, capsys):
 def test_flags_of_pairs_add_up():
     parser = argparse.ArgumentParser()
     parser.add_argument("--pairs", **PAIRS)
-    assert parser.parse_args(["--pairs", "a:1", "--pairs", "b:2", "c:3"]).pairs == {"a": 1, "b": 2, "c": 3}
+    assert parser.parse_args(["--pairs", "a:1", "--pairs", "b:2", "c:3"]).pairs == {
+        "a": 1,
+        "b": 2,
+        "c": 3,
+    }
 
 
 def test_moved_and_scaled_positions_are_part_of_the_actor():
@@ -125,18 +170,24 @@ def test_moved_and_scaled_positions_are_part_of_the_actor():
     longer[:, :3] /= 0.8
     before = model.predict(longer, deterministic=True)[0]
     scale_position(model, 0.8)
-    np.testing.assert_allclose(model.predict(observations, deterministic=True)[0], before, atol=1e-5)
+    np.testing.assert_allclose(
+        model.predict(observations, deterministic=True)[0], before, atol=1e-5
+    )
 
 
 def test_an_agent_that_crashes_cannot_be_trimmed():
-    model = PPO("MlpPolicy", QuadcopterVecEnv(4, seed=1), n_steps=8, batch_size=8, seed=0, device="cpu")
+    model = PPO(
+        "MlpPolicy", QuadcopterVecEnv(4, seed=1), n_steps=8, batch_size=8, seed=0, device="cpu"
+    )
     with pytest.raises(ConfigError, match="offset from the target cannot be measured"):
         hover_offset(model, n_flights=8)
 
 
 @pytest.mark.slow
 def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
-    monkeypatch.setattr("sb3_quad.training.trim.fly", partial(fly, max_steps=700))  # 7 s are enough to arrive
+    monkeypatch.setattr(
+        "sb3_quad.training.trim.fly", partial(fly, max_steps=700)
+    )  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
@@ -146,19 +197,27 @@ def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
 
 def test_a_stage_says_where_and_how_often_its_agent_is_trimmed(tmp_path, job, monkeypatch):
     seen = []
-    monkeypatch.setattr(pipeline_module, "trim_arrival", lambda *given: seen.append(given) or Trim(1.0, 0.5))
+    monkeypatch.setattr(
+        pipeline_module, "trim_arrival", lambda *given: seen.append(given) or Trim(1.0, 0.5)
+    )
     for own in ({}, {"trim_env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}, "trims": 2}):
         settings = {"env_kwargs": {"randomize": {"share": 0.5}, "noise": 0.1}}
         stage = {**STAGES[0], "trim": "arrival", "settings": settings, **own}
         run_pipeline(tiny(tmp_path, [stage]), job, "stages", quiet)
     randomize = [worlds.randomize for _, _, _, worlds, _ in seen]
-    assert [(each.share, each.mass and each.mass.high) for each in randomize] == [(0.5, None), (1.0, 1.1), (1.0, 1.1)]
+    assert [(each.share, each.mass and each.mass.high) for each in randomize] == [
+        (0.5, None),
+        (1.0, 1.1),
+        (1.0, 1.1),
+    ]
     assert {worlds.noise for _, _, _, worlds, _ in seen} == {0.1}
     assert len({seed for _, seed, *_ in seen}) == 2 and seen[0][1] == seen[1][1]
 
 
 @pytest.mark.slow
-def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_overshoot_again(monkeypatch):
+def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_overshoot_again(
+    monkeypatch,
+):
     monkeypatch.setattr(arrival, "N_FLIGHTS", 24)
     monkeypatch.setattr(arrival, "N_CHECKED", 120)
     model, settings = load_pretrained("itm-recovery"), FlightSettings()
@@ -175,19 +234,31 @@ def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_oversh
 
 
 def test_scales_that_do_not_help_are_not_kept(monkeypatch):
-    for name, value in (("ROUNDS", 1), ("CANDIDATES", 2), ("BEST", 1), ("N_FLIGHTS", 2), ("N_CHECKED", 2)):
+    for name, value in (
+        ("ROUNDS", 1),
+        ("CANDIDATES", 2),
+        ("BEST", 1),
+        ("N_FLIGHTS", 2),
+        ("N_CHECKED", 2),
+    ):
         monkeypatch.setattr(arrival, name, value)
     env = QuadcopterVecEnv(4, seed=1, last_action=True, history=[0, 2])
-    model = PPO("MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu")  # loses every flight, however it is scaled
+    model = PPO(
+        "MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"
+    )  # loses every flight, however it is scaled
     before = model.policy.mlp_extractor.policy_net[0].weight.detach().clone()
     result = arrival.trim_arrival(model, 1, *[FlightSettings(last_action=True, history=[0, 2])] * 2)
-    assert result.after == result.before and th.equal(model.policy.mlp_extractor.policy_net[0].weight, before)
+    assert result.after == result.before and th.equal(
+        model.policy.mlp_extractor.policy_net[0].weight, before
+    )
     with pytest.raises(ConfigError, match="reads the 18 features"):
         arrival.trim_arrival(model, 1, FlightSettings(), FlightSettings())
 
 
 def small_file(tmp_path):
-    return write(tmp_path, [{**stage, "settings": {**TINY, **stage.get("settings", {})}} for stage in STAGES])
+    return write(
+        tmp_path, [{**stage, "settings": {**TINY, **stage.get("settings", {})}} for stage in STAGES]
+    )
 
 
 def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, monkeypatch):
@@ -210,13 +281,17 @@ def test_an_interrupted_pipeline_goes_on_to_the_same_agents(tmp_path, capsys, mo
     assert main(["train", "--resume", str(folder)]) == 0
     assert capsys.readouterr().out.count("fresh episodes, the same for all") == 2
     for algo in ("dagger", "ppo_bc"):
-        one, two = (next((tmp_path / name / algo).rglob("Quad*.zip")) for name in ("whole", "interrupted"))
+        one, two = (
+            next((tmp_path / name / algo).rglob("Quad*.zip")) for name in ("whole", "interrupted")
+        )
         for ours, theirs in zip(policy(one).values(), policy(two).values(), strict=True):
             np.testing.assert_array_equal(ours, theirs)
 
 
 def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
-    pipeline = load_pipeline(write(tmp_path, [STAGES[0], {**STAGES[0], "name": "two", "seed_offset": 10}]))
+    pipeline = load_pipeline(
+        write(tmp_path, [STAGES[0], {**STAGES[0], "name": "two", "seed_offset": 10}])
+    )
     assert [job.seed for job in stage_jobs(pipeline, {"seed": 3})] == [3, 13]
     assert all(0 <= job.seed < LARGEST for job in stage_jobs(pipeline, {"seed": LARGEST - 1}))
 
@@ -246,10 +321,14 @@ def test_a_stage_is_not_trained_anew_when_its_trimming_was_interrupted(tmp_path,
     assert len(list((tmp_path / "logs" / "dagger").iterdir())) == 2
     monkeypatch.setattr(pipeline_module, "trim_hover", interrupted)
     again = resume_pipeline(result.folder, quiet)  # as after a kill in the final tables
-    assert [each.agent for each in again.stages.values()] == [each.agent for each in after.stages.values()]
+    assert [each.agent for each in again.stages.values()] == [
+        each.agent for each in after.stages.values()
+    ]
 
 
-def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(tmp_path, job, monkeypatch):
+def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(
+    tmp_path, job, monkeypatch
+):
     def killed(*args, **kwargs):
         raise SystemExit
 

@@ -35,15 +35,24 @@ def test_a_curve_holds_the_means_of_the_evaluations(runs):
 
 
 def test_seeds_are_drawn_as_mean_and_range(runs):
-    figure = plot_curves({"agent": [read_curve(runs / "Env_1"), read_curve(runs / "Env_2")]}, EXPERT)
+    figure = plot_curves(
+        {"agent": [read_curve(runs / "Env_1"), read_curve(runs / "Env_2")]}, EXPERT
+    )
     reward = figure.axes[2].lines[0]
-    assert reward.get_ydata()[0] == pytest.approx(-4.5) and reward.get_ydata()[-1] == pytest.approx(-1.5)
+    assert reward.get_ydata()[0] == pytest.approx(-4.5) and reward.get_ydata()[-1] == pytest.approx(
+        -1.5
+    )
     np.testing.assert_array_equal(figure.axes[0].lines[1].get_ydata(), [30.0, 30.0])
 
 
 def test_every_evaluation_is_marked_and_the_legend_covers_nothing(runs):
-    long, short = read_curve(runs / "Env_1"), Curve(*(np.array([each]) for each in (150.0, 30.0, 0.5, -2.0)))
-    figure = plot_curves({"agent": [long], "a run with a single evaluation": [short]}, EXPERT, "title")
+    long, short = (
+        read_curve(runs / "Env_1"),
+        Curve(*(np.array([each]) for each in (150.0, 30.0, 0.5, -2.0))),
+    )
+    figure = plot_curves(
+        {"agent": [long], "a run with a single evaluation": [short]}, EXPERT, "title"
+    )
     for axes, times in zip(figure.axes, ([1e-4, 2e-4], [1.0, 2.0]) * 2, strict=True):
         several, single, _ = axes.lines
         np.testing.assert_allclose(several.get_xdata(), times)
@@ -54,14 +63,24 @@ def test_every_evaluation_is_marked_and_the_legend_covers_nothing(runs):
 def test_the_command_writes_a_picture(runs, capsys):
     picture = runs / "curves.svg"
     assert main(["plot", f"agent={runs}/Env_*", "--line", "expert:30:-5", "-o", str(picture)]) == 0
-    assert picture.read_text(encoding="utf-8").count("<svg") == 1 and "curves.svg" in capsys.readouterr().out
+    assert (
+        picture.read_text(encoding="utf-8").count("<svg") == 1
+        and "curves.svg" in capsys.readouterr().out
+    )
 
 
 def test_a_run_folder_alone_is_called_by_its_path(runs, monkeypatch):
     named = {}
-    monkeypatch.setattr(curves, "plot_curves", lambda groups, *rest: named.update(groups) or plot_curves(groups, *rest))
+    monkeypatch.setattr(
+        curves,
+        "plot_curves",
+        lambda groups, *rest: named.update(groups) or plot_curves(groups, *rest),
+    )
     assert main(["plot", f"{runs}/Env_1", f"{runs}/Env_2/", "-o", str(runs / "curves.svg")]) == 0
-    assert {name: len(found) for name, found in named.items()} == {f"{runs.name}/Env_1": 1, f"{runs.name}/Env_2": 1}
+    assert {name: len(found) for name, found in named.items()} == {
+        f"{runs.name}/Env_1": 1,
+        f"{runs.name}/Env_2": 1,
+    }
 
 
 def test_losses_and_survival_are_drawn_where_a_run_has_them(runs):
@@ -80,7 +99,9 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
     path = runs / "Env_1" / "evaluations.npz"
     np.savez(path, **{**np.load(path), "survivals": np.ones((2, 2))})
     picture = runs / "curves.svg"
-    assert main(["plot", f"agent={runs}/Env_1", "--thesis", "state_recovery", "-o", str(picture)]) == 0
+    assert (
+        main(["plot", f"agent={runs}/Env_1", "--thesis", "state_recovery", "-o", str(picture)]) == 0
+    )
     text = picture.read_text(encoding="utf-8")
     assert all(f"thesis: {name}" in text for name in ("expert", "RL-agent", "PPO only"))
 
@@ -95,7 +116,10 @@ def test_the_thesis_is_drawn_by_the_name_of_the_task(runs):
         (["agent={runs}/Env_1", "-o", "{runs}/mine.svg"], "exists already"),
         (["agent={runs}/Env_1", "--line", "expert"], "NAME:SUCCESS:REWARD"),
         (["agent={runs}"], "no such file"),
-        (["agent={runs}/Env_1", "--thesis", "state_recovery"], "survival: the runs' evaluations hold none"),
+        (
+            ["agent={runs}/Env_1", "--thesis", "state_recovery"],
+            "survival: the runs' evaluations hold none",
+        ),
         (["agent={runs}/Env_1", "--show", "losses"], "losses: the runs' evaluations hold none"),
         (["agent={runs}/Env_1", "--task", "target_tracking"], "none of this run's eval_tasks"),
     ],

@@ -1,4 +1,6 @@
-"""PPO with behavioural cloning: what it adds moves the right parameters, and switched off it is PPO."""
+"""PPO with behavioural cloning: what it adds moves the right parameters, and switched off it is
+PPO.
+"""
 
 import csv
 import inspect
@@ -38,7 +40,10 @@ def part(model, name):
     [
         ("Pendulum-v1", {}),
         ("Pendulum-v1", {"clip_range_vf": 0.2, "ent_coef": 0.01, "normalize_advantage": False}),
-        ("Pendulum-v1", {"target_kl": 1e-3, "batch_size": 48}),  # stops early; the last mini-batch is a smaller one
+        (
+            "Pendulum-v1",
+            {"target_kl": 1e-3, "batch_size": 48},
+        ),  # stops early; the last mini-batch is a smaller one
         ("Pendulum-v1", {"use_sde": True}),
         ("CartPole-v1", {"ent_coef": 0.01}),
     ],
@@ -58,12 +63,18 @@ def test_without_additions_it_is_ppo_bit_for_bit(monkeypatch, env, settings):
             assert ours.logger.name_to_value[name] == pytest.approx(value, rel=1e-5, abs=1e-6), name
 
 
-@pytest.mark.parametrize("settings", [{}, {"clip_range_vf": 0.2, "max_clipped_value": False}, {"target_kl": 1e-3}])
+@pytest.mark.parametrize(
+    "settings", [{}, {"clip_range_vf": 0.2, "max_clipped_value": False}, {"target_kl": 1e-3}]
+)
 def test_with_a_vanishing_addition_it_is_ppo_to_rounding(settings):
-    """The faster update computes what PPO's does: with a weight of 1e-12 on an addition, only rounding is left of it."""
+    """The faster update computes what PPO's does: with a weight of 1e-12 on an addition, only
+    rounding is left of it.
+    """
     for_ppo = {key: value for key, value in settings.items() if key != "max_clipped_value"}
     stock = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SMALL).learn(128)
-    ours = PPOBC("MlpPolicy", "Pendulum-v1", ent_coef=0.01, l2_coef=1e-12, bc_coef=0.0, **settings, **SMALL).learn(128)
+    ours = PPOBC(
+        "MlpPolicy", "Pendulum-v1", ent_coef=0.01, l2_coef=1e-12, bc_coef=0.0, **settings, **SMALL
+    ).learn(128)
     start = PPO("MlpPolicy", "Pendulum-v1", ent_coef=0.01, **for_ppo, **SMALL)
     assert (parameters(stock) - parameters(start)).abs().max() > 1e-3
     th.testing.assert_close(parameters(ours), parameters(stock), rtol=1e-3, atol=1e-5)
@@ -81,7 +92,10 @@ def error(**settings):
     """Mean squared difference of actions from the expert's, after a short training."""
     model = PPOBC("MlpPolicy", "Pendulum-v1", learning_rate=3e-3, **settings, **SMALL).learn(512)
     observations = np.random.default_rng(0).normal(size=(256, 3)).astype(np.float32)
-    return np.square(model.predict(observations, deterministic=True)[0] - np.clip(swing_back(observations), -2, 2)).mean()
+    return np.square(
+        model.predict(observations, deterministic=True)[0]
+        - np.clip(swing_back(observations), -2, 2)
+    ).mean()
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +114,9 @@ def test_labels_belong_to_the_state_before_the_step():
     original = model.rollout_buffer.add
 
     def add(obs, *args, **kwargs):
-        seen.append((obs.copy(), model.rollout_buffer.expert_actions[model.rollout_buffer.pos].copy()))
+        seen.append(
+            (obs.copy(), model.rollout_buffer.expert_actions[model.rollout_buffer.pos].copy())
+        )
         return original(obs, *args, **kwargs)
 
     model.rollout_buffer.add = add
@@ -111,18 +127,26 @@ def test_labels_belong_to_the_state_before_the_step():
 
 
 def test_critic_warmup_moves_the_critic_only():
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=1, **SMALL)
-    before = {name: part(model, name) for name in ("policy_net", "action_net", "log_std", "value_net")}
+    model = PPOBC(
+        "MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=1, **SMALL
+    )
+    before = {
+        name: part(model, name) for name in ("policy_net", "action_net", "log_std", "value_net")
+    }
     model.learn(64)
     for name in ("policy_net", "action_net", "log_std"):
         assert all(th.equal(old, part(model, name)[key]) for key, old in before[name].items()), name
-    assert not all(th.equal(old, part(model, "value_net")[key]) for key, old in before["value_net"].items())
+    assert not all(
+        th.equal(old, part(model, "value_net")[key]) for key, old in before["value_net"].items()
+    )
     model.learn(64, reset_num_timesteps=False)
     assert not th.equal(before["log_std"]["log_std"], part(model, "log_std")["log_std"])
 
 
 def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=2, **SMALL)
+    model = PPOBC(
+        "MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=1.0, critic_warmup=2, **SMALL
+    )
     before, told, unchanged = part(model, "log_std")["log_std"], [], []
 
     def report(line):
@@ -136,18 +160,34 @@ def test_evaluations_say_while_only_the_critic_has_learnt(tmp_path):
 
 
 def test_schedule_of_the_cloning_weight_follows_progress(tmp_path):
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=LinearSchedule(0.4, 0.0, 0.5), **SMALL)
+    model = PPOBC(
+        "MlpPolicy",
+        "Pendulum-v1",
+        expert=swing_back,
+        bc_coef=LinearSchedule(0.4, 0.0, 0.5),
+        **SMALL,
+    )
     model.set_logger(configure(str(tmp_path), ["csv"]))
     model.learn(256)
     with open(tmp_path / "progress.csv", encoding="utf-8") as file:
-        weights = [float(row["train/bc_coef"]) for row in csv.DictReader(file) if row["train/bc_coef"]]
-    assert weights[0] == pytest.approx(0.2) and weights[-1] == 0.0  # a quarter of the way, and the end
+        weights = [
+            float(row["train/bc_coef"]) for row in csv.DictReader(file) if row["train/bc_coef"]
+        ]
+    assert (
+        weights[0] == pytest.approx(0.2) and weights[-1] == 0.0
+    )  # a quarter of the way, and the end
 
 
 @pytest.mark.parametrize(("start", "weight"), [(0.0, 1.0), (1.0, 0.0)])
 def test_a_rollout_is_labelled_exactly_if_its_update_clones(start, weight):
     """Also where a schedule changes between the rollout's begin and its end, when the update comes."""
-    model = PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, bc_coef=lambda p: start if p > 0.75 else weight, **SMALL)
+    model = PPOBC(
+        "MlpPolicy",
+        "Pendulum-v1",
+        expert=swing_back,
+        bc_coef=lambda p: start if p > 0.75 else weight,
+        **SMALL,
+    )
     seen = []
     original = model.train
 
@@ -162,7 +202,9 @@ def test_a_rollout_is_labelled_exactly_if_its_update_clones(start, weight):
 
 
 def test_a_missing_expert_is_noticed_at_the_latest_when_it_is_to_be_cloned():
-    model = PPOBC("MlpPolicy", "Pendulum-v1", bc_coef=lambda progress: float(progress == 1.0 - 3 / 7), **SMALL)
+    model = PPOBC(
+        "MlpPolicy", "Pendulum-v1", bc_coef=lambda progress: float(progress == 1.0 - 3 / 7), **SMALL
+    )
     with pytest.raises(ExpertError, match="set_expert"):
         model.learn(64 * 7)
     assert model.num_timesteps == 64 * 2
@@ -223,22 +265,48 @@ def test_bad_arguments_are_named(arguments):
 
 
 def test_state_dependent_exploration_clones_by_the_mean():
-    PPOBC("MlpPolicy", "Pendulum-v1", expert=swing_back, use_sde=True, bc_loss="mse", **SMALL).learn(64)
+    PPOBC(
+        "MlpPolicy", "Pendulum-v1", expert=swing_back, use_sde=True, bc_loss="mse", **SMALL
+    ).learn(64)
 
 
 def test_the_signature_is_ppos_and_what_is_added():
     stock, ours = (inspect.signature(algorithm).parameters for algorithm in (PPO, PPOBC))
-    added = ["expert", "bc_coef", "bc_loss", "bc_filter", "l2_coef", "max_clipped_value", "critic_warmup", "shuffle"]
-    assert [*ours] == [*(name for name in stock if name != "_init_setup_model"), *added, "_init_setup_model"]
+    added = [
+        "expert",
+        "bc_coef",
+        "bc_loss",
+        "bc_filter",
+        "l2_coef",
+        "max_clipped_value",
+        "critic_warmup",
+        "shuffle",
+    ]
+    assert [*ours] == [
+        *(name for name in stock if name != "_init_setup_model"),
+        *added,
+        "_init_setup_model",
+    ]
     assert all(ours[name].default == stock[name].default for name in stock)
 
 
 def test_in_order_mini_batches_follow_each_other_in_time():
-    model = PPOBC("MlpPolicy", make_vec_env("Pendulum-v1", n_envs=3), n_steps=4, batch_size=6, shuffle=False, bc_coef=0.0)
+    model = PPOBC(
+        "MlpPolicy",
+        make_vec_env("Pendulum-v1", n_envs=3),
+        n_steps=4,
+        batch_size=6,
+        shuffle=False,
+        bc_coef=0.0,
+    )
     buffer = model.rollout_buffer
     for step in range(4):
         rewards = np.arange(3.0) + 10 * step
-        buffer.add(np.zeros((3, 3)), np.zeros((3, 1)), rewards, np.zeros(3), th.zeros(3), th.zeros(3))
+        buffer.add(
+            np.zeros((3, 3)), np.zeros((3, 1)), rewards, np.zeros(3), th.zeros(3), th.zeros(3)
+        )
     buffer.returns[:] = buffer.rewards
-    seen = [critic.tensors(model.device)[1][:, 1].tolist() for _, critic in buffer.get(6, model.shuffle)]
+    seen = [
+        critic.tensors(model.device)[1][:, 1].tolist() for _, critic in buffer.get(6, model.shuffle)
+    ]
     assert seen == [[0, 1, 2, 10, 11, 12], [20, 21, 22, 30, 31, 32]]

@@ -30,7 +30,10 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 
 FAST = ("itm-recovery", "any-quadcopter", "itm-robust")
 OTHERS = sorted(set(pretrained_names()) - set(FAST))
-PICKLED = {"stable_baselines3.common.buffers.RolloutBuffer", "stable_baselines3.common.policies.ActorCriticPolicy"}
+PICKLED = {
+    "stable_baselines3.common.buffers.RolloutBuffer",
+    "stable_baselines3.common.policies.ActorCriticPolicy",
+}
 
 
 @pytest.fixture(scope="module")
@@ -48,18 +51,33 @@ def test_there_are_some_each_with_a_card_of_its_own():
     for name in pretrained_names():
         card = sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8")
         assert card.startswith(f"# {name}\n")
-        for part in ("state recovery |", "targets 20 m away |", "| seed |", "| commit |", "sb3_quad.cli train"):
+        for part in (
+            "state recovery |",
+            "targets 20 m away |",
+            "| seed |",
+            "| commit |",
+            "sb3_quad.cli train",
+        ):
             assert part in card, (name, part)
         assert "and changes" not in card
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[] if name in FAST else pytest.mark.slow) for name in pretrained_names()]
+    "name",
+    [
+        pytest.param(name, marks=[] if name in FAST else pytest.mark.slow)
+        for name in pretrained_names()
+    ],
 )
 def test_each_flies_as_its_card_says(name):
-    own = {**agent_settings(sb3_quad.pretrained(name))[0].in_any_task(), "vehicle": vehicle_of(name)}
+    own = {
+        **agent_settings(sb3_quad.pretrained(name))[0].in_any_task(),
+        "vehicle": vehicle_of(name),
+    }
     flights = fly(sb3_quad.load_pretrained(name), "state_recovery", 480, 31_000_000, **own)
-    assert 100 * flights.survival.mean() == pytest.approx(survival_on_the_card(name), abs=4.0 if "thesis" in name else 2.0)
+    assert 100 * flights.survival.mean() == pytest.approx(
+        survival_on_the_card(name), abs=4.0 if "thesis" in name else 2.0
+    )
 
 
 def vehicle_of(name):
@@ -71,7 +89,8 @@ def survival_on_the_card(name):
     lines = sb3_quad.pretrained(name).with_suffix(".md").read_text(encoding="utf-8").splitlines()
     rows = [line.split("|") for line in lines if line.startswith("|")]
     heading, recovery = (
-        next(row for row in rows if any(part in cell for cell in row)) for part in ("survival", "state recovery")
+        next(row for row in rows if any(part in cell for cell in row))
+        for part in ("survival", "state recovery")
     )
     (column,) = (number for number, cell in enumerate(heading) if "survival" in cell)
     return float(recovery[column].split()[0])
@@ -85,14 +104,26 @@ def test_the_robust_one_ends_at_its_target_whatever_pushes():
     for randomize, largest in (({"force": force}, 0.04), (worlds, 0.1)):
         agent = sb3_quad.load_pretrained("itm-robust")
         flights = fly(agent, "target_tracking", 240, 32_000_000, **{**own, "randomize": randomize})
-        assert flights.survival.mean() > 0.98 and np.quantile(flights.final_error[flights.survival], 0.95) < largest
+        assert (
+            flights.survival.mean() > 0.98
+            and np.quantile(flights.final_error[flights.survival], 0.95) < largest
+        )
 
 
 @pytest.mark.parametrize("vehicle", ["itm", "crazyflie", "hummingbird"])
 def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(vehicle):
     own = {**sb3_quad.env_kwargs("any-quadcopter"), "vehicles": None, "vehicle": vehicle}
-    flights = fly(sb3_quad.load_pretrained("any-quadcopter"), "state_recovery", 480, 33_000_000, max_steps=600, **own)
-    assert flights.survival.mean() > 0.96  # of ITM, whose rotors do the least; without the layout it would be nearly none
+    flights = fly(
+        sb3_quad.load_pretrained("any-quadcopter"),
+        "state_recovery",
+        480,
+        33_000_000,
+        max_steps=600,
+        **own,
+    )
+    assert (
+        flights.survival.mean() > 0.96
+    )  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 
 def test_any_quadcopter_is_exported_for_a_vehicle_that_is_named(tmp_path, capsys):
@@ -117,7 +148,9 @@ class Names(pickle.Unpickler):
 
 @pytest.mark.parametrize("name", pretrained_names())
 def test_what_they_pickle_is_there_in_other_versions_too(name):
-    """SB3 2.4 and later load them (tried with 2.4.1 and 2.7.1): nothing is pickled but what all of these have."""
+    """SB3 2.4 and later load them (tried with 2.4.1 and 2.7.1): nothing is pickled but what all of
+    these have.
+    """
     with zipfile.ZipFile(sb3_quad.pretrained(name)) as file:
         data = json.loads(file.read("data"))
     found = set()
@@ -126,8 +159,12 @@ def test_what_they_pickle_is_there_in_other_versions_too(name):
             unpickler = Names(base64.b64decode(value[":serialized:"]))
             unpickler.load()
             found |= unpickler.found
-    assert {each for each in found if each.startswith(("stable_baselines3.", "sb3_quad"))} == PICKLED
-    assert {"learning_rate", "clip_range"} <= {key for key, value in data.items() if isinstance(value, float)}  # no schedules
+    assert {
+        each for each in found if each.startswith(("stable_baselines3.", "sb3_quad"))
+    } == PICKLED
+    assert {"learning_rate", "clip_range"} <= {
+        key for key, value in data.items() if isinstance(value, float)
+    }  # no schedules
 
 
 def test_names_stand_where_zips_do(capsys):
@@ -142,12 +179,20 @@ def test_names_stand_where_zips_do(capsys):
     assert main(["enjoy", "itm-recovry", "--no-render"]) == 2
     assert "did you mean 'itm-recovery'" in capsys.readouterr().err
     any_quadcopter, recovery = parse_controllers(["any-quadcopter", "itm-recovery"])
-    assert not any_quadcopter.notice("crazyflie") and "was trained on the vehicle itm" in recovery.notice("crazyflie")
-    labels = {each.label: each.spec for each in parse_controllers(["itm-recovery", "mine=itm-recovery"])}
-    assert labels == dict.fromkeys(("itm-recovery", "mine"), str(sb3_quad.pretrained("itm-recovery")))
+    assert not any_quadcopter.notice(
+        "crazyflie"
+    ) and "was trained on the vehicle itm" in recovery.notice("crazyflie")
+    labels = {
+        each.label: each.spec for each in parse_controllers(["itm-recovery", "mine=itm-recovery"])
+    }
+    assert labels == dict.fromkeys(
+        ("itm-recovery", "mine"), str(sb3_quad.pretrained("itm-recovery"))
+    )
 
 
-def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_run, tmp_path, capsys, observations):
+def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(
+    dagger_run, tmp_path, capsys, observations
+):
     source = dagger_run / "QuadStateRecovery-v0.zip"
     (dagger_run / "QuadStateRecovery-v0" / "command.txt").write_text("typed\n```\nso\n")
     command = [str(source), "--name", "mine", "-o", str(tmp_path), "--episodes", "4"]
@@ -166,7 +211,8 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(dagger_ru
     slim, whole = (PPO.load(path, device="cpu") for path in (tmp_path / "mine.zip", source))
     for observation in (observations[1], -3.0 * observations[1]):
         np.testing.assert_array_equal(
-            slim.predict(observation, deterministic=True)[0], whole.predict(observation, deterministic=True)[0]
+            slim.predict(observation, deterministic=True)[0],
+            whole.predict(observation, deterministic=True)[0],
         )
     assert (tmp_path / "mine.zip").stat().st_size < 0.5 * source.stat().st_size
     before = (tmp_path / "mine.zip").read_bytes()
@@ -185,25 +231,52 @@ def test_publish_lays_out_what_the_hub_takes_and_uploads_it(tmp_path, monkeypatc
 
         def upload_folder(self, **given):
             called.append(given)
-            called.append(sorted(str(path.relative_to(given["folder_path"])) for path in given["folder_path"].rglob("*.*")))
+            called.append(
+                sorted(
+                    str(path.relative_to(given["folder_path"]))
+                    for path in given["folder_path"].rglob("*.*")
+                )
+            )
 
     monkeypatch.setitem(sys.modules, "huggingface_hub", types.SimpleNamespace(HfApi=HfApi))
     given = ["itm-recovery", "--name", "mine", "-o", str(tmp_path), "--episodes", "2"]
     assert publish.main([*given, "--push", "somebody/mine"]) == 0
     folder = tmp_path / "mine"
     parts = ["policy.pth", "policy.optimizer.pth", "pytorch_variables.pth", "system_info.txt"]
-    files = sorted(["README.md", "config.json", "results.json", "mine.zip", *(f"mine/{part}" for part in parts)])
+    files = sorted(
+        [
+            "README.md",
+            "config.json",
+            "results.json",
+            "mine.zip",
+            *(f"mine/{part}" for part in parts),
+        ]
+    )
     upload = {"repo_id": "somebody/mine", "folder_path": folder, "commit_message": "Add mine"}
     assert called == [{"repo_id": "somebody/mine", "exist_ok": True}, upload, files]
     _, metadata, card = (folder / "README.md").read_text().split("---\n", 2)
     metadata = yaml.safe_load(metadata)
-    results, config = (json.loads((folder / f"{name}.json").read_text()) for name in ("results", "config"))
+    results, config = (
+        json.loads((folder / f"{name}.json").read_text()) for name in ("results", "config")
+    )
     assert card.startswith("\n# mine\n") and metadata["library_name"] == "stable-baselines3"
-    assert "QuadStateRecovery-v0" in metadata["tags"] and "reinforcement-learning" in metadata["tags"]
+    assert (
+        "QuadStateRecovery-v0" in metadata["tags"] and "reinforcement-learning" in metadata["tags"]
+    )
     (result,) = metadata["model-index"][0]["results"]
-    assert result["dataset"]["type"] == "QuadStateRecovery-v0" and result["task"]["type"] == "reinforcement-learning"
-    assert results["n_eval_episodes"] == 8 and results["is_deterministic"] and results["std_reward"] > 0
-    assert result["metrics"][0]["value"] == f"{results['mean_reward']:.2f} +/- {results['std_reward']:.2f}"
+    assert (
+        result["dataset"]["type"] == "QuadStateRecovery-v0"
+        and result["task"]["type"] == "reinforcement-learning"
+    )
+    assert (
+        results["n_eval_episodes"] == 8
+        and results["is_deterministic"]
+        and results["std_reward"] > 0
+    )
+    assert (
+        result["metrics"][0]["value"]
+        == f"{results['mean_reward']:.2f} +/- {results['std_reward']:.2f}"
+    )
     assert f"| {results['mean_reward']:.2f} ".replace("-", "−") in card
     assert config["num_timesteps"] == PPO.load(folder / "mine.zip", device="cpu").num_timesteps
     assert "Python" in config["system_info"]
@@ -211,14 +284,23 @@ def test_publish_lays_out_what_the_hub_takes_and_uploads_it(tmp_path, monkeypatc
 
 def test_publish_says_what_an_upload_needs(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "huggingface_hub", None)
-    assert publish.main(["itm-recovery", "--name", "mine", "-o", str(tmp_path), "--push", "somebody/mine"]) == 2
-    assert capsys.readouterr().err.rstrip().endswith("pip install huggingface-hub") and not [*tmp_path.iterdir()]
+    assert (
+        publish.main(
+            ["itm-recovery", "--name", "mine", "-o", str(tmp_path), "--push", "somebody/mine"]
+        )
+        == 2
+    )
+    assert capsys.readouterr().err.rstrip().endswith("pip install huggingface-hub") and not [
+        *tmp_path.iterdir()
+    ]
 
 
 @pytest.mark.parametrize("name", pretrained_names())
 def test_each_says_how_it_flies(name):
     settings, source = agent_settings(sb3_quad.pretrained(name))
-    assert source == sb3_quad.pretrained(name) and settings.vehicle.flies_as(load_vehicle(vehicle_of(name)))
+    assert source == sb3_quad.pretrained(name) and settings.vehicle.flies_as(
+        load_vehicle(vehicle_of(name))
+    )
     imitates_pid = name in ("thesis-imitation", "thesis-printed-imitation")
     assert settings.task == ("target_tracking" if imitates_pid else "state_recovery")
 
@@ -231,22 +313,42 @@ def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
     output = capsys.readouterr().out
     assert "vehicle: crazyflie" in output and "crazyflie-recovery.zip" in output
     assert main(["export", "itm-recovery", "--format", "torchscript", "-o", "there"]) == 0
-    assert sorted(path.name for path in tmp_path.rglob("*.pt")) == ["crazyflie-recovery.pt", "itm-recovery.pt"]
+    assert sorted(path.name for path in tmp_path.rglob("*.pt")) == [
+        "crazyflie-recovery.pt",
+        "itm-recovery.pt",
+    ]
     assert (tmp_path / "there" / "itm-recovery.pt").is_file()
-    assert main(["enjoy", "crazyflie-recovery", "-n", "40", "-o", "poses.png", "--size", "64x64"]) == 0
+    assert (
+        main(["enjoy", "crazyflie-recovery", "-n", "40", "-o", "poses.png", "--size", "64x64"]) == 0
+    )
     assert (tmp_path / "poses.png").is_file() and "warning" not in capsys.readouterr().err
     if importlib.util.find_spec("imageio_ffmpeg") is not None:
-        assert main(["enjoy", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "a.gif", "b.mp4"]) == 0
+        assert (
+            main(["enjoy", "itm-recovery", "-n", "3", "--size", "64x64", "-o", "a.gif", "b.mp4"])
+            == 0
+        )
         assert (tmp_path / "a.gif").is_file() and (tmp_path / "b.mp4").is_file()
     assert sorted(FOLDER.iterdir()) == before
 
 
 def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
     env = QuadcopterVecEnv(2, seed=0)
-    PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).save(tmp_path / "alone.zip")
-    assert publish.main([str(tmp_path / "alone.zip"), "--name", "x", "-o", str(tmp_path), "--episodes", "2"]) == 0
+    PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).save(
+        tmp_path / "alone.zip"
+    )
+    assert (
+        publish.main(
+            [str(tmp_path / "alone.zip"), "--name", "x", "-o", str(tmp_path), "--episodes", "2"]
+        )
+        == 0
+    )
     card = (tmp_path / "x.md").read_text()
-    for part in ("`PPO`, 0 timesteps", "| run | not recorded |", "# not recorded", "not recorded; measured on `itm`"):
+    for part in (
+        "`PPO`, 0 timesteps",
+        "| run | not recorded |",
+        "# not recorded",
+        "not recorded; measured on `itm`",
+    ):
         assert part in card
     for part in ("commit", "seed", "versions", "None"):
         assert part not in card

@@ -1,4 +1,6 @@
-"""The PyBullet environment: Gymnasium's and SB3's contracts, its physics against written-out equations, bad input."""
+"""The PyBullet environment: Gymnasium's and SB3's contracts, its physics against written-out
+equations, bad input.
+"""
 
 import re
 import subprocess
@@ -38,7 +40,9 @@ def _rotation(q: FloatArray) -> FloatArray:
 
 
 def _product(p: FloatArray, q: FloatArray) -> FloatArray:
-    return np.array([p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))])
+    return np.array(
+        [p[0] * q[0] - p[1:] @ q[1:], *(p[0] * q[1:] + q[0] * p[1:] + np.cross(p[1:], q[1:]))]
+    )
 
 
 class Reference:
@@ -46,11 +50,19 @@ class Reference:
 
     def __init__(self, state: FloatArray, delay: int = 1, **wrench: FloatArray) -> None:
         self.vehicle = load_vehicle("itm")
-        self.r, self.q, self.v, self.w, self.rotor = (state[part].copy() for part in np.split(np.arange(17), [3, 7, 10, 13]))
+        self.r, self.q, self.v, self.w, self.rotor = (
+            state[part].copy() for part in np.split(np.arange(17), [3, 7, 10, 13])
+        )
         self.queue = [np.full(4, self.vehicle.hover_rotor_speed)] * delay
         zero = np.zeros(3)
-        self.force_world, self.force_body = wrench.get("force_world", zero), wrench.get("force_body", zero)
-        self.torque_world, self.torque_body = wrench.get("torque_world", zero), wrench.get("torque_body", zero)
+        self.force_world, self.force_body = (
+            wrench.get("force_world", zero),
+            wrench.get("force_body", zero),
+        )
+        self.torque_world, self.torque_body = (
+            wrench.get("torque_world", zero),
+            wrench.get("torque_body", zero),
+        )
 
     def step(self, action: FloatArray) -> None:
         vehicle, dt = self.vehicle, self.vehicle.physics_step
@@ -68,26 +80,46 @@ class Reference:
             self.w = self.w + dt * (torque - np.cross(self.w, inertia * self.w)) / inertia
             self.r = self.r + dt * self.v
             angle = np.linalg.norm(self.w) * dt
-            self.q = _product(self.q, np.array([np.cos(angle / 2), *(self.w / np.linalg.norm(self.w) * np.sin(angle / 2))]))
+            self.q = _product(
+                self.q,
+                np.array(
+                    [np.cos(angle / 2), *(self.w / np.linalg.norm(self.w) * np.sin(angle / 2))]
+                ),
+            )
 
 
 @pytest.mark.parametrize("delay", [0, 1, 3])
 @pytest.mark.parametrize(
     "wrench",
-    [{}, {"force_frame": "world", "torque_frame": "body"}, {"force_frame": "body", "torque_frame": "world"}],
+    [
+        {},
+        {"force_frame": "world", "torque_frame": "body"},
+        {"force_frame": "body", "torque_frame": "world"},
+    ],
     ids=["free", "world_force", "body_force"],
 )
 def test_flight_is_the_specified_integrator(wrench: dict[str, str], delay: int) -> None:
-    """400 control steps of violent tumbling agree to 1e-9 with the specification's lines, pushed in any frame."""
+    """400 control steps of violent tumbling agree to 1e-9 with the specification's lines, pushed in
+    any frame.
+    """
     rng = np.random.default_rng(1)
-    env = QuadcopterEnv(task_kwargs=HIGH, noise=0.0, vehicle=load_vehicle("itm").model_copy(update={"delay": delay}))
-    start = {"quaternion": rng.normal(size=4), "velocity": rng.normal(size=3) * 3, "body_rates": [12.0, -14.0, 10.0]}
+    env = QuadcopterEnv(
+        task_kwargs=HIGH, noise=0.0, vehicle=load_vehicle("itm").model_copy(update={"delay": delay})
+    )
+    start = {
+        "quaternion": rng.normal(size=4),
+        "velocity": rng.normal(size=3) * 3,
+        "body_rates": [12.0, -14.0, 10.0],
+    }
     env.reset(seed=3, options={"state": start})
     parts: dict[str, FloatArray] = {}
     if wrench:
         force, torque = np.array([3.0, -2.0, 5.0]), np.array([0.05, 0.04, -0.05])
         env.set_wrench(force, torque, **wrench)
-        parts = {f"force_{wrench['force_frame']}": force, f"torque_{wrench['torque_frame']}": torque}
+        parts = {
+            f"force_{wrench['force_frame']}": force,
+            f"torque_{wrench['torque_frame']}": torque,
+        }
     state = env.true_state().array[:, 0]
     reference = Reference(state, delay, **parts)
     fastest = 0.0
@@ -97,7 +129,13 @@ def test_flight_is_the_specified_integrator(wrench: dict[str, str], delay: int) 
         reference.step(action)
         fastest = max(fastest, float(np.linalg.norm(reference.w)))
     assert fastest > 20.0
-    expected = [reference.r, np.sign(state[3] * reference.q[0]) * reference.q, reference.v, reference.w, reference.rotor]
+    expected = [
+        reference.r,
+        np.sign(state[3] * reference.q[0]) * reference.q,
+        reference.v,
+        reference.w,
+        reference.rotor,
+    ]
     for part, value in zip(np.split(state[:17], [3, 7, 10, 13]), expected, strict=True):
         np.testing.assert_allclose(part, value, rtol=0, atol=1e-9)
     env.close()
@@ -105,14 +143,20 @@ def test_flight_is_the_specified_integrator(wrench: dict[str, str], delay: int) 
 
 @pytest.mark.parametrize("env_id", IDS)
 @pytest.mark.parametrize("render_mode", [None, "rgb_array"])
-def test_both_checkers_pass(env_id: str, render_mode: str | None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_both_checkers_pass(
+    env_id: str, render_mode: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # The observation is unbounded by design (thesis 3.3.1), of which Gymnasium's checker warns.
-        warnings.filterwarnings("ignore", message=".*A Box observation space m[a-z]+imum value is -?infinity.*")
+        warnings.filterwarnings(
+            "ignore", message=".*A Box observation space m[a-z]+imum value is -?infinity.*"
+        )
         env = gymnasium.make(env_id, render_mode=render_mode)
-        check_env(env.unwrapped)  # makes one in human mode, too: without a display that flies without a window
+        check_env(
+            env.unwrapped
+        )  # makes one in human mode, too: without a display that flies without a window
         env = gymnasium.make(env_id, render_mode=render_mode)
         sb3_check_env(env.unwrapped, skip_render_check=render_mode is None)
         env.close()
@@ -120,7 +164,9 @@ def test_both_checkers_pass(env_id: str, render_mode: str | None, monkeypatch: p
 
 @pytest.mark.parametrize("env_id", IDS)
 def test_same_seed_same_episode(env_id: str) -> None:
-    """Bit for bit, on another instance and on a used one; the next episode differs and is as repeatable."""
+    """Bit for bit, on another instance and on a used one; the next episode differs and is as
+    repeatable.
+    """
     actions = np.random.default_rng(0).uniform(-1, 1, (50, 4)).astype(np.float32)
 
     def fly(env: gymnasium.Env[Any, Any]) -> list[Any]:
@@ -135,7 +181,10 @@ def test_same_seed_same_episode(env_id: str) -> None:
 
     first, second = gymnasium.make(env_id), gymnasium.make(env_id)
     one, two, again = fly(first), fly(second), fly(first)
-    assert all(np.array_equal(a, b) and np.array_equal(a, c) for a, b, c in zip(one, two, again, strict=True))
+    assert all(
+        np.array_equal(a, b) and np.array_equal(a, c)
+        for a, b, c in zip(one, two, again, strict=True)
+    )
     assert not np.array_equal(one[0], one[len(one) // 2])
     first.close(), second.close()
 
@@ -151,11 +200,19 @@ def test_hovers_on_zero_action(env: QuadcopterEnv) -> None:
 
 
 def test_ends_on_touching_the_ground(env: QuadcopterEnv) -> None:
-    env.reset(seed=0, options={"state": {"position": (0, 0, 0.3), "velocity": (0, 0, -2)}, "target": (0, 0, 5)})
+    env.reset(
+        seed=0,
+        options={"state": {"position": (0, 0, 0.3), "velocity": (0, 0, -2)}, "target": (0, 0, 5)},
+    )
     for _ in range(100):
         _, reward, terminated, _, info = env.step(-np.ones(4, dtype=np.float32))
         height = env.true_state().position[0, 2]
-        assert terminated == (height <= env.vehicle.collision_radius) == info["collision"] == (not info["survival"])
+        assert (
+            terminated
+            == (height <= env.vehicle.collision_radius)
+            == info["collision"]
+            == (not info["survival"])
+        )
         if terminated:
             break
     assert terminated and reward < -15 and not info["out_of_range"]
@@ -186,14 +243,21 @@ def test_wrench_pushes_until_set_anew(env: QuadcopterEnv) -> None:
 
 
 def test_fixed_start(env: QuadcopterEnv) -> None:
-    start = {"position": (1, 2, 3), "quaternion": (0, -2, 0, 0), "velocity": (2, 2, 0), "body_rates": (4, 4, 4)}
+    start = {
+        "position": (1, 2, 3),
+        "quaternion": (0, -2, 0, 0),
+        "velocity": (2, 2, 0),
+        "body_rates": (4, 4, 4),
+    }
     observation, info = env.reset(seed=0, options={"state": start, "target": (1, 2, 4)})
     state = env.true_state()
     np.testing.assert_array_equal(state.position[0], [1, 2, 3])
     np.testing.assert_array_equal(state.quaternion[0], [0, -1, 0, 0])
     np.testing.assert_array_equal(state.body_rates[0], [4, 4, 4])
     np.testing.assert_allclose(
-        observation * env.observation_std, [0, 0, -1, 1, 0, 0, 0, -1, 0, 0, 0, -1, 2, -2, 0, 4, 4, 4], atol=1e-6
+        observation * env.observation_std,
+        [0, 0, -1, 1, 0, 0, 0, -1, 0, 0, 0, -1, 2, -2, 0, 4, 4, 4],
+        atol=1e-6,
     )
     assert info["distance"] == 1.0
 
@@ -218,8 +282,14 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
     ("call", "message"),
     [
         (lambda env: env.reset(options={"targets": (0, 0, 1)}), "'targets': did you mean 'target'"),
-        (lambda env: env.reset(options={"state": {"velocty": (0, 0, 1)}}), "did you mean 'velocity'"),
-        (lambda env: env.reset(options={"state": {"quaternion": (0, 0, 0, 0)}}), "quaternion: must not be zero"),
+        (
+            lambda env: env.reset(options={"state": {"velocty": (0, 0, 1)}}),
+            "did you mean 'velocity'",
+        ),
+        (
+            lambda env: env.reset(options={"state": {"quaternion": (0, 0, 0, 0)}}),
+            "quaternion: must not be zero",
+        ),
         (lambda env: env.reset(options={"state": {"position": (0, 0, 0.1)}}), "ground"),
         (lambda env: env.reset(options={"state": 3}), "state"),
         (lambda env: env.reset(options={"target": (0, 0)}), "options: target"),
@@ -228,9 +298,15 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: env.set_wrench(force=(1, 2, 3), force_frame="wrld"), "force_frame 'wrld'"),
         (lambda env: env.set_noise(-1), "noise"),
         (lambda env: QuadcopterEnv(observation_std=np.zeros(18)), "observation_std"),
-        (lambda env: QuadcopterEnv(max_episode_steps=5), "max_episode_steps 5: give it to gymnasium.make"),
+        (
+            lambda env: QuadcopterEnv(max_episode_steps=5),
+            "max_episode_steps 5: give it to gymnasium.make",
+        ),
         (lambda env: QuadcopterEnv(task="target_trackin"), "did you mean 'target_tracking'"),
-        (lambda env: QuadcopterEnv(noize=0), "QuadcopterEnv: unknown keyword 'noize': did you mean 'noise'"),
+        (
+            lambda env: QuadcopterEnv(noize=0),
+            "QuadcopterEnv: unknown keyword 'noize': did you mean 'noise'",
+        ),
         (
             lambda env: QuadcopterEnv(rendermode="human"),
             "QuadcopterEnv: .* 'rendermode': did you mean 'render_mode'",
@@ -272,7 +348,8 @@ def test_close_twice_and_neighbours_live_on() -> None:
 
 @pytest.mark.slow
 def test_import_is_light() -> None:
-    """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for gymnasium.make.
+    """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for
+    gymnasium.make.
 
     PyBullet is imported without its line about its build, and standard error works afterwards.
     """
@@ -282,7 +359,9 @@ def test_import_is_light() -> None:
         "gymnasium.make('QuadTargetTracking-v0').reset(seed=0); print('torch' in sys.modules);"
         "print('told', file=sys.stderr)"
     )
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    )
     assert result.stdout.splitlines() == ["[]", "False"]
     assert result.stderr.splitlines() == ["told"]
 
@@ -292,4 +371,6 @@ def test_the_manual_lists_every_argument() -> None:
     cells = [line.split("|")[1] for line in table.splitlines() if line.strip().startswith("| `")]
     listed = {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
     drawn = {"render_mode", "render_width", "render_height"}
-    assert listed == {*FlightSettings.model_fields, *drawn} - {"max_episode_steps"}  # an argument of gymnasium.make
+    assert listed == {*FlightSettings.model_fields, *drawn} - {
+        "max_episode_steps"
+    }  # an argument of gymnasium.make

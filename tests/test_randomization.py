@@ -1,4 +1,6 @@
-"""Randomization and vehicle distributions: the same in both environments, of the row's own stream, within their ranges."""
+"""Randomization and vehicle distributions: the same in both environments, of the row's own stream,
+within their ranges.
+"""
 
 import gymnasium
 import numpy as np
@@ -53,11 +55,18 @@ def batch_of(n, seed=0, autoreset=True, **keywords):
 
 @st.composite
 def randomized(draw):
-    """Keywords of environments: some of what can be random, in either frame; or a distribution, with or without more."""
+    """Keywords of environments: some of what can be random, in either frame; or a distribution,
+    with or without more.
+    """
     keywords = {"task": draw(st.sampled_from(["target_tracking", "state_recovery"]))}
     if draw(st.booleans()):
-        return keywords | {"vehicles": RAPTOR} | draw(st.sampled_from([{}, {"randomize": IN_WEIGHTS}]))
-    names, frame = draw(st.sets(st.sampled_from(sorted(RANDOMIZE)), min_size=1)), draw(st.sampled_from(["world", "body"]))
+        return (
+            keywords | {"vehicles": RAPTOR} | draw(st.sampled_from([{}, {"randomize": IN_WEIGHTS}]))
+        )
+    names, frame = (
+        draw(st.sets(st.sampled_from(sorted(RANDOMIZE)), min_size=1)),
+        draw(st.sampled_from(["world", "body"])),
+    )
     randomize = {name: RANDOMIZE[name] for name in names}
     for name in {"force", "torque"} & names:
         randomize[name] = {**RANDOMIZE[name], "frame": frame}
@@ -78,7 +87,11 @@ def test_a_row_and_pybullet_fly_the_same(seed, keywords):
         rewards.append(reward)
     single = envs.QuadcopterEnv(**keywords)
     for row, own in enumerate(row_seeds(seed, n)):
-        observations, flown, returns = [single.reset(seed=own)[0]], [single.true_state().array[:, 0].copy()], []
+        observations, flown, returns = (
+            [single.reset(seed=own)[0]],
+            [single.true_state().array[:, 0].copy()],
+            [],
+        )
         for action in actions[:, row]:
             observation, reward, terminated, _, _ = single.step(action)
             observations.append(observation)
@@ -88,9 +101,13 @@ def test_a_row_and_pybullet_fly_the_same(seed, keywords):
                 break
         length, flown = len(flown), np.array(flown)
         ours = np.array(states)[:length, :, row]
-        ours[:, QUATERNION] *= np.sign((ours[:, QUATERNION] * flown[:, QUATERNION]).sum(axis=1))[:, None]  # q is -q
+        ours[:, QUATERNION] *= np.sign((ours[:, QUATERNION] * flown[:, QUATERNION]).sum(axis=1))[
+            :, None
+        ]  # q is -q
         np.testing.assert_allclose(ours, flown, rtol=1e-9, atol=1e-9)
-        np.testing.assert_allclose(np.array(rewards)[: length - 1, row], returns, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(
+            np.array(rewards)[: length - 1, row], returns, rtol=1e-6, atol=1e-6
+        )
         np.testing.assert_allclose(np.array(seen)[:length, row], observations, atol=5e-5)
     single.close()
 
@@ -107,11 +124,15 @@ def test_an_episode_is_random_within_the_ranges():
     for row, (low, high) in {P.mass: (0.8, 1.25), P.thrust_middle: (0.9, 1.0)}.items():
         values = factors[row, changed]
         assert values.min() >= low and values.max() <= high
-        assert np.median(np.log(values)) == pytest.approx(np.log(low * high) / 2, abs=0.05 * np.log(high / low))
+        assert np.median(np.log(values)) == pytest.approx(
+            np.log(low * high) / 2, abs=0.05 * np.log(high / low)
+        )
     ratio = batch.vehicles[P.motor_gain_up, changed] / batch.vehicles[P.motor_gain_down, changed]
     assert ratio.min() < 0.6 and ratio.max() > 1.1  # each of its own, besides what they share
     drag = batch.vehicles[P.drag_x : P.drag_z + 1, changed] / base[P.mass]
-    assert (drag == drag[0]).all() and np.quantile(drag, [0.0, 0.5, 1.0]) == pytest.approx([0.0, 0.25, 0.5], abs=0.02)
+    assert (drag == drag[0]).all() and np.quantile(drag, [0.0, 0.5, 1.0]) == pytest.approx(
+        [0.0, 0.25, 0.5], abs=0.02
+    )
     inertia = batch.vehicles[[P.ixx, P.iyy, P.izz]]
     assert (2 * inertia.max(axis=0) <= inertia.sum(axis=0) * (1 + 1e-12)).all()
     assert [*np.unique(batch.vehicles[P.delay, changed])] == [0, 1, 2, 3]
@@ -119,10 +140,16 @@ def test_an_episode_is_random_within_the_ranges():
     assert (force > 0).mean() == pytest.approx(0.6, abs=0.05)
     assert force.max() <= 5 and np.median(force[force > 0]) == pytest.approx(2.5, abs=0.3)
     wind = np.linalg.norm(batch.wind, axis=0)
-    assert (wind > 0).mean() == pytest.approx(0.6, abs=0.05) and wind.max() <= 5 and not batch.wind[2].any()
+    assert (
+        (wind > 0).mean() == pytest.approx(0.6, abs=0.05)
+        and wind.max() <= 5
+        and not batch.wind[2].any()
+    )
     assert np.std(batch.wind_gust[:3, wind > 0], axis=1) == pytest.approx(2 / np.sqrt(3), abs=0.1)
     torque = np.abs(batch.wrench[W.torque_body : W.torque_body + 3]).max(axis=1)
-    assert torque[:2] == pytest.approx(0.1, abs=0.01) and torque[2] == pytest.approx(0.033, abs=0.003)
+    assert torque[:2] == pytest.approx(0.1, abs=0.01) and torque[2] == pytest.approx(
+        0.033, abs=0.003
+    )
 
 
 def test_a_share_of_zero_changes_no_flight():
@@ -139,7 +166,11 @@ def test_a_share_of_zero_changes_no_flight():
 
 @pytest.mark.parametrize(
     ("kind", "std", "unit", "size"),
-    [("gusts", 2.0, "SI", 2.0), ("gusts", 0.1, "weight", 0.1 * 1.727 * 9.81), ("wind_gusts", 2.0, "SI", 2.0)],
+    [
+        ("gusts", 2.0, "SI", 2.0),
+        ("gusts", 0.1, "weight", 0.1 * 1.727 * 9.81),
+        ("wind_gusts", 2.0, "SI", 2.0),
+    ],
 )
 def test_gusts_have_their_spread_and_time_constant(kind, std, unit, size):
     randomize = {kind: {"std": std, "unit": unit, "time_constant": 0.2}}
@@ -151,7 +182,9 @@ def test_gusts_have_their_spread_and_time_constant(kind, std, unit, size):
         gusts.append(present[:3].copy())
     assert np.std(gusts[0], axis=1) == pytest.approx(size, rel=0.05)
     assert np.std(gusts[-1], axis=1) == pytest.approx(size, rel=0.05)
-    assert np.mean((gusts[-1] / size) ** 4) == pytest.approx(3.0, abs=0.25)  # as of a normal distribution
+    assert np.mean((gusts[-1] / size) ** 4) == pytest.approx(
+        3.0, abs=0.25
+    )  # as of a normal distribution
     assert abs(np.corrcoef(gusts[-1])[0, 1]) < 0.06
     for steps in (10, 20):
         kept = [np.corrcoef(gusts[0][axis], gusts[steps][axis])[0, 1] for axis in range(3)]
@@ -164,7 +197,10 @@ def test_a_wrench_that_is_set_lasts_until_the_next_episode_brings_its_own():
     batch.step(np.zeros((2, 4), np.float32))
     assert batch.wrench[W.force_world].tolist() == [3.0, 3.0]
     batch.reset(0)
-    assert np.linalg.norm(batch.wrench[:, 0]) == pytest.approx(1.0) and batch.wrench[W.force_world, 1] == 3.0
+    assert (
+        np.linalg.norm(batch.wrench[:, 0]) == pytest.approx(1.0)
+        and batch.wrench[W.force_world, 1] == 3.0
+    )
 
 
 def test_vehicles_repeat_over_the_rows_and_are_randomised():
@@ -185,17 +221,24 @@ def test_sampled_vehicles_are_valid_and_fill_the_ranges():
     metrics = {  # with the ranges of the file
         "size": (np.cbrt([each.mass for each in vehicles]), np.cbrt([0.02, 5.0])),
         "thrust_to_weight": ([each.thrust_limits[1] for each in vehicles], (1.5, 5.0)),
-        "torque_to_inertia": ([each.arm_length * each.thrust_range[1] / each.inertia[0] for each in vehicles], (40, 1200)),
+        "torque_to_inertia": (
+            [each.arm_length * each.thrust_range[1] / each.inertia[0] for each in vehicles],
+            (40, 1200),
+        ),
         "motor_time_constant": ([1.0 / each.motor_gain_up for each in vehicles], (0.03, 0.1)),
         "moment_thrust_ratio": ([each.moment_thrust_ratio for each in vehicles], (0.005, 0.05)),
     }
     for name, (values, (low, high)) in metrics.items():
         share = (np.array(values) - low) / (high - low)
         assert share.min() > -1e-9 and share.max() < 1 + 1e-9, name
-        np.testing.assert_allclose(np.quantile(share, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.05, err_msg=name)
+        np.testing.assert_allclose(
+            np.quantile(share, [0.1, 0.5, 0.9]), [0.1, 0.5, 0.9], atol=0.05, err_msg=name
+        )
     np.testing.assert_allclose(inertia / inertia[:, :1], np.tile([1.0, 1.024, 1.854], (2000, 1)))
     np.testing.assert_allclose([each.thrust_limits[0] for each in vehicles], 0.05)
-    assert np.std(np.log([each.arm_length / np.cbrt(each.mass) for each in vehicles])) == pytest.approx(0.09, abs=0.02)
+    assert np.std(
+        np.log([each.arm_length / np.cbrt(each.mass) for each in vehicles])
+    ) == pytest.approx(0.09, abs=0.02)
 
 
 def test_every_episode_has_another_vehicle_and_forces_in_its_weights():
@@ -206,18 +249,27 @@ def test_every_episode_has_another_vehicle_and_forces_in_its_weights():
     masses = []
     for _ in range(3):
         np.testing.assert_array_equal(first.vehicles, again.vehicles)
-        np.testing.assert_allclose(-first.wrench[W.force_world + 2], 0.2 * 9.81 * first.vehicles[P.mass], rtol=1e-12)
+        np.testing.assert_allclose(
+            -first.wrench[W.force_world + 2], 0.2 * 9.81 * first.vehicles[P.mass], rtol=1e-12
+        )
         masses.append(first.vehicles[P.mass].copy())
         first.reset(), again.reset()
     assert np.unique(masses).size == 48
 
 
 def test_the_base_vehicle_says_what_a_distribution_does_not():
-    ranges = {"mass": 1.0, "thrust_to_weight": 2.0, "torque_to_inertia": 300.0, "motor_time_constant": 0.05}
+    ranges = {
+        "mass": 1.0,
+        "thrust_to_weight": 2.0,
+        "torque_to_inertia": 300.0,
+        "motor_time_constant": 0.05,
+    }
     base = load_vehicle("hummingbird").model_copy(update={"delay": 3})
     (one,) = sample_vehicles({**ranges, "moment_thrust_ratio": 0.02}, 1, vehicle=base)
     assert one.rotor_directions == base.rotor_directions and one.delay == 3
-    np.testing.assert_allclose(np.array(one.inertia) / one.inertia[0], np.array(base.inertia) / base.inertia[0])
+    np.testing.assert_allclose(
+        np.array(one.inertia) / one.inertia[0], np.array(base.inertia) / base.inertia[0]
+    )
     np.testing.assert_allclose(one.rotor_positions, np.cbrt(2.0) * np.array(base.rotor_positions))
     np.testing.assert_allclose(one.hover_rotor_speed, base.hover_rotor_speed)
 
@@ -229,7 +281,9 @@ def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():
     assert again.vehicles == own.vehicles and again.in_any_task()["vehicles"] == own.vehicles
     assert own.with_changes(vehicle="itm").vehicles is None
     env = gymnasium.make("QuadTargetTracking-v0", vehicles="raptor")
-    masses = {float(env.unwrapped.true_state().vehicles[P.mass, 0]) for _ in range(2) if env.reset()}
+    masses = {
+        float(env.unwrapped.true_state().vehicles[P.mass, 0]) for _ in range(2) if env.reset()
+    }
     assert len(masses) == 2
     env.close()
 
@@ -244,14 +298,21 @@ def test_wind_carries_away_what_has_drag_and_the_told_expert_holds_against_it():
         (windy, GeometricExpert(), 0.1, 2.0),
         (windy, told_geometric(), 0.0, 1e-3),
     ):
-        errors = fly(expert, "target_tracking", 48, seed=3, max_steps=900, randomize=randomize).final_error
+        errors = fly(
+            expert, "target_tracking", 48, seed=3, max_steps=900, randomize=randomize
+        ).final_error
         assert least <= errors.min() and errors.max() < most
 
 
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
 def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
     torque = {"magnitude": [0.0, 0.1], "axes": [1, 1, 0.33]}
-    randomize = {"mass": [0.8, 1.2], "motor_gain": [0.7, 1.5], "force": [1.0, 4.0], "torque": torque}
+    randomize = {
+        "mass": [0.8, 1.2],
+        "motor_gain": [0.7, 1.5],
+        "force": [1.0, 4.0],
+        "torque": torque,
+    }
     errors = {}
     for expert in (GeometricExpert(), told_geometric()):
         batch = batch_of(240, task=task, randomize=randomize, autoreset=False)
@@ -268,8 +329,14 @@ def test_the_told_expert_flies_every_vehicle_of_a_distribution(task):
 
 
 def test_the_told_expert_flies_as_the_others_where_nothing_is_random():
-    batch, gains, told = batch_of(240, task="state_recovery"), GeometricExpert().gains, told_geometric()
-    plain = GeometricExpert(gains=gains.model_copy(update={"yaw_rate": geometric._TOLD_YAW * gains.yaw_rate}))
+    batch, gains, told = (
+        batch_of(240, task="state_recovery"),
+        GeometricExpert().gains,
+        told_geometric(),
+    )
+    plain = GeometricExpert(
+        gains=gains.model_copy(update={"yaw_rate": geometric._TOLD_YAW * gains.yaw_rate})
+    )
     for _ in range(100):
         state = batch.true_state()
         np.testing.assert_allclose(told.actions(state), plain.actions(state), atol=1e-5)
@@ -286,7 +353,9 @@ def test_the_cautious_expert_falls_less_fast_where_the_rotors_lift_hardly_more_t
             lost |= batch.step(expert.actions(batch.true_state()))[2]
             lowest = np.minimum(lowest, batch.state[VELOCITY][2])
         descent[expert.reserve > 0], survival[expert.reserve > 0] = -lowest.min(), 1.0 - lost.mean()
-    assert survival[True] >= survival[False] == 1.0 and descent[False] > 1.2 * descent[True], descent
+    assert survival[True] >= survival[False] == 1.0 and descent[False] > 1.2 * descent[True], (
+        descent
+    )
 
 
 @pytest.mark.parametrize(("told", "reserve"), [(True, -0.1), (False, 0.1)])
@@ -308,8 +377,14 @@ def test_a_reserve_is_for_a_told_expert_and_not_negative(told, reserve):
         ({"force": {"magnitude": [0, 1], "direction": [0, 0, 0]}}, "must not be zero"),
         ({"wind": {"magnitude": 1, "frame": "body"}}, "leave out unit and frame"),
         ({"wind_gusts": {"std": 1, "unit": "weight"}}, "leave out unit and frame"),
-        ({"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}}, "greater than 0"),
-        ({"center_of_mass": {"low": -0.01, "high": 0.01, "distribution": "uniform_cube_root"}}, "not negative"),
+        (
+            {"center_of_mass": {"low": -1, "high": 1, "distribution": "log_uniform"}},
+            "greater than 0",
+        ),
+        (
+            {"center_of_mass": {"low": -0.01, "high": 0.01, "distribution": "uniform_cube_root"}},
+            "not negative",
+        ),
         ("mass", "randomize"),
         ({"vehicles": {"distribution": "rapter"}}, "vehicle distribution 'rapter'"),
         ({"vehicles": {**RAPTOR, "mass": [0, 2]}}, "greater than"),

@@ -34,7 +34,9 @@ def tilted(axis, degrees):
 @pytest.mark.parametrize("axis", [(1, 0, 0), (0, -1, 0), (0, 0, 1)])
 @pytest.mark.parametrize("vehicle", ["itm", "crazyflie"])
 def test_it_recovers_about_each_axis_and_flies_a_metre_to_its_target(axis, vehicle):
-    """Rotors in another order, or turning the other way, tumble or spin; ITM's and Crazyflie's differ in their order."""
+    """Rotors in another order, or turning the other way, tumble or spin; ITM's and Crazyflie's
+    differ in their order.
+    """
     scenario = tilted(axis, 40).model_copy(update={"vehicle": vehicle})
     flights, tracks = fly_scenario(resolve_expert("raptor:Raptor", vehicle), scenario, recorded=4)
     assert flights.success.all()
@@ -47,11 +49,18 @@ def test_each_row_begins_an_episode_of_its_own():
     actions, state = raptor.predict(first)
     _, later = raptor.predict(first, state)
     again, _ = raptor.predict(first, later, np.array([True, False, True]))
-    assert actions.dtype == np.float32 and (actions[[0, 2]] == again[[0, 2]]).all() and (actions[1] != again[1]).any()
+    assert (
+        actions.dtype == np.float32
+        and (actions[[0, 2]] == again[[0, 2]]).all()
+        and (actions[1] != again[1]).any()
+    )
 
 
 def test_it_refuses_other_rotors():
     itm = load_vehicle("itm")
-    for vehicle in (load_vehicle("hummingbird"), itm.model_copy(update={"rotor_directions": (-1, 1, -1, 1)})):
+    for vehicle in (
+        load_vehicle("hummingbird"),
+        itm.model_copy(update={"rotor_directions": (-1, 1, -1, 1)}),
+    ):
         with pytest.raises(ConfigError, match="RAPTOR flies an X"):
             resolve_expert("raptor:Raptor", vehicle)

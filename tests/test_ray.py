@@ -1,4 +1,6 @@
-"""Sweeps on Ray: the runs of a two-node cluster are those of this machine, also when a node is lost; run by make test-zoo."""
+"""Sweeps on Ray: the runs of a two-node cluster are those of this machine, also when a node is
+lost; run by make test-zoo.
+"""
 
 import json
 import os
@@ -21,8 +23,20 @@ from ray.cluster_utils import Cluster
 
 from sb3_quad.executors import start_executor
 
-NET = {"n_steps": 20, "batch_size": 80, "gradient_steps": 2, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
-TINY = {"algo": "dagger", "env": "QuadStateRecovery-v0", "n_envs": 4, "eval_episodes": 0, "hyperparams": NET}
+NET = {
+    "n_steps": 20,
+    "batch_size": 80,
+    "gradient_steps": 2,
+    "n_epochs": 1,
+    "policy_kwargs": {"net_arch": [4]},
+}
+TINY = {
+    "algo": "dagger",
+    "env": "QuadStateRecovery-v0",
+    "n_envs": 4,
+    "eval_episodes": 0,
+    "hyperparams": NET,
+}
 ROOT = Path(__file__).resolve().parent.parent
 
 
@@ -34,7 +48,11 @@ def write(path, **keys):
 @pytest.fixture
 def cluster(monkeypatch):
     monkeypatch.setenv("RAY_worker_niceness", "0")
-    settings = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 1000, "health_check_failure_threshold": 3}
+    settings = {
+        "health_check_initial_delay_ms": 0,
+        "health_check_period_ms": 1000,
+        "health_check_failure_threshold": 3,
+    }
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": settings})
     made.add_node(num_cpus=1)
     yield made
@@ -50,7 +68,10 @@ def weights(folder):
 def test_an_address_that_nobody_answers_is_refused_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    for address, words in ((f"127.0.0.1:{port}", "no Ray cluster answers"), ("ray://host:port", "must be auto")):
+    for address, words in (
+        (f"127.0.0.1:{port}", "no Ray cluster answers"),
+        ("ray://host:port", "must be auto"),
+    ):
         with pytest.raises(ConfigError, match=words):
             start_executor("ray", 1, address)
 
@@ -60,7 +81,17 @@ def test_an_address_that_nobody_answers_is_refused_in_one_line():
 def test_a_cluster_that_loses_a_node_gives_the_table_of_one_machine(tmp_path, monkeypatch, cluster):
     monkeypatch.chdir(tmp_path)
     file = write(tmp_path / "s.yaml", seed=[0, 1, 2])
-    command = [sys.executable, "-m", "sb3_quad.cli", "sweep", file, "--executor", "ray", "--address", cluster.address]
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_quad.cli",
+        "sweep",
+        file,
+        "--executor",
+        "ray",
+        "--address",
+        cluster.address,
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     process = subprocess.Popen([*command, "--no-progress"], cwd=tmp_path, env=environment)
     folder, end = tmp_path / "logs/sweep/s_1", time.monotonic() + 600
@@ -70,6 +101,9 @@ def test_a_cluster_that_loses_a_node_gives_the_table_of_one_machine(tmp_path, mo
     cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
     assert process.wait(600) == 0
     assert main(["sweep", file, "--workers", "2", "--no-progress"]) == 0
-    assert weights("logs/sweep/s_1") == weights("logs/sweep/s_2") and len(weights("logs/sweep/s_1")) == 3
+    assert (
+        weights("logs/sweep/s_1") == weights("logs/sweep/s_2")
+        and len(weights("logs/sweep/s_1")) == 3
+    )
     results = [Path(f"logs/sweep/s_{k}/results.json").read_text() for k in (1, 2)]
     assert results[0] == results[1]

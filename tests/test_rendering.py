@@ -1,4 +1,6 @@
-"""Pictures: without a display, of the asked size, showing what is there, and without touching the flight."""
+"""Pictures: without a display, of the asked size, showing what is there, and without touching the
+flight.
+"""
 
 from typing import Any
 
@@ -38,17 +40,28 @@ def _orange(picture: Picture) -> npt.NDArray[np.bool_]:
 
 def test_picture_of_the_asked_size() -> None:
     size = 161, 97
-    env = gymnasium.make("QuadTargetTracking-v0", render_mode="rgb_array", render_width=size[0], render_height=size[1])
+    env = gymnasium.make(
+        "QuadTargetTracking-v0",
+        render_mode="rgb_array",
+        render_width=size[0],
+        render_height=size[1],
+    )
     env.reset(seed=0)
     env.step(HOVER)
     picture: Any = env.render()
     assert picture.shape == (size[1], size[0], 3) and picture.dtype == np.uint8
-    assert env.metadata["render_modes"] == ["human", "rgb_array"] and env.metadata["render_fps"] == 100
+    assert (
+        env.metadata["render_modes"] == ["human", "rgb_array"] and env.metadata["render_fps"] == 100
+    )
     env.close()
 
 
-@pytest.mark.parametrize("direction", [(1, 0, 0), (0, -1, 0), (-0.6, 0.6, 0.5), (0, 0, 1), (0, 0, -1), (0.1, 0, 0.995)])
-def test_vehicle_and_target_are_in_the_picture(env: QuadcopterEnv, direction: tuple[float, float, float]) -> None:
+@pytest.mark.parametrize(
+    "direction", [(1, 0, 0), (0, -1, 0), (-0.6, 0.6, 0.5), (0, 0, 1), (0, 0, -1), (0.1, 0, 0.995)]
+)
+def test_vehicle_and_target_are_in_the_picture(
+    env: QuadcopterEnv, direction: tuple[float, float, float]
+) -> None:
     env.reset(seed=0, options={"target": np.array([0, 0, 15.0]) + 8.0 * np.array(direction)})
     picture = env.render()
     assert picture is not None
@@ -83,13 +96,17 @@ def test_pictures_do_not_touch_the_flight(env: QuadcopterEnv) -> None:
         each.reset(seed=4)
         each.set_wrench(force=(1, 0, 0), torque=(0, 0.01, 0))
     for action in actions:
-        assert all(np.array_equal(a, b) for a, b in zip(env.step(action), plain.step(action), strict=True))
+        assert all(
+            np.array_equal(a, b) for a, b in zip(env.step(action), plain.step(action), strict=True)
+        )
         env.render()
     np.testing.assert_array_equal(env.true_state().array, plain.true_state().array)
     plain.close()
 
 
-def test_human_mode_without_a_display_flies_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_human_mode_without_a_display_flies_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setattr("sys.platform", "linux")
     env = QuadcopterEnv(render_mode="human")
@@ -119,13 +136,19 @@ def test_the_body_has_the_numbers_of_the_vehicle() -> None:
     mass, _, inertia, *at = p.getDynamicsInfo(body.body, -1, physicsClientId=body.client)[:5]
     assert mass == vehicle.mass and tuple(inertia) == vehicle.inertia
     assert at == [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0)]
-    assert p.getNumBodies(physicsClientId=body.client) == 1 and p.getNumJoints(body.body, physicsClientId=body.client) == 0
+    assert (
+        p.getNumBodies(physicsClientId=body.client) == 1
+        and p.getNumJoints(body.body, physicsClientId=body.client) == 0
+    )
     body.close()
 
 
 def test_what_is_only_drawn_has_no_mass_and_touches_nothing(env: QuadcopterEnv) -> None:
     client = env._body.client
-    drawn = [p.getBodyUniqueId(k, physicsClientId=client) for k in range(p.getNumBodies(physicsClientId=client))]
+    drawn = [
+        p.getBodyUniqueId(k, physicsClientId=client)
+        for k in range(p.getNumBodies(physicsClientId=client))
+    ]
     drawn.remove(env._body.body)
     assert len(drawn) >= 10
     for body in drawn:

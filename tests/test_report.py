@@ -1,4 +1,6 @@
-"""The report: the metrics of the results, every plot in the page and as PNG, and a page that needs nothing else."""
+"""The report: the metrics of the results, every plot in the page and as PNG, and a page that needs
+nothing else.
+"""
 
 import datetime
 import io
@@ -101,7 +103,11 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attributes):
         self.tags.append(tag)
         self._inside = tag if tag in ("script", "style") else ""
-        self.links += [value for name, value in attributes if name in ("src", "href", "srcset", "action", "data")]
+        self.links += [
+            value
+            for name, value in attributes
+            if name in ("src", "href", "srcset", "action", "data")
+        ]
 
     def handle_endtag(self, tag):
         self._inside = ""
@@ -119,7 +125,10 @@ def test_the_page_holds_the_results(folder, page):
     assert LABEL in text and results.description in text
     metrics = results.entry("pid", "tracking").metrics
     assert f"{metrics.reward.value:.2f}".replace("-", "−") in text
-    assert f"{metrics.arrivals[0].time.value:.2f}" in text and f"{metrics.final_error_95.value:.3f}" in text
+    assert (
+        f"{metrics.arrivals[0].time.value:.2f}" in text
+        and f"{metrics.final_error_95.value:.3f}" in text
+    )
     low, high = metrics.success.low, metrics.success.high
     assert f"{100 * low:.1f} to {100 * high:.1f}" in text
     for number in ("1.25", "never", "2 to 3", "paper"):  # the reference's
@@ -138,27 +147,42 @@ def test_every_plot_is_in_the_page_and_beside_it(folder, parts, page):
     plots = [plot.name for section in parts.values() for plot in section.plots]
     assert {name.rpartition("_")[2] for name in plots} == {"times", "paths", "error", "success"}
     text = page.read_text(encoding="utf-8")
-    assert text.count("<svg") == len({*plots}) == len(plots) and all(f'data-plot="{name}"' in text for name in plots)
-    assert {path.name for path in (folder / "figures").iterdir()} == {f"{name}.png" for name in plots}
+    assert text.count("<svg") == len({*plots}) == len(plots) and all(
+        f'data-plot="{name}"' in text for name in plots
+    )
+    assert {path.name for path in (folder / "figures").iterdir()} == {
+        f"{name}.png" for name in plots
+    }
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in (folder / "figures").iterdir())
 
 
 def test_legends_cover_nothing_and_axes_have_units(parts):
     for plot in (plot for section in parts.values() for plot in section.plots):
         legends_cover_nothing(plot.figure)
-        titles = [name for axes in plot.figure.axes for name in (axes.get_xlabel(), axes.get_ylabel()) if name]
+        titles = [
+            name
+            for axes in plot.figure.axes
+            for name in (axes.get_xlabel(), axes.get_ylabel())
+            if name
+        ]
         assert len(titles) >= 2 and all("(" in title for title in titles), titles
 
 
 def test_the_page_is_small_and_says_what_was_flown_when_and_by_which_version(folder, page):
     assert page.stat().st_size < 1_000_000
     results = load_results(folder)
-    agent = results.controllers[0].model_copy(update={"algorithm": "PPO", "content": "0123456789abcdef"})
+    agent = results.controllers[0].model_copy(
+        update={"algorithm": "PPO", "content": "0123456789abcdef"}
+    )
     failure = Failure(controller="x<y", scenario="hit", message="no & no")
-    flown = results.model_copy(update={"controllers": [agent, *results.controllers[1:]], "failures": [failure]})
+    flown = results.model_copy(
+        update={"controllers": [agent, *results.controllers[1:]], "failures": [failure]}
+    )
     text = render("title", facts(flown), sections(flown, folder))
     (day,) = {datetime.date.fromisoformat(entry.date) for entry in results.entries}
-    assert f"flown {day} by sb3_quad {results.package_version}" in text and agent.content[:12] in text
+    assert (
+        f"flown {day} by sb3_quad {results.package_version}" in text and agent.content[:12] in text
+    )
     assert "x&lt;y" in text and "no &amp; no" in text
 
 
@@ -174,8 +198,12 @@ def test_what_varies_alone_is_success_and_final_error_over_it(folder, parts):
         plots = [plot_of(parts, "drop", kind).figure.axes[0] for kind in ("success", "error")]
         success, error = ({line.get_label(): line for line in axes.lines}[label] for axes in plots)
         metrics = [results.entry(label, f"drop.{delay}").metrics for delay in (0, 90)]
-        np.testing.assert_allclose(success.get_ydata(), [100 * each.success.value for each in metrics])
-        assert metrics[1].survival.value == 0.0 and len(error.get_ydata()) == 1  # where most are lost, there is no error
+        np.testing.assert_allclose(
+            success.get_ydata(), [100 * each.success.value for each in metrics]
+        )
+        assert (
+            metrics[1].survival.value == 0.0 and len(error.get_ydata()) == 1
+        )  # where most are lost, there is no error
         assert error.get_ydata()[0] == max(metrics[0].final_error_median, 1e-3)
         assert plots[1].get_xlabel() == "delay (control steps)"
 
@@ -183,11 +211,15 @@ def test_what_varies_alone_is_success_and_final_error_over_it(folder, parts):
 def test_of_several_quantities_each_has_the_mean_over_the_others(folder, parts):
     results = load_results(folder)
     axes = plot_of(parts, "starts", "0_success").figure.axes[0]
-    assert [plot.name for plot in parts["starts"].plots] == [f"starts_{number}_success" for number in range(3)]
+    assert [plot.name for plot in parts["starts"].plots] == [
+        f"starts_{number}_success" for number in range(3)
+    ]
     for line in axes.lines:
         for tilt, mean in zip(*line.get_data(), strict=True):
             cells = [
-                each.name for each in results.scenarios if each.group == "starts" and each.cell["start.attitude.tilt"] == tilt
+                each.name
+                for each in results.scenarios
+                if each.group == "starts" and each.cell["start.attitude.tilt"] == tilt
             ]
             metrics = [results.entry(line.get_label(), name).metrics for name in cells]
             shares = [(each.success or each.survival).value for each in metrics]
@@ -202,18 +234,36 @@ def test_paths_and_distances_are_the_flights(folder, parts):
         for axes, columns in ((above, [0, 1]), (side, [0, 2])):
             (line,) = (line for line in axes.lines if line.get_label() == label)
             np.testing.assert_array_equal(line.get_xydata()[0], track.position[0, columns])
-            (force,) = {tuple(np.round([u, v], 6)) for each in axes.collections for u, v in zip(each.U, each.V, strict=True)}
+            (force,) = {
+                tuple(np.round([u, v], 6))
+                for each in axes.collections
+                for u, v in zip(each.U, each.V, strict=True)
+            }
             assert force == pytest.approx(np.array([-1.0, -1.0, 0.0])[columns] / 2**0.5, abs=1e-6)
     assert results.entry("pid", "upside_down").metrics.collisions == 2
-    (line,) = (line for line in plot_of(parts, "upside_down", "error").figure.axes[0].lines if line.get_label() == "pid")
+    (line,) = (
+        line
+        for line in plot_of(parts, "upside_down", "error").figure.axes[0].lines
+        if line.get_label() == "pid"
+    )
     assert line.get_xdata()[-1] < 2.0  # a lost flight counts as far away, and ends in a cross
-    assert "x" in [line.get_marker() for line in plot_of(parts, "upside_down", "paths").figure.axes[0].lines]
+    assert "x" in [
+        line.get_marker() for line in plot_of(parts, "upside_down", "paths").figure.axes[0].lines
+    ]
 
 
 def test_a_table_reads_the_same_everywhere():
-    cells = [Cell(-1.234, (-1.5, -1.0), best=True), Cell(2.0, (2.0, 2.0)), Cell(words="never"), Cell(3.0, note="a | b")]
+    cells = [
+        Cell(-1.234, (-1.5, -1.0), best=True),
+        Cell(2.0, (2.0, 2.0)),
+        Cell(words="never"),
+        Cell(3.0, note="a | b"),
+    ]
     columns = [Column("a"), Column("b"), Column("c", source="paper"), Column("d", source="paper")]
-    rows = [Row("time", "s", cells), Row("share", "%", [Cell(99.96875, (99.8, 100.0)), *[Cell()] * 3])]
+    rows = [
+        Row("time", "s", cells),
+        Row("share", "%", [Cell(99.96875, (99.8, 100.0)), *[Cell()] * 3]),
+    ]
     table = Table(columns, rows, corner="what", title="[title]", caption="caption")
     assert table.markdown().splitlines() == [
         "| what | a | b | paper: c | paper: d |",
@@ -241,7 +291,9 @@ def test_a_table_reads_the_same_everywhere():
 @given(value=st.floats(-1e4, 1e4), decimals=st.integers(0, 4))
 def test_numbers_are_rounded_and_zero_has_no_sign(value, decimals):
     text = Cell(value, decimals=decimals).number.replace("−", "-")
-    assert (float(text) == float(f"{value:.{decimals}f}") and not text.startswith("-0")) or float(text) != 0
+    assert (float(text) == float(f"{value:.{decimals}f}") and not text.startswith("-0")) or float(
+        text
+    ) != 0
     assert len(text.partition(".")[2]) == decimals
 
 

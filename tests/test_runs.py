@@ -46,10 +46,16 @@ def test_processes_and_threads_never_share_a_folder(tmp_path):
         f"for _ in range(40): print(claim_run(sys.argv[1], 'dagger', '{ENV}').path.name)"
     )
     processes = [
-        subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) for _ in range(2)
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True
+        )
+        for _ in range(2)
     ]
     with ThreadPoolExecutor(4) as pool:
-        claimed = [run.path.name for run in pool.map(lambda _: claim_run(tmp_path, "dagger", ENV), range(40))]
+        claimed = [
+            run.path.name
+            for run in pool.map(lambda _: claim_run(tmp_path, "dagger", ENV), range(40))
+        ]
     for process in processes:
         claimed += process.communicate(timeout=60)[0].split()
         assert process.returncode == 0
@@ -66,9 +72,13 @@ def test_settings_arguments_and_the_command_come_back(tmp_path, monkeypatch):
     run = claim_run(tmp_path, "dagger", ENV)
     monkeypatch.setattr("sys.argv", ["/somewhere/bin/sb3-quad", "train", "--expert", "my file.zip"])
     written = []
-    monkeypatch.setattr(runs, "write_text", lambda path, text: written.append(path.name) or path.write_text(text))
+    monkeypatch.setattr(
+        runs, "write_text", lambda path, text: written.append(path.name) or path.write_text(text)
+    )
     run.write_yaml({"n_envs": 3}, {"seed": 7, "trained_agent": None})
-    assert {*written} == {"config.yml", "command.txt", "args.yml"} and written[-1] == "args.yml"  # who has it lacks nothing
+    assert {*written} == {"config.yml", "command.txt", "args.yml"} and written[
+        -1
+    ] == "args.yml"  # who has it lacks nothing
     assert run.command.read_text() == "sb3-quad train --expert 'my file.zip'\n"
     assert vars(open_run(run.path)) == vars(run)
     assert run.read_yaml() == ({"n_envs": 3}, {"seed": 7, "trained_agent": None})

@@ -18,7 +18,13 @@ from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.training import transfer
 from sb3_quad.training.transfer import transfer_policy
 
-SMALL = {"policy_kwargs": {"net_arch": [16]}, "batch_size": 32, "buffer_size": 2000, "seed": 3, "device": "cpu"}
+SMALL = {
+    "policy_kwargs": {"net_arch": [16]},
+    "batch_size": 32,
+    "buffer_size": 2000,
+    "seed": 3,
+    "device": "cpu",
+}
 
 
 def swing_up(observation):
@@ -34,17 +40,30 @@ def parameters(module):
 
 
 def pendulum(n_envs=4, **settings):
-    given = {**SMALL, "learning_starts": 0, "train_freq": 4, "gradient_steps": 2, "expert": swing_up, **settings}
+    given = {
+        **SMALL,
+        "learning_starts": 0,
+        "train_freq": 4,
+        "gradient_steps": 2,
+        "expert": swing_up,
+        **settings,
+    }
     return SACBC("MlpPolicy", make_vec_env("Pendulum-v1", n_envs, seed=0), **given)
 
 
-@pytest.mark.parametrize("settings", [{}, {"use_sde": True}, {"ent_coef": 0.1, "n_steps": 3}, {"target_update_interval": 2}])
+@pytest.mark.parametrize(
+    "settings",
+    [{}, {"use_sde": True}, {"ent_coef": 0.1, "n_steps": 3}, {"target_update_interval": 2}],
+)
 def test_without_additions_it_is_sac_bit_for_bit(monkeypatch, settings):
     stock = SAC("MlpPolicy", "Pendulum-v1", **SMALL, **settings).learn(160)
     ours = SACBC("MlpPolicy", "Pendulum-v1", **SMALL, **settings)
     monkeypatch.delattr(SAC, "train")
     ours.learn(160)
-    assert th.equal(parameters(stock.policy), parameters(ours.policy)) and ours._n_updates == stock._n_updates > 50
+    assert (
+        th.equal(parameters(stock.policy), parameters(ours.policy))
+        and ours._n_updates == stock._n_updates > 50
+    )
     for name, value in stock.logger.name_to_value.items():
         if name.startswith("train/"):
             assert ours.logger.name_to_value[name] == pytest.approx(value), name
@@ -52,14 +71,18 @@ def test_without_additions_it_is_sac_bit_for_bit(monkeypatch, settings):
 
 def test_labels_go_with_n_step_returns():
     data = pendulum(bc_coef=0.5, n_steps=3).learn(400).replay_buffer.sample(300)
-    np.testing.assert_allclose(2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5)
+    np.testing.assert_allclose(
+        2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5
+    )
     assert (data.discounts.numpy() < 0.99).any()
 
 
 def test_dict_observations_are_cloned_as_sac_takes_them():
     def make():
         observed = spaces.Dict(pole=spaces.Box(-1.0, 1.0, (2,)), rate=spaces.Box(-8.0, 8.0, (1,)))
-        return TransformObservation(gym.make("Pendulum-v1"), lambda o: {"pole": o[:2], "rate": o[2:]}, observed)
+        return TransformObservation(
+            gym.make("Pendulum-v1"), lambda o: {"pole": o[:2], "rate": o[2:]}, observed
+        )
 
     def expert(observation):
         return swing_up(np.hstack([observation["pole"], observation["rate"]]))
@@ -76,12 +99,16 @@ def test_dict_observations_are_cloned_as_sac_takes_them():
 
 def test_labels_lie_beside_the_actions_of_the_same_state():
     data = pendulum(bc_coef=0.5).learn(1200).replay_buffer.sample(500)  # the episodes end after 800
-    np.testing.assert_allclose(2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5)
+    np.testing.assert_allclose(
+        2.0 * data.expert_actions.numpy(), swing_up(data.observations.numpy()), atol=1e-5
+    )
 
 
 def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone():
     def trained(bc_coef):
-        model = pendulum(bc_coef=1e-9, gradient_steps=0, learning_rate=3e-3, ent_coef=0.01).learn(400)
+        model = pendulum(bc_coef=1e-9, gradient_steps=0, learning_rate=3e-3, ent_coef=0.01).learn(
+            400
+        )
         model.bc_coef = lambda progress: bc_coef
         th.manual_seed(0)
         np.random.seed(0)  # noqa: NPY002 - SB3 samples from it
@@ -90,7 +117,9 @@ def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone(
         model.train(150, 64)
         observations = th.as_tensor(model.replay_buffer.observations.reshape(-1, 3))
         with th.no_grad():
-            error = 2.0 * model.actor(observations, deterministic=True).numpy() - swing_up(observations.numpy())
+            error = 2.0 * model.actor(observations, deterministic=True).numpy() - swing_up(
+                observations.numpy()
+            )
         return critic, np.sqrt(np.mean(error**2))
 
     (critic, without), (same, cloned) = trained(1e-9), trained(100.0)
@@ -98,21 +127,30 @@ def test_cloning_moves_the_actor_towards_the_expert_and_leaves_the_critic_alone(
 
 
 @pytest.mark.parametrize("normalised", [False, True])
-def test_normalised_critics_see_no_scale_of_a_layer_and_stock_sac_loads_the_zip(tmp_path, normalised):
+def test_normalised_critics_see_no_scale_of_a_layer_and_stock_sac_loads_the_zip(
+    tmp_path, normalised
+):
     model = SACBC("MlpPolicy", "Pendulum-v1", critic_layer_norm=normalised, **SMALL).learn(150)
     model.save(tmp_path / "model.zip")
     observations, actions = th.rand(50, 3), th.rand(50, 1)
     values = model.critic(observations, actions)[0]
     again = SACBC.load(tmp_path / "model.zip", device="cpu")
     assert th.equal(again.critic(observations, actions)[0], values)
-    assert th.equal(again.critic_target(observations, actions)[0], model.critic_target(observations, actions)[0])
+    assert th.equal(
+        again.critic_target(observations, actions)[0], model.critic_target(observations, actions)[0]
+    )
     stock = SAC.load(tmp_path / "model.zip", device="cpu")
-    assert th.equal(stock.actor(observations, deterministic=True), model.actor(observations, deterministic=True))
+    assert th.equal(
+        stock.actor(observations, deterministic=True), model.actor(observations, deterministic=True)
+    )
     assert th.equal(stock.critic(observations, actions)[0], values) is not normalised
     with th.no_grad():
         for parameter in model.critic.q_networks[0][0].parameters():
             parameter *= 10.0
-    assert th.allclose(model.critic(observations, actions)[0], values, rtol=1e-2, atol=1e-2) is normalised
+    assert (
+        th.allclose(model.critic(observations, actions)[0], values, rtol=1e-2, atol=1e-2)
+        is normalised
+    )
 
 
 @pytest.mark.parametrize("prefers", [True, False])
@@ -120,7 +158,9 @@ def test_the_q_filter_clones_where_the_critic_prefers_the_expert(prefers):
     model = pendulum(bc_coef=0.5, bc_filter="q")
     labels = th.tensor([[0.5], [-0.5]])
     model.critic.forward = lambda observations, actions: (actions if prefers else -actions,) * 2
-    loss, share = model._bc_loss(th.zeros(2, 3), th.zeros(2, 1), labels)  # of the two, one is greater than the mean
+    loss, share = model._bc_loss(
+        th.zeros(2, 3), th.zeros(2, 1), labels
+    )  # of the two, one is greater than the mean
     assert share == 0.5 and loss == pytest.approx(0.125)
     model.bc_filter = "none"
     assert model._bc_loss(th.zeros(2, 3), th.zeros(2, 1), labels)[1] == 1.0
@@ -140,7 +180,9 @@ def test_while_the_critic_warms_up_the_actor_stands_still():
     actor, critic = parameters(model.actor).clone(), parameters(model.critic).clone()
     model.learn(160)
     assert model._n_updates == 20
-    assert th.equal(actor, parameters(model.actor)) and not th.equal(critic, parameters(model.critic))
+    assert th.equal(actor, parameters(model.actor)) and not th.equal(
+        critic, parameters(model.critic)
+    )
     model.learn(16, reset_num_timesteps=False)
     assert not th.equal(actor, parameters(model.actor))
 
@@ -149,8 +191,13 @@ def test_a_loaded_agent_is_the_same_and_needs_its_expert_to_go_on(tmp_path):
     """A run that goes on with its buffers: tests/test_value_based.py."""
     straight = pendulum(bc_coef=0.5).learn(320)
     straight.save(tmp_path / "agent.zip")
-    loaded = SACBC.load(tmp_path / "agent.zip", device="cpu", expert=swing_up, env=straight.get_env())
-    assert th.equal(parameters(straight.policy), parameters(loaded.policy)) and loaded.expert is swing_up
+    loaded = SACBC.load(
+        tmp_path / "agent.zip", device="cpu", expert=swing_up, env=straight.get_env()
+    )
+    assert (
+        th.equal(parameters(straight.policy), parameters(loaded.policy))
+        and loaded.expert is swing_up
+    )
     with pytest.raises(ExpertError, match="set_expert"):
         SACBC.load(tmp_path / "agent.zip", device="cpu", env=straight.get_env()).learn(8)
 
@@ -159,10 +206,15 @@ def test_the_batch_gives_the_buffer_what_sb3_wants_of_ends():
     """A time limit is no end of the values; the state before it is the last of the same flight."""
     env = QuadcopterVecEnv(4, "target_tracking", seed=0, max_episode_steps=6)
     buffer = (
-        SACBC("MlpPolicy", env, expert=PIDExpert(), bc_coef=0.5, **{**SMALL, "learning_starts": 0}).learn(48).replay_buffer
+        SACBC("MlpPolicy", env, expert=PIDExpert(), bc_coef=0.5, **{**SMALL, "learning_starts": 0})
+        .learn(48)
+        .replay_buffer
     )
     flown = slice(0, 12)
-    assert buffer.dones[flown, 0].nonzero()[0].tolist() == [5, 11] and (buffer.dones == buffer.timeouts).all()
+    assert (
+        buffer.dones[flown, 0].nonzero()[0].tolist() == [5, 11]
+        and (buffer.dones == buffer.timeouts).all()
+    )
     assert (buffer.sample(64).dones == 0).all()
     same = np.isclose(buffer.next_observations[:11], buffer.observations[1:12]).all(axis=(1, 2))
     assert same.tolist() == [True] * 5 + [False] + [True] * 5
@@ -198,15 +250,27 @@ def test_an_actor_takes_over_what_an_on_policy_zip_flies(tmp_path, monkeypatch, 
     after = model.predict(seen, deterministic=True)[0]
     assert np.abs(after - taught).max() < 0.2 * np.abs(before - taught).max()
     model.save(tmp_path / "own.zip")
-    again = algorithm("MlpPolicy", env, **{**SMALL, "policy_kwargs": {"net_arch": [64, 64]}, "seed": 4})
-    transfer_policy(tmp_path / "own.zip", again)  # of its own kind: the same weights, the critic's too
+    again = algorithm(
+        "MlpPolicy", env, **{**SMALL, "policy_kwargs": {"net_arch": [64, 64]}, "seed": 4}
+    )
+    transfer_policy(
+        tmp_path / "own.zip", again
+    )  # of its own kind: the same weights, the critic's too
     assert th.equal(parameters(again.policy), parameters(model.policy))
 
 
 @pytest.mark.slow
 def test_it_learns_pendulum_from_its_expert_in_seconds():
     settings = {"bc_coef": 5.0, "learning_rate": 3e-3, "batch_size": 128}
-    settings |= {"gradient_steps": 16, "train_freq": 8, "policy_kwargs": {"net_arch": [64, 64]}, "ent_coef": 0.01}
+    settings |= {
+        "gradient_steps": 16,
+        "train_freq": 8,
+        "policy_kwargs": {"net_arch": [64, 64]},
+        "ent_coef": 0.01,
+    }
     model = pendulum(8, **settings).learn(8000)
-    agent, new = (evaluate_policy(each, make_vec_env("Pendulum-v1", 16, seed=1), 16)[0] for each in (model, pendulum()))
+    agent, new = (
+        evaluate_policy(each, make_vec_env("Pendulum-v1", 16, seed=1), 16)[0]
+        for each in (model, pendulum())
+    )
     assert agent > -300 and new < -900  # the expert has about -150

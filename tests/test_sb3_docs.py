@@ -1,6 +1,8 @@
-"""Our environments in the examples of Stable-Baselines3's documentation: another id, fewer steps, nothing else.
+"""Our environments in the examples of Stable-Baselines3's documentation: another id, fewer steps,
+nothing else.
 
-https://stable-baselines3.readthedocs.io, pages Getting Started, Examples, Callbacks, Vectorized Environments, PPO.
+https://stable-baselines3.readthedocs.io, pages Getting Started, Examples, Callbacks, Vectorized
+Environments, PPO.
 """
 
 import warnings

@@ -1,4 +1,6 @@
-"""Flights of scenarios: the same in either environment, and physics where it can be said beforehand."""
+"""Flights of scenarios: the same in either environment, and physics where it can be said
+beforehand.
+"""
 
 import dataclasses
 
@@ -30,7 +32,9 @@ def hover(observation):
 
 
 class OnObservations:
-    """The expert as a policy: it sees the noisy observation, and takes its target to lie off by an offset."""
+    """The expert as a policy: it sees the noisy observation, and takes its target to lie off by an
+    offset.
+    """
 
     def __init__(self, offset=(0.0, 0.0, 0.0)):
         mean = np.zeros(18)
@@ -50,7 +54,9 @@ MIXED = (
 )
 
 
-RECOVERY = "start: {attitude: uniform, velocity: {std: 2}, body_rates: {std: 4}}, duration: 3, episodes: 6"
+RECOVERY = (
+    "start: {attitude: uniform, velocity: {std: 2}, body_rates: {std: 4}}, duration: 3, episodes: 6"
+)
 SIDE_HIT = (
     "target: [10, 10, 25], duration: 5, episodes: 2, noise: 0.1,"
     "wrenches: [{start: 2.5, duration: 0.02, force: [-20, -20, 0], torque: [-5, -5, -5]}]"
@@ -62,18 +68,32 @@ GUSTS = "target: {distance: 3}, duration: 3, episodes: 3, randomize: {mass: [0.9
 
 @pytest.mark.parametrize(
     ("entry", "controller"),
-    [(MIXED, PIDExpert()), (MIXED, OnObservations()), (RECOVERY, PIDExpert()), (SIDE_HIT, PIDExpert()), (GUSTS, PIDExpert())],
+    [
+        (MIXED, PIDExpert()),
+        (MIXED, OnObservations()),
+        (RECOVERY, PIDExpert()),
+        (SIDE_HIT, PIDExpert()),
+        (GUSTS, PIDExpert()),
+    ],
     ids=["mixed", "mixed, on observations", "recovery", "side hit", "gusts"],
 )
 def test_both_backends_fly_the_same(entry, controller):
-    flown = [fly_scenario(controller, scenario(entry), backend, recorded=2) for backend in ("batch", "pybullet")]
+    flown = [
+        fly_scenario(controller, scenario(entry), backend, recorded=2)
+        for backend in ("batch", "pybullet")
+    ]
     (batch, one), (bullet, two) = flown
     for column in (field.name for field in dataclasses.fields(Flights)):
         ours, theirs = (getattr(each, column) for each in (batch, bullet))
-        ours, theirs = (np.stack([*each.values()]) if isinstance(each, dict) else each for each in (ours, theirs))
+        ours, theirs = (
+            np.stack([*each.values()]) if isinstance(each, dict) else each
+            for each in (ours, theirs)
+        )
         np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5, err_msg=column)
     assert one.keys() == two.keys()
-    same = np.sign(np.nansum(one["quaternion"] * two["quaternion"], axis=2, keepdims=True))  # q and -q are one attitude
+    same = np.sign(
+        np.nansum(one["quaternion"] * two["quaternion"], axis=2, keepdims=True)
+    )  # q and -q are one attitude
     two["quaternion"] = two["quaternion"] * same
     for name, values in one.items():
         np.testing.assert_allclose(values, two[name], rtol=1e-3, atol=1e-4, err_msg=name)
@@ -81,17 +101,25 @@ def test_both_backends_fly_the_same(entry, controller):
 
 def test_gusts_push_and_the_suite_of_changes_flies():
     calm, gusty = (
-        fly_scenario(PIDExpert(), scenario(f"randomize: {{gusts: {{std: {std}}}}}, duration: 4"))[0] for std in (0, 3)
+        fly_scenario(PIDExpert(), scenario(f"randomize: {{gusts: {{std: {std}}}}}, duration: 4"))[0]
+        for std in (0, 3)
     )
     assert calm.final_error.max() < 1e-3 and gusty.final_error.min() > 0.01
     for each in load_suite("robustness").with_changes(episodes=2).scenarios:
         if each.group != "starts":
-            flights, _ = fly_scenario(PIDExpert(), each.model_copy(update={"duration": 0.3, "wrenches": each.wrenches[:1]}))
+            flights, _ = fly_scenario(
+                PIDExpert(),
+                each.model_copy(update={"duration": 0.3, "wrenches": each.wrenches[:1]}),
+            )
             assert flights.n == 2 and flights.survival.all()
 
 
 def test_episodes_are_those_of_the_task():
-    recovery = load_suite("thesis").scenario("recovery").model_copy(update={"episodes": 8, "duration": 2.0})
+    recovery = (
+        load_suite("thesis")
+        .scenario("recovery")
+        .model_copy(update={"episodes": 8, "duration": 2.0})
+    )
     ours, _ = fly_scenario(PIDExpert(), recovery)
     plain = fly(PIDExpert(), "state_recovery", 8, seed_for("suite", recovery.seed), max_steps=200)
     for name in ("reward", "length", "path_length", "final_error", "start"):
@@ -100,11 +128,15 @@ def test_episodes_are_those_of_the_task():
 
 @pytest.mark.parametrize("factor", [1.0, -2.0])
 def test_an_impulse_is_force_times_time(factor):
-    push = f"{{start: 0.1, duration: 0.05, force: [6, 0, 0], torque: [0, 0, 0.01], factor: {factor}}}"
+    push = (
+        f"{{start: 0.1, duration: 0.05, force: [6, 0, 0], torque: [0, 0, 0.01], factor: {factor}}}"
+    )
     entry = f"noise: 0, duration: 0.5, episodes: 2, wrenches: [{push}]"
     flights, log = fly_scenario(hover, scenario(entry), recorded=2)
     np.testing.assert_allclose(log["velocity"][:, -1, 0], factor * 6 * 0.05 / 1.727, rtol=1e-4)
-    np.testing.assert_allclose(log["body_rates"][:, -1, 2], factor * 0.01 * 0.05 / 0.00996, rtol=1e-3)
+    np.testing.assert_allclose(
+        log["body_rates"][:, -1, 2], factor * 0.01 * 0.05 / 0.00996, rtol=1e-3
+    )
     np.testing.assert_allclose(np.diff(log["time"]), 0.02)
     impulse = 0.02 * log["wrench"][:, 1:, 0].sum(axis=1)  # means over the steps between samples
     np.testing.assert_allclose(impulse, factor * 6 * 0.05, rtol=1e-5)
@@ -112,11 +144,15 @@ def test_an_impulse_is_force_times_time(factor):
 
 
 def test_waypoints_are_flown_one_after_the_other():
-    course = scenario("target: {waypoints: [[0, 0, 17], [2, 0, 17], [2, 2, 16]], radius: 0.4}, duration: 20, episodes: 3")
+    course = scenario(
+        "target: {waypoints: [[0, 0, 17], [2, 0, 17], [2, 2, 16]], radius: 0.4}, duration: 20, episodes: 3"
+    )
     flights, log = fly_scenario(PIDExpert(), course, recorded=3)
     assert (np.diff(flights.waypoint_times, axis=1) > 0).all()
     for row in range(3):
-        assert [tuple(target) for target in dict.fromkeys(map(tuple, log["target"][row]))] == list(course.target.points)
+        assert [tuple(target) for target in dict.fromkeys(map(tuple, log["target"][row]))] == list(
+            course.target.points
+        )
         for time, point in zip(flights.waypoint_times[row], course.target.points, strict=True):
             near = np.abs(log["time"] - time) <= 0.02
             assert np.linalg.norm(log["position"][row, near] - point, axis=1).min() < 0.4 + 0.1
@@ -127,9 +163,17 @@ def test_waypoints_are_flown_one_after_the_other():
 
 
 def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_path):
-    flights, log = fly_scenario(lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), recorded=2)
-    assert flights.collision.all() and not flights.survival.any() and np.isnan(flights.final_offset).all()
-    assert (log["samples"] <= flights.flown / 0.02 + 1).all() and (log["samples"] > flights.flown / 0.02 - 1).all()
+    flights, log = fly_scenario(
+        lambda observation: hover(observation) - 1, scenario("episodes: 2, duration: 5"), recorded=2
+    )
+    assert (
+        flights.collision.all()
+        and not flights.survival.any()
+        and np.isnan(flights.final_offset).all()
+    )
+    assert (log["samples"] <= flights.flown / 0.02 + 1).all() and (
+        log["samples"] > flights.flown / 0.02 - 1
+    ).all()
     assert log["position"][0, log["samples"][0] - 1, 2] < 0.8
     write_arrays(tmp_path / "f.npz", **episode_arrays(flights, range(2)), **log)
     arrays = read_flights(tmp_path / "f.npz")
@@ -138,9 +182,13 @@ def test_a_lost_flight_is_recorded_to_its_end_and_files_hold_what_was_flown(tmp_
 
 
 def specified(name: str, episodes: int):
-    flights, _ = fly_scenario(PIDExpert(), load_suite("thesis").scenario(name).model_copy(update={"episodes": episodes}))
+    flights, _ = fly_scenario(
+        PIDExpert(), load_suite("thesis").scenario(name).model_copy(update={"episodes": episodes})
+    )
     metrics = summarise(flights)
-    return metrics, {arrival.tolerance: arrival.time and arrival.time.value for arrival in metrics.arrivals}
+    return metrics, {
+        arrival.tolerance: arrival.time and arrival.time.value for arrival in metrics.arrivals
+    }
 
 
 @pytest.mark.parametrize(
@@ -188,7 +236,9 @@ def test_scaling_changes_the_position_only():
     np.testing.assert_array_equal(adapted[:, 3:], observation[:, 3:])
     metres = observation[:, :3] * std
     factor = 0.5 * (1 + np.linalg.norm(metres, axis=1) / 10)
-    np.testing.assert_allclose(adapted[:, :3], (metres - [0.1, 0.0, -0.2]) / (factor[:, None] * std), rtol=1e-5)
+    np.testing.assert_allclose(
+        adapted[:, :3], (metres - [0.1, 0.0, -0.2]) / (factor[:, None] * std), rtol=1e-5
+    )
     np.testing.assert_allclose(adaptive_factor([0.0, 10.0, 30.0]), [0.5, 1.0, 2.0])
 
 
@@ -199,7 +249,8 @@ def test_the_measured_offset_is_cancelled_and_the_way_is_quicker():
     adapted = AdaptiveScaling(policy, measure_mean(policy, n_flights=8))
     assert np.linalg.norm(hover_offset(adapted, 8)) < 0.01
     plain, quick = (
-        fly(each, n_episodes=8, max_steps=900, tolerances=(0.5,)).time_to[0.5].mean() for each in (policy, adapted)
+        fly(each, n_episodes=8, max_steps=900, tolerances=(0.5,)).time_to[0.5].mean()
+        for each in (policy, adapted)
     )
     assert quick < plain
 
@@ -208,7 +259,9 @@ def test_intervals_hold_the_value_and_narrow_with_n():
     """Wilson's for 8 of 10: 49.0 to 94.3 %, as tables have it."""
     estimate = share([True] * 8 + [False] * 2)
     assert (estimate.low, estimate.high) == pytest.approx((0.4902, 0.9433), abs=1e-4)
-    assert share([True] * 10).high == 1.0 and share([True] * 10).low == pytest.approx(0.7225, abs=1e-4)
+    assert share([True] * 10).high == 1.0 and share([True] * 10).low == pytest.approx(
+        0.7225, abs=1e-4
+    )
     values = np.random.default_rng(0).normal(3.0, 2.0, 400)
     wide, narrow = mean(values[:40]), mean(values)
     assert wide.high - wide.low > narrow.high - narrow.low

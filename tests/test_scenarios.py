@@ -1,4 +1,6 @@
-"""Scenarios: what a file says is what is flown, impossible ones are refused in one line, the shipped suites hold together."""
+"""Scenarios: what a file says is what is flown, impossible ones are refused in one line, the
+shipped suites hold together.
+"""
 
 import math
 import re
@@ -20,7 +22,9 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 
 def suite(*entries: str) -> Suite:
     return parse_suite(
-        "name: mine\nscenarios:\n" + "".join(f"  - {{name: s{k}, {entry}}}\n" for k, entry in enumerate(entries)), "x"
+        "name: mine\nscenarios:\n"
+        + "".join(f"  - {{name: s{k}, {entry}}}\n" for k, entry in enumerate(entries)),
+        "x",
     )
 
 
@@ -37,9 +41,14 @@ def test_shipped_suites_survive_json(name):
 
 def test_the_thesis_suite_holds_all_of_chapter_four():
     thesis = load_suite("thesis")
-    tracking = {thesis.scenario(name).target.distance for name in ("tracking", "tracking_15m", "tracking_20m")}
+    tracking = {
+        thesis.scenario(name).target.distance
+        for name in ("tracking", "tracking_15m", "tracking_20m")
+    }
     assert tracking == {10.0, 15.0, 20.0}
-    assert set(np.round(np.arange(0.2, 1.01, 0.1), 1)) | {0.05, 0.1} <= set(thesis.scenario("tracking").tolerances)
+    assert set(np.round(np.arange(0.2, 1.01, 0.1), 1)) | {0.05, 0.1} <= set(
+        thesis.scenario("tracking").tolerances
+    )
     for name, sign in (("target_up", 1), ("target_down", -1)):
         way = np.array(thesis.scenario(name).target.position) - [0, 0, 15]
         np.testing.assert_allclose(way, sign * 10 / math.sqrt(3) * np.ones(3))
@@ -71,7 +80,11 @@ def test_the_thesis_suite_holds_all_of_chapter_four():
 def test_what_is_impossible_is_named(entry, message):
     with pytest.raises(ConfigError) as caught:
         scenario(entry)
-    assert message in str(caught.value) and str(caught.value).startswith("x: scenario s0: ") and "\n" not in str(caught.value)
+    assert (
+        message in str(caught.value)
+        and str(caught.value).startswith("x: scenario s0: ")
+        and "\n" not in str(caught.value)
+    )
 
 
 def test_the_example_of_the_documentation_is_valid():
@@ -98,11 +111,16 @@ def test_vehicle_files_lie_beside_the_suite(tmp_path):
 
 
 def test_vary_is_a_grid_of_named_cells():
-    cells = suite("title: grid, vary: {noise: [0, 0.1], start.attitude.tilt: [0, 45, 90]}").scenarios
+    cells = suite(
+        "title: grid, vary: {noise: [0, 0.1], start.attitude.tilt: [0, 45, 90]}"
+    ).scenarios
     assert len(cells) == 6 and len({cell.name for cell in cells}) == 6
     for cell in cells:
         assert cell.group == "s0"
-        assert (cell.noise, cell.start.attitude.tilt) == (cell.cell["noise"], cell.cell["start.attitude.tilt"])
+        assert (cell.noise, cell.start.attitude.tilt) == (
+            cell.cell["noise"],
+            cell.cell["start.attitude.tilt"],
+        )
     assert axis_label("start.attitude.tilt") == "tilt (deg)"
 
 
@@ -137,13 +155,19 @@ def test_the_physical_limit_is_told_where_it_is_that_of_the_flights(entry, limit
 def test_wrenches_in_weights_grow_with_the_vehicle_and_change_no_others(name):
     vehicle = load_vehicle(name)
     push = "{force: [0, 0, -0.5], torque: [2, 0, 0], unit: weight}"
-    each = scenario(f"vehicle: {name}, vehicle_changes: {{mass: 1.2}}, wrenches: [{push}, {{start: 1, force: [1, 0, 0]}}]")
+    each = scenario(
+        f"vehicle: {name}, vehicle_changes: {{mass: 1.2}}, wrenches: [{push}, {{start: 1, force: [1, 0, 0]}}]"
+    )
     first, second = sample_plan(each, [0]).wrenches.values()
     weight = vehicle.mass * vehicle.gravity  # of the vehicle as its controller knows it
     torque = 2 * weight * vehicle.arm_length
-    both = make_wrench(np.array([[0, 0, -0.5 * weight], [1, 0, 0]]), np.array([[torque, 0, 0], [0, 0, 0]]))
+    both = make_wrench(
+        np.array([[0, 0, -0.5 * weight], [1, 0, 0]]), np.array([[torque, 0, 0], [0, 0, 0]])
+    )
     np.testing.assert_allclose([first[0], (second - first)[0]], both.T, atol=1e-12)
-    varied = suite("wrenches: [{force: {magnitude: 0}, unit: weight}], vary: {wrenches.0.force.magnitude: [0, 1]}")
+    varied = suite(
+        "wrenches: [{force: {magnitude: 0}, unit: weight}], vary: {wrenches.0.force.magnitude: [0, 1]}"
+    )
     assert axis_label("wrenches.0.force.magnitude", varied.scenarios[1]) == "force (weights)"
 
 
@@ -164,7 +188,12 @@ def test_what_is_random_in_a_scenario_is_part_of_it_and_changes_no_others():
             scenario(entry)
 
 
-@given(seed=st.integers(0, 2**31), tilt=st.floats(0, 180), speed=st.floats(0, 20), rate=st.floats(0, 50))
+@given(
+    seed=st.integers(0, 2**31),
+    tilt=st.floats(0, 180),
+    speed=st.floats(0, 20),
+    rate=st.floats(0, 50),
+)
 def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     entry = f"start: {{attitude: {{tilt: {tilt}}}, velocity: {{magnitude: {speed}}}, body_rates: {{magnitude: {rate}}}}}"
     sampled, again = (sample_plan(scenario(entry), range(seed, seed + 3)).start for _ in range(2))
@@ -176,12 +205,18 @@ def test_samples_have_the_size_that_was_asked_for(seed, tilt, speed, rate):
     np.testing.assert_allclose(np.linalg.norm(sampled["body_rates"], axis=1), rate, atol=1e-9)
     for name, values in sampled.items():
         np.testing.assert_array_equal(values, again[name])
-        if name == "velocity" and speed > 1e-300:  # smaller ones have too few digits to tell directions apart
+        if (
+            name == "velocity" and speed > 1e-300
+        ):  # smaller ones have too few digits to tell directions apart
             assert len(np.unique(values[:, 0])) == 3
 
 
 @given(
-    st.lists(st.tuples(st.integers(0, 40), st.integers(1, 60), st.sampled_from(["world", "body"])), min_size=1, max_size=4),
+    st.lists(
+        st.tuples(st.integers(0, 40), st.integers(1, 60), st.sampled_from(["world", "body"])),
+        min_size=1,
+        max_size=4,
+    ),
     st.floats(0, 3),
 )
 def test_the_wrench_at_any_time_is_the_sum_of_those_that_act(times, factor):
@@ -208,4 +243,6 @@ def test_a_heavier_vehicle_keeps_its_motors(mass, action):
     vehicle = load_vehicle("itm")
     changed = VehicleChanges(mass=mass).apply(vehicle)
     assert changed.mass == pytest.approx(mass * 1.727)
-    np.testing.assert_allclose(changed.action_to_thrust(np.array(action)), vehicle.action_to_thrust(np.array(action)))
+    np.testing.assert_allclose(
+        changed.action_to_thrust(np.array(action)), vehicle.action_to_thrust(np.array(action))
+    )

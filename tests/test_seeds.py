@@ -19,7 +19,9 @@ seeds = st.integers(0, LARGEST - 1)
 
 
 @given(seeds, seeds, st.integers(1, 64))
-@example(524_288, 0, 64)  # in version 0.1 such a training flew the episodes of the closing tables of seed 0
+@example(
+    524_288, 0, 64
+)  # in version 0.1 such a training flew the episodes of the closing tables of seed 0
 @example(0, 1, 64)  # and these two shared all streams but one
 def test_seeds_and_purposes_share_no_stream(one, other, n):
     runs = {(purpose, seed) for purpose in PURPOSES for seed in (one, other)}
@@ -46,7 +48,12 @@ def test_rows_of_different_seeds_start_differently(kind):
 def test_a_training_flies_the_same_episodes_in_either_environment():
     flown = []
     for vec_env in ("batch", "dummy"):
-        settings = {"n_timesteps": 64, "n_envs": 3, "vec_env": vec_env, "env_kwargs": {"max_episode_steps": [3, 5]}}
+        settings = {
+            "n_timesteps": 64,
+            "n_envs": 3,
+            "vec_env": vec_env,
+            "env_kwargs": {"max_episode_steps": [3, 5]},
+        }
         config = build_config("ppo", "QuadStateRecovery-v0", settings)
         env = make_environments(config, 3, seed_for("training", 5), staggered=True)
         env.seed(seed_for("training", 5))

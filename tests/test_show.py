@@ -1,4 +1,6 @@
-"""Flights to look at: recordings are the flights, cameras see what they must, files are whole and never lost."""
+"""Flights to look at: recordings are the flights, cameras see what they must, files are whole and
+never lost.
+"""
 
 import importlib.util
 import os
@@ -52,7 +54,9 @@ def fall():
 def hit():
     """A hit on the way to a target."""
     setting = fixed_setting(FlightSettings(task="target_tracking", noise=0.0), target=(3, 0, 16))
-    wrenches = sample_wrenches([Wrench(**HIT)], load_vehicle("itm"), 1500, [np.random.default_rng(0)])
+    wrenches = sample_wrenches(
+        [Wrench(**HIT)], load_vehicle("itm"), 1500, [np.random.default_rng(0)]
+    )
     plan = replace(setting.plan(0), wrenches=wrenches)
     return flown(setting._replace(plan=lambda seed: plan), 60)
 
@@ -75,12 +79,16 @@ def test_a_recording_is_the_flight_of_the_environment():
 def test_a_lost_flight_ends_where_it_was_lost(fall):
     assert fall.lost == "collision"
     assert fall.state.position[-1, 2] <= fall.vehicle.collision_radius < fall.state.position[-2, 2]
-    assert fall.times[-1] == pytest.approx(1.71, abs=0.02)  # the specification's expert, velocity in the body frame
+    assert fall.times[-1] == pytest.approx(
+        1.71, abs=0.02
+    )  # the specification's expert, velocity in the body frame
 
 
 def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
     acting = np.flatnonzero(hit.wrench.any(axis=1))
-    np.testing.assert_array_equal(acting, [11, 12])  # during the steps that begin at 0.10 and 0.11 s
+    np.testing.assert_array_equal(
+        acting, [11, 12]
+    )  # during the steps that begin at 0.10 and 0.11 s
     assert hit.pushes == [11]
     np.testing.assert_array_equal(hit.wrench_around(40)[:3], [-20, -20, 0])
     assert not hit.wrench_around(10).any() and not hit.wrench_around(59).any()
@@ -89,7 +97,9 @@ def test_a_blow_is_recorded_when_it_acts_and_seen_for_a_while(hit):
 
 def test_what_randomize_pushes_with_is_recorded():
     setting = fixed_setting(
-        FlightSettings(task="target_tracking", randomize={"force": {"magnitude": [3, 3]}, "gusts": {"std": 1}})
+        FlightSettings(
+            task="target_tracking", randomize={"force": {"magnitude": [3, 3]}, "gusts": {"std": 1}}
+        )
     )
     recording = flown(setting, 20)
     np.testing.assert_allclose(recording.wrench[1:], recording.state.wrench[:, :-1].T)
@@ -98,7 +108,9 @@ def test_what_randomize_pushes_with_is_recorded():
 
 def test_controllers_fly_the_same_episodes_until_the_steps_are_used_up():
     setting = fixed_setting(FlightSettings(task="state_recovery", max_episode_steps=20))
-    episodes = list(fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50))
+    episodes = list(
+        fly_all({"a": PIDExpert(), "b": lambda observation: np.zeros((1, 4))}, setting, 5, 50)
+    )
     assert [len(a.times) - 1 for a, _ in episodes] == [20, 20, 10]
     for first, second in episodes:
         np.testing.assert_array_equal(first.state.array[:, 0], second.state.array[:, 0])
@@ -113,11 +125,15 @@ def test_a_controller_that_fails_is_named():
 
 
 def looking_along_x():
-    return Camera(np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), Lens(80, 40, 0.5))
+    return Camera(
+        np.zeros(3), np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]]), Lens(80, 40, 0.5)
+    )
 
 
 def test_points_are_seen_where_they_are():
-    columns, rows, depth = looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]])).T
+    columns, rows, depth = (
+        looking_along_x().project(np.array([[4.0, 0, 0], [4, -2, 0], [4, 0, 2], [2, 0, 0]])).T
+    )
     np.testing.assert_allclose(columns, [40, 60, 40, 40])
     np.testing.assert_allclose(rows, [20, 20, 0, 20])
     np.testing.assert_allclose(depth, [4, 4, 4, 2])
@@ -127,18 +143,24 @@ def test_points_are_seen_where_they_are():
 def test_trails_are_hidden_by_what_is_before_them(distance, seen):
     points = np.array([[distance, -0.5, 0.0], [distance, 0.5, 0.0], [distance, 0.0, 0.5]])
     picture = Image.new("RGBA", (80, 40))
-    draw_trails(picture, [Trail(points, "red", 0.1)], looking_along_x(), np.full((40, 80), 5.0, np.float32))
+    draw_trails(
+        picture, [Trail(points, "red", 0.1)], looking_along_x(), np.full((40, 80), 5.0, np.float32)
+    )
     drawn = np.asarray(picture)
     assert (drawn[..., 3] == 255).any() == (drawn[..., 3] > 0).any() == seen
     assert (drawn[drawn[..., 3] > 0, :3] == (255, 0, 0)).all()
 
 
 coordinates = st.floats(-20, 20, allow_nan=False)
-clouds = st.lists(st.tuples(coordinates, coordinates, st.floats(10, 40)), min_size=1, max_size=8).map(np.array)
+clouds = st.lists(
+    st.tuples(coordinates, coordinates, st.floats(10, 40)), min_size=1, max_size=8
+).map(np.array)
 
 
 @given(points=clouds, aspect=st.floats(0.5, 2), course=st.floats(0, 6.28))
-def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(points, aspect, course):
+def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(
+    points, aspect, course
+):
     ahead = np.array([np.cos(course), np.sin(course), 0.0])
     camera = framing_camera(points, 1.0, ahead, Lens(round(200 * aspect), 200))
     forward, *across = ((points - camera.eye) @ camera.axes.T).T
@@ -149,7 +171,9 @@ def test_a_framing_camera_has_everything_in_its_picture_and_no_room_to_spare(poi
 def test_a_following_camera_never_loses_the_vehicle(fall, hit):
     for recording in (fall, hit):
         times = frame_times([recording], 1.0)
-        cameras = [*following_cameras([recording], times, 1.0, np.array([0.0, 1.0, 0.0]), Lens(100, 100))]
+        cameras = [
+            *following_cameras([recording], times, 1.0, np.array([0.0, 1.0, 0.0]), Lens(100, 100))
+        ]
         assert len(cameras) == len(times)
         for seconds, camera in zip(times, cameras, strict=True):
             column, row, _ = camera.project(recording.vehicle_and_target(recording.at(seconds)))[0]
@@ -166,7 +190,11 @@ def test_broadside_looks_across_the_motion():
 def test_a_film_runs_as_long_as_the_longest_flight_and_holds_its_end(fall, hit):
     times = frame_times([fall, hit], 0.5)
     assert len(times) == round((fall.times[-1] / 0.5 + HOLD) * FPS) + 1
-    assert times[0] == 0.0 and times[-1] == fall.times[-1] and np.diff(times).max() == pytest.approx(0.5 / FPS)
+    assert (
+        times[0] == 0.0
+        and times[-1] == fall.times[-1]
+        and np.diff(times).max() == pytest.approx(0.5 / FPS)
+    )
     frames = film_frames([fall, hit], 64, 48, 0.5)
     some = [next(frames) for _ in range(6)]
     frames.close()
@@ -184,7 +212,9 @@ def test_a_sequence_shows_start_hit_and_end_without_overlap(fall, hit):
     assert chosen[0][0] == 0 and chosen[0][-1] == ends[0] and hit.pushes[0] in chosen[1]
     for steps, flight in zip(chosen, (fall, hit), strict=True):
         places, breadth = view.project(flight.state.position[steps])
-        gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[np.triu_indices(len(steps), 1)]
+        gaps = np.linalg.norm(places[:, None] - places[None], axis=2)[
+            np.triu_indices(len(steps), 1)
+        ]
         assert (gaps > 0.7 * breadth.min()).sum() >= len(gaps) - 1  # a push is shown in any case
     picture = sequence.sequence([fall, hit], 120, 100)
     assert picture.shape[0] > 100 and picture.shape[1] >= 240 and picture.std() > 20
@@ -205,7 +235,9 @@ def test_texts_of_a_sequence_are_inside_the_picture_beside_their_poses(fall, siz
 
 def test_a_sequence_explains_its_signs(fall, hit, monkeypatch):
     headers = []
-    monkeypatch.setattr(sequence, "with_header", lambda pixels, name, lines, *look: headers.append(lines) or pixels)
+    monkeypatch.setattr(
+        sequence, "with_header", lambda pixels, name, lines, *look: headers.append(lines) or pixels
+    )
     sequence.sequence([fall, hit], 60, 60)
     assert [header[-1] for header in headers] == [
         "green hoops: target",
@@ -249,13 +281,25 @@ def test_missing_video_packages_are_named(monkeypatch, capsys, tmp_path):
 def test_the_command_draws_and_tells(tmp_path, capsys):
     picture, film = tmp_path / "s.png", tmp_path / "f.gif"
     size = ["--size", "64x64", "-n", "12", "--seed", "3"]
-    asked = ["enjoy", "pid", "still=geometric", "--task", "state_recovery", *size, "-P", "-o", str(picture)]
+    asked = [
+        "enjoy",
+        "pid",
+        "still=geometric",
+        "--task",
+        "state_recovery",
+        *size,
+        "-P",
+        "-o",
+        str(picture),
+    ]
     assert main([*asked, *([str(film)] if VIDEO else [])]) == 0
     output, progress = capsys.readouterr()
     assert not VIDEO or (
         "100%" in progress and re.search(r"\d:\d\d:\d\d", progress)
     )  # how much is done, and how long it takes
-    assert "pid: " in output and "still: " in output and "0.12 s" in output and str(picture) in output
+    assert (
+        "pid: " in output and "still: " in output and "0.12 s" in output and str(picture) in output
+    )
     with Image.open(picture) as image:
         assert image.width >= 128
     assert film.is_file() == VIDEO
@@ -273,11 +317,18 @@ def run_folder(tmp_path):
 
     from sb3_quad.envs.vec_env import QuadcopterVecEnv
 
-    config = load_config("ppo", "QuadStateRecovery-v0", None, {"eval_env_kwargs": {"noise": 0.0, "max_episode_steps": 30}})
+    config = load_config(
+        "ppo",
+        "QuadStateRecovery-v0",
+        None,
+        {"eval_env_kwargs": {"noise": 0.0, "max_episode_steps": 30}},
+    )
     run = claim_run(tmp_path / "logs", "ppo", "QuadStateRecovery-v0")
     run.write_yaml(config.settings, {})
     env = QuadcopterVecEnv(1, task="state_recovery")
-    PPO("MlpPolicy", env, n_steps=2, batch_size=2, policy_kwargs={"net_arch": [4]}, device="cpu").save(run.best_model)
+    PPO(
+        "MlpPolicy", env, n_steps=2, batch_size=2, policy_kwargs={"net_arch": [4]}, device="cpu"
+    ).save(run.best_model)
     return run
 
 
@@ -308,7 +359,10 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
         (["nowhere.zip", "--no-render"], "no such file"),
         (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),
         (["pid", "--task", "state-recovery", "--no-render"], "did you mean 'state_recovery'"),
-        (["pid", "--task", "state_recovery", "--scenario", "thesis:side_hit", "--no-render"], "not allowed with"),
+        (
+            ["pid", "--task", "state_recovery", "--scenario", "thesis:side_hit", "--no-render"],
+            "not allowed with",
+        ),
         (["pid", "--scenario", "thesis:side_hitt", "--no-render"], "did you mean 'side_hit'"),
         (["pid", "--scenario", "side_hit", "--no-render"], "suite:name"),
         (["pid", "--target", "0", "0", "-1", "--no-render"], "below ground"),
@@ -335,9 +389,23 @@ def test_a_window_without_a_display_is_refused(monkeypatch, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is not installed: no display to open a window on")
+@pytest.mark.skipif(
+    shutil.which("xvfb-run") is None,
+    reason="xvfb-run is not installed: no display to open a window on",
+)
 def test_flights_are_shown_in_a_window():
-    command = [sys.executable, "-m", "sb3_quad.cli", "enjoy", "pid", "geometric", "-n", "20", "--speed", "0.5"]
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_quad.cli",
+        "enjoy",
+        "pid",
+        "geometric",
+        "-n",
+        "20",
+        "--speed",
+        "0.5",
+    ]
     result = subprocess.run(
         ["xvfb-run", "-a", *command],
         cwd=Path(__file__).parent.parent,
@@ -356,7 +424,20 @@ def test_the_agent_of_a_run_is_filmed_and_no_film_replaced(run_folder, tmp_path,
     import imageio.v2 as imageio
 
     logs, film = str(run_folder.path.parent.parent), tmp_path / "one.mp4"
-    asked = ["enjoy", "--algo", "ppo", "--env", "QuadStateRecovery-v0", "-f", logs, "-n", "10", "--size", "64x64", "-o"]
+    asked = [
+        "enjoy",
+        "--algo",
+        "ppo",
+        "--env",
+        "QuadStateRecovery-v0",
+        "-f",
+        logs,
+        "-n",
+        "10",
+        "--size",
+        "64x64",
+        "-o",
+    ]
     assert main([*asked, str(film)]) == 0
     output = capsys.readouterr().out
     assert f"agent: {run_folder.best_model}" in output and f"saved {film}" in output
@@ -366,7 +447,9 @@ def test_the_agent_of_a_run_is_filmed_and_no_film_replaced(run_folder, tmp_path,
     assert main([*asked, str(tmp_path / "both.mp4"), "--n-envs", "2", "--seed", "4"]) == 0
     output = capsys.readouterr().out
     assert "seed 4, ppo best_model" in output and "seed 5, ppo best_model" in output
-    widths = [next(iter(imageio.get_reader(path))).shape[1] for path in (film, tmp_path / "both.mp4")]
+    widths = [
+        next(iter(imageio.get_reader(path))).shape[1] for path in (film, tmp_path / "both.mp4")
+    ]
     assert widths[1] >= 2 * widths[0]
 
 

@@ -1,4 +1,6 @@
-"""Sweeps: what they expand to, what they refuse, and that nothing of them is lost; trainings of a few hundred timesteps."""
+"""Sweeps: what they expand to, what they refuse, and that nothing of them is lost; trainings of a
+few hundred timesteps.
+"""
 
 import itertools
 import json
@@ -30,7 +32,13 @@ from sb3_quad.sweep.run import digest
 from sb3_quad.sweep.spec import SWEEPS, SweepSpec, load_sweep
 
 ROOT = Path(__file__).resolve().parent.parent
-NET = {"n_steps": 20, "batch_size": 80, "gradient_steps": 2, "n_epochs": 1, "policy_kwargs": {"net_arch": [4]}}
+NET = {
+    "n_steps": 20,
+    "batch_size": 80,
+    "gradient_steps": 2,
+    "n_epochs": 1,
+    "policy_kwargs": {"net_arch": [4]},
+}
 TINY = {
     "algo": "dagger",
     "env": "QuadStateRecovery-v0",
@@ -41,7 +49,12 @@ TINY = {
 }
 
 
-STAGE = {"name": "one", "algo": "dagger", "env": "QuadStateRecovery-v0", "settings": {**NET, "n_timesteps": 160, "n_envs": 4}}
+STAGE = {
+    "name": "one",
+    "algo": "dagger",
+    "env": "QuadStateRecovery-v0",
+    "settings": {**NET, "n_timesteps": 160, "n_envs": 4},
+}
 
 
 class Fails(BaseCallback):
@@ -80,7 +93,9 @@ def write(path, **keys):
     seeds=st.lists(st.integers(0, 99), min_size=1, max_size=3, unique=True),
 )
 def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
-    runs = expand(spec(seed=seeds, grid={"env_kwargs.noise": noise, "hyperparams.learning_rate": rate}))
+    runs = expand(
+        spec(seed=seeds, grid={"env_kwargs.noise": noise, "hyperparams.learning_rate": rate})
+    )
     settings = [(run.stages[0].settings, run.seed) for run in runs]
     found = [(each["env_kwargs"]["noise"], each["learning_rate"], seed) for each, seed in settings]
     assert found == list(itertools.product(noise, rate, seeds))
@@ -89,11 +104,22 @@ def test_the_runs_are_the_product_of_grid_and_seeds(noise, rate, seeds):
 
 
 def test_entries_of_a_list_have_their_names_and_inherit():
-    own = [{"name": "calm", "env_kwargs": {"noise": 0}}, {"hyperparams": {"n_epochs": 2}, "eval_freq": "1e3"}]
+    own = [
+        {"name": "calm", "env_kwargs": {"noise": 0}},
+        {"hyperparams": {"n_epochs": 2}, "eval_freq": "1e3"},
+    ]
     calm, other = expand(spec(configurations=own))
     settings, others = calm.stages[0].settings, other.stages[0].settings
-    assert calm.name == "calm/seed_0" and settings["env_kwargs"]["noise"] == 0 and settings["n_epochs"] == 1
-    assert others["n_epochs"] == 2 and others["n_steps"] == NET["n_steps"] and other.job["eval_freq"] == 1000
+    assert (
+        calm.name == "calm/seed_0"
+        and settings["env_kwargs"]["noise"] == 0
+        and settings["n_epochs"] == 1
+    )
+    assert (
+        others["n_epochs"] == 2
+        and others["n_steps"] == NET["n_steps"]
+        and other.job["eval_freq"] == 1000
+    )
 
 
 @pytest.mark.parametrize(
@@ -107,7 +133,11 @@ def test_entries_of_a_list_have_their_names_and_inherit():
         ({"grid": {"vehicle": ["itm", "no-such"]}}, [], "no-such"),
         ({"seed": []}, [], "seed"),
         ({"seed": -1}, [], "seed.0: Input should be greater than or equal to 0"),
-        ({"configurations": [{"name": "a"}, {"name": "a"}]}, [], "two configurations are called 'a'"),
+        (
+            {"configurations": [{"name": "a"}, {"name": "a"}]},
+            [],
+            "two configurations are called 'a'",
+        ),
         ({"eval_freq": "often"}, [], "eval_freq"),
         ({"evaluation": {"suite": "no-such"}}, [], "no-such"),
         ({"resources": {"num_cpus": -1}}, [], "num_cpus"),
@@ -116,7 +146,9 @@ def test_entries_of_a_list_have_their_names_and_inherit():
         ({}, ["--executor", "ray"], "pip install '.[ray]'"),
     ],
 )
-def test_bad_input_is_one_line_before_anything_is_trained(tmp_path, monkeypatch, capsys, keys, flags, words):
+def test_bad_input_is_one_line_before_anything_is_trained(
+    tmp_path, monkeypatch, capsys, keys, flags, words
+):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, "ray", None)
     assert main(["sweep", write(tmp_path / "s.yaml", **keys), *flags]) == 2
@@ -127,16 +159,31 @@ def test_bad_input_is_one_line_before_anything_is_trained(tmp_path, monkeypatch,
 
 def test_dry_run_lists_the_runs(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["sweep", write(tmp_path / "s.yaml", seed=[3, 4], grid={"algo": ["dagger"]}), "--dry-run"]) == 0
+    assert (
+        main(
+            [
+                "sweep",
+                write(tmp_path / "s.yaml", seed=[3, 4], grid={"algo": ["dagger"]}),
+                "--dry-run",
+            ]
+        )
+        == 0
+    )
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["dagger/seed_3", "dagger/seed_4", "2 runs of 1 configuration"]
+    assert [line.split(":")[0] for line in lines] == [
+        "dagger/seed_3",
+        "dagger/seed_4",
+        "2 runs of 1 configuration",
+    ]
     assert [path.name for path in tmp_path.iterdir()] == ["s.yaml"]
 
 
 @pytest.mark.parametrize("name", SWEEPS.names())
 def test_sweeps_of_the_package_expand(name, trained_runs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    shutil.copytree(trained_runs("dagger"), "logs/dagger/QuadTargetTracking-v0_1")  # from which `cloning` starts
+    shutil.copytree(
+        trained_runs("dagger"), "logs/dagger/QuadTargetTracking-v0_1"
+    )  # from which `cloning` starts
     assert {run.seed for run in expand(load_sweep(name))} == {0, 1, 2}
 
 
@@ -144,7 +191,9 @@ def test_who_is_better_is_known_where_it_is_clear():
     random = np.random.default_rng(0)
     common = random.normal(size=(1, 60))  # some episodes are harder, for all
     low, high = (common + random.normal(shift, 0.3, (3, 60)) for shift in (0.0, 1.0))
-    verdicts = [verdict(over_seeds(difference)) for difference in (high - low, low - high, low - low)]
+    verdicts = [
+        verdict(over_seeds(difference)) for difference in (high - low, low - high, low - low)
+    ]
     assert verdicts == ["better", "worse", "cannot tell"]
     interval = over_seeds(low)
     assert interval.low < low.mean() < interval.high and interval.value == pytest.approx(low.mean())
@@ -187,25 +236,39 @@ def test_a_sweep_trains_compares_and_goes_on_with_what_failed(tmp_path, monkeypa
     keys = {"hyperparams": {**NET, "callback": "test_sweep.Fails"}, "configurations": own}
     assert main(["sweep", write(tmp_path / "s.yaml", **keys), "--no-progress"]) == 1
     output = capsys.readouterr()
-    assert "failed: noisy/seed_0: ValueError: too noisy" in output.err and "1 of 2 runs finished, 1 failed" in output.out
+    assert (
+        "failed: noisy/seed_0: ValueError: too noisy" in output.err
+        and "1 of 2 runs finished, 1 failed" in output.out
+    )
     place = SweepFolder("logs/sweep/s_1")
     before = {path: path.read_bytes() for path in place.path.rglob("records/one/*")}
     monkeypatch.setattr(Fails, "limit", 1.0)
     assert main(["sweep", "--resume", str(place.path), "--no-progress"]) == 0
     assert all(path.read_bytes() == content for path, content in before.items())
     output = capsys.readouterr().out
-    assert "noisy/seed_0: failed before (ValueError: too noisy)" in output and "one than noisy" in output
+    assert (
+        "noisy/seed_0: failed before (ValueError: too noisy)" in output
+        and "one than noisy" in output
+    )
     found = json.loads((place.path / "results.json").read_text())
-    assert list(found["configurations"]) == ["one", "noisy"] and found["finished"] == 2 and not found["failed"]
+    assert (
+        list(found["configurations"]) == ["one", "noisy"]
+        and found["finished"] == 2
+        and not found["failed"]
+    )
     assert {each["measure"] for each in found["comparisons"]} == {"success", "reward"}
     assert len((place.path / "results.csv").read_text().splitlines()) == 5  # two scenarios each
-    assert (place.path / "report.html").is_file() and "one (1 seed)" in (place.path / "report.md").read_text()
+    assert (place.path / "report.html").is_file() and "one (1 seed)" in (
+        place.path / "report.md"
+    ).read_text()
 
 
 def test_resuming_rereads_no_settings_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sb3_quad.executors.start_executor", Inline)
-    (tmp_path / "two.yml").write_text(json.dumps({"stages": [STAGE, {**STAGE, "name": "two", "seed_offset": 1}]}))
+    (tmp_path / "two.yml").write_text(
+        json.dumps({"stages": [STAGE, {**STAGE, "name": "two", "seed_offset": 1}]})
+    )
     keys = {"algo": None, "env": None, "n_timesteps": None, "conf_file": "two.yml"}
     plan = Plan(spec=spec(**keys), runs=tuple(expand(spec(**keys))))
     place = SweepFolder("logs/s_1")
@@ -245,29 +308,74 @@ def test_calls_that_were_cancelled_are_not_waited_for():
 def test_a_sweep_gives_what_train_gives(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     keys = {"env_kwargs": {"noise": 0.05}, "seed": [0, 1]}
-    assert main(["sweep", write(tmp_path / "s.yaml", **keys), "--workers", "2", "--no-progress"]) == 0
+    assert (
+        main(["sweep", write(tmp_path / "s.yaml", **keys), "--workers", "2", "--no-progress"]) == 0
+    )
     place = SweepFolder("logs/sweep/s_1")
     records = place.records(place.read().runs)
-    hyperparams = ["n_steps:20", "batch_size:80", "gradient_steps:2", "n_epochs:1", "policy_kwargs:dict(net_arch=[4])"]
-    single = ["--algo", "dagger", "--env", "QuadStateRecovery-v0", "-n", "160", "--n-envs", "4", "--eval-episodes", "0"]
-    command = ["train", *single, "--hyperparams", *hyperparams, "--env-kwargs", "noise:0.05", "--seed", "1"]
+    hyperparams = [
+        "n_steps:20",
+        "batch_size:80",
+        "gradient_steps:2",
+        "n_epochs:1",
+        "policy_kwargs:dict(net_arch=[4])",
+    ]
+    single = [
+        "--algo",
+        "dagger",
+        "--env",
+        "QuadStateRecovery-v0",
+        "-n",
+        "160",
+        "--n-envs",
+        "4",
+        "--eval-episodes",
+        "0",
+    ]
+    command = [
+        "train",
+        *single,
+        "--hyperparams",
+        *hyperparams,
+        "--env-kwargs",
+        "noise:0.05",
+        "--seed",
+        "1",
+    ]
     assert main([*command, "--num-threads", "1", "-f", "alone", "--no-progress"]) == 0
     alone = digest(Path("alone/dagger/QuadStateRecovery-v0_1/QuadStateRecovery-v0.zip"))
     assert alone == records["dagger/seed_1"].weights != records["dagger/seed_0"].weights
 
 
 def start(folder, *arguments):
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]), "SLOW": "0.5"}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]),
+        "SLOW": "0.5",
+    }
     command = [sys.executable, "-m", "sb3_quad.cli", "sweep", *arguments, "--no-progress"]
-    return subprocess.Popen(command, cwd=folder, env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT)
+    return subprocess.Popen(
+        command,
+        cwd=folder,
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("sb3_quad.executors.start_executor", Inline)  # one thread, as workers have: equal bits
-    keys = {"seed": [0, 1, 2], "n_timesteps": 400, "hyperparams": {**NET, "callback": "test_sweep.Slow"}}
+    monkeypatch.setattr(
+        "sb3_quad.executors.start_executor", Inline
+    )  # one thread, as workers have: equal bits
+    keys = {
+        "seed": [0, 1, 2],
+        "n_timesteps": 400,
+        "hyperparams": {**NET, "callback": "test_sweep.Slow"},
+    }
     file = write(tmp_path / "s.yaml", **keys)
     tables = []
     for k, number in enumerate((signal.SIGKILL, signal.SIGTERM), start=1):
@@ -282,7 +390,10 @@ def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatc
         kept = {path: path.read_bytes() for path in records.rglob("*.json")}
         assert 0 < len(kept) < 3, output
         if number == signal.SIGTERM:
-            assert f"{len(kept)} of 3 runs finished" in output and (tmp_path / f"logs/sweep/s_{k}/results.csv").is_file()
+            assert (
+                f"{len(kept)} of 3 runs finished" in output
+                and (tmp_path / f"logs/sweep/s_{k}/results.csv").is_file()
+            )
         assert main(["sweep", "--resume", f"logs/sweep/s_{k}", "--no-progress"]) == 0
         assert {path: path.read_bytes() for path in kept} == kept
         tables.append((tmp_path / f"logs/sweep/s_{k}/results.json").read_text())
@@ -291,6 +402,10 @@ def test_a_driver_that_is_ended_goes_on_with_the_same_table(tmp_path, monkeypatc
 
 
 def test_a_grid_fills_what_a_configuration_leaves_empty():
-    data = {"algo": "dagger", "env": "QuadStateRecovery-v0", "configurations": [{"name": "one", "env_kwargs": None}]}
+    data = {
+        "algo": "dagger",
+        "env": "QuadStateRecovery-v0",
+        "configurations": [{"name": "one", "env_kwargs": None}],
+    }
     runs = expand(SweepSpec(**data, grid={"env_kwargs.noise": [0.0, 0.1]}))
     assert [run.stages[0].settings["env_kwargs"]["noise"] for run in runs] == [0.0, 0.1]

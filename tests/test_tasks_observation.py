@@ -1,4 +1,6 @@
-"""Tasks, observations and random numbers: what the compiled array functions must be, worked out again in numpy."""
+"""Tasks, observations and random numbers: what the compiled array functions must be, worked out
+again in numpy.
+"""
 
 import math
 
@@ -13,7 +15,15 @@ from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.observation import DEFAULT_STD, FEATURE_NAMES, GROUPS, OBSERVATION_SIZE
 from sb3_quad.simulation.random import EPISODE, STEP, philox
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, ROTOR_SPEEDS, TARGET, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    ROTOR_SPEEDS,
+    TARGET,
+    VELOCITY,
+    QuadcopterState,
+)
 from sb3_quad.simulation.tasks import SCORED, TASK, T, Task, resolve_tasks
 from sb3_quad.vehicles.vehicle import load_vehicle
 
@@ -23,7 +33,9 @@ NOISE = {"relative": 0.05, "additive": 0.1}
 
 def start(n, task, seed=0, **task_kwargs):
     """n rows at the start of their first episode."""
-    rows = QuadcopterBatch(n, FlightSettings(task=task, task_kwargs=task_kwargs), n_threads=1, autoreset=False)
+    rows = QuadcopterBatch(
+        n, FlightSettings(task=task, task_kwargs=task_kwargs), n_threads=1, autoreset=False
+    )
     rows.seed(range(seed, seed + n))
     rows.reset()
     return rows
@@ -57,7 +69,9 @@ def test_philox_gives_the_published_numbers(word, expected):
 def noise_of(n, steps, task="state_recovery"):
     """Standard normals as they come out of observations, (steps, n, 15)."""
     rows = start(n, task)
-    clean = observations(rows, 0.0)[:, 3:].astype(np.float64)  # the first three are zero in state recovery
+    clean = observations(rows, 0.0)[:, 3:].astype(
+        np.float64
+    )  # the first three are zero in state recovery
     normals = []
     for _ in range(steps):
         rows.streams[STEP] += 1
@@ -107,7 +121,9 @@ def test_features_in_their_order():
 
 
 def test_additive_noise_does_not_vanish_at_the_target():
-    env, plain = (QuadcopterVecEnv(4000, task="state_recovery", noise=noise, seed=0) for noise in (NOISE, 0.0))
+    env, plain = (
+        QuadcopterVecEnv(4000, task="state_recovery", noise=noise, seed=0) for noise in (NOISE, 0.0)
+    )
     seen, true = env.reset(), plain.reset()
     assert np.std(seen[:, :3]) == pytest.approx(0.1, rel=0.03)  # r = r_T there, in σ
     spread = np.hypot(0.05 * true[:, 12:], 0.1)
@@ -125,7 +141,9 @@ def test_noise_is_the_same_on_pybullet_and_for_short():
         action = np.full((1, 4), 0.1, np.float32)
         seen = batch.step(action)[0][0], single.step(action[0])[0]
     single.close()
-    first, second = (QuadcopterVecEnv(8, noise=noise, seed=1).reset() for noise in (0.05, {"relative": 0.05}))
+    first, second = (
+        QuadcopterVecEnv(8, noise=noise, seed=1).reset() for noise in (0.05, {"relative": 0.05})
+    )
     np.testing.assert_array_equal(first, second)
     assert FlightSettings(noise=0.1).model_dump(mode="json")["noise"] == 0.1
 
@@ -156,11 +174,15 @@ def test_state_recovery_starts():
     np.testing.assert_allclose(rotation.mean(axis=0), 0.0, atol=5 * math.sqrt(1 / 3 / 8_000))
     angle = np.arccos(np.clip((np.trace(rotation, axis1=1, axis2=2) - 1) / 2, -1, 1))
     for theta in (0.5, 1.0, 2.0, 3.0):  # uniform on SO(3): P(angle < θ) = (θ - sin θ) / π
-        assert (angle < theta).mean() == pytest.approx((theta - math.sin(theta)) / math.pi, abs=0.02)
+        assert (angle < theta).mean() == pytest.approx(
+            (theta - math.sin(theta)) / math.pi, abs=0.02
+        )
     for values, std in ((state.velocity, 2.0), (state.body_rates, 4.0)):
         np.testing.assert_allclose(values.mean(axis=0), 0.0, atol=5 * std / math.sqrt(8_000))
         np.testing.assert_allclose(values.std(axis=0), std, rtol=5 / math.sqrt(2 * 8_000))
-    together = np.corrcoef(np.concatenate([rows.state[QUATERNION], rows.state[VELOCITY.start : BODY_RATES.stop]]))
+    together = np.corrcoef(
+        np.concatenate([rows.state[QUATERNION], rows.state[VELOCITY.start : BODY_RATES.stop]])
+    )
     assert np.abs(together - np.eye(10)).max() < 0.04
 
 
@@ -178,7 +200,9 @@ def test_targets_are_never_below_ground(distance):
 def test_targets_near_and_far():
     rows = start(8_000, "recovery_and_tracking")
     state = QuadcopterState(rows.state)
-    assert np.quantile(state.distance, [0.0, 0.25, 0.5, 0.75, 1.0]) == pytest.approx([0, 6.25, 12.5, 18.75, 25], abs=0.5)
+    assert np.quantile(state.distance, [0.0, 0.25, 0.5, 0.75, 1.0]) == pytest.approx(
+        [0, 6.25, 12.5, 18.75, 25], abs=0.5
+    )
     assert np.linalg.norm(state.velocity, axis=1).min() > 0.0
     state = QuadcopterState(start(8_000, "far_tracking").state)
     assert np.quantile(state.distance, [0.0, 0.5, 1.0]) == pytest.approx([10, 17.5, 25], abs=0.3)
@@ -191,8 +215,17 @@ def test_a_reset_touches_the_rows_it_names_and_counts_their_episodes():
     rows.streams[STEP] = 9
     rows.reset(np.array([1, 3]))
     np.testing.assert_array_equal(rows.state[:, [0, 2, 4]], before[:, [0, 2, 4]])
-    assert (rows.state[QUATERNION.start : BODY_RATES.stop, [1, 3]] != before[QUATERNION.start : BODY_RATES.stop, [1, 3]]).all()
-    assert rows.streams[EPISODE].tolist() == [1, 2, 1, 2, 1] and rows.streams[STEP].tolist() == [9, 0, 9, 0, 9]
+    assert (
+        rows.state[QUATERNION.start : BODY_RATES.stop, [1, 3]]
+        != before[QUATERNION.start : BODY_RATES.stop, [1, 3]]
+    ).all()
+    assert rows.streams[EPISODE].tolist() == [1, 2, 1, 2, 1] and rows.streams[STEP].tolist() == [
+        9,
+        0,
+        9,
+        0,
+        9,
+    ]
     np.testing.assert_array_equal(rows.streams[:2], streams[:2])
 
 
@@ -219,7 +252,9 @@ def test_reward_and_ends_of_each_task():
     tilt_cost = np.where(rows.task_index == 1, 0.5, 0.002)
     collided, away = state.position[:, 2] <= 0.135, state.distance > 30.0
     assert 3 < collided.sum() < 100 and 3 < away.sum() < 100
-    expected = -0.003 * state.distance - tilt_cost * np.arccos(np.clip(state.rotation[:, 2, 2], -1, 1))
+    expected = -0.003 * state.distance - tilt_cost * np.arccos(
+        np.clip(state.rotation[:, 2, 2], -1, 1)
+    )
     expected -= 0.0005 * np.linalg.norm(state.body_rates, axis=1) + 15.0 * collided + 15.0 * away
     np.testing.assert_allclose(got["reward"], expected, atol=1e-12)
     np.testing.assert_allclose(got["distance"], state.distance)
@@ -230,15 +265,26 @@ def test_reward_and_ends_of_each_task():
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.7, math.pi / 2, 2.5, math.pi - 1e-6, math.pi])
 def test_tilt_is_exact_at_every_angle(angle):
     rows = start(1, "target_tracking", tilt_cost=1.0, position_cost=0.0, body_rates_cost=0.0)
-    rows.state[QUATERNION, 0] = math.cos(angle / 2), 0.6 * math.sin(angle / 2), 0.8 * math.sin(angle / 2), 0.0
+    rows.state[QUATERNION, 0] = (
+        math.cos(angle / 2),
+        0.6 * math.sin(angle / 2),
+        0.8 * math.sin(angle / 2),
+        0.0,
+    )
     assert scores(rows)["reward"][0] == pytest.approx(-angle, rel=1e-12, abs=1e-12)
 
 
 def test_precision_is_half_due_at_its_range_and_steepest_at_the_target():
     rows = start(3, "target_tracking", precision_cost=0.02, precision_range=0.3, position_cost=0.0)
-    rows.state[POSITION] = rows.state[TARGET] + np.array([-0.001, -0.3, -8.7]) * np.array([[0.0], [0.0], [1.0]])
+    rows.state[POSITION] = rows.state[TARGET] + np.array([-0.001, -0.3, -8.7]) * np.array(
+        [[0.0], [0.0], [1.0]]
+    )
     near, middle, far = scores(rows)["reward"]
-    assert near == pytest.approx(-0.02 * 0.001 / 0.3, rel=0.01) and middle == pytest.approx(-0.01) and far > -0.02
+    assert (
+        near == pytest.approx(-0.02 * 0.001 / 0.3, rel=0.01)
+        and middle == pytest.approx(-0.01)
+        and far > -0.02
+    )
 
 
 # --- tasks as data
@@ -248,7 +294,9 @@ def test_task_specifications():
     own = Task(name="own", target_distance=3.0)
     np.testing.assert_array_equal(resolve_tasks(own)[0], own.parameters()[None])
     assert list(TASK)[-len(SCORED) :] == SCORED  # the kernel copies them as one piece
-    parameters, weights = resolve_tasks({"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50})
+    parameters, weights = resolve_tasks(
+        {"target_tracking": 1, "state_recovery": 3}, {"max_distance": 50}
+    )
     assert weights.tolist() == [0.25, 1.0]
     assert parameters[:, T.max_distance].tolist() == [50.0, 50.0]
     assert parameters.shape == (2, sum(TASK.values()))

@@ -1,4 +1,6 @@
-"""Settings: what rl-zoo's YAML may hold arrives as the algorithm's arguments; everything else is one clear error."""
+"""Settings: what rl-zoo's YAML may hold arrives as the algorithm's arguments; everything else is
+one clear error.
+"""
 
 import inspect
 from typing import Any, Literal, Optional
@@ -50,7 +52,10 @@ def test_linear_schedules_are_sb3s_own(start):
     ],
 )
 def test_policy_kwargs_in_every_spelling(given_kwargs):
-    assert build(policy_kwargs=given_kwargs).policy_kwargs == {"net_arch": [64, 64], "activation_fn": nn.Tanh}
+    assert build(policy_kwargs=given_kwargs).policy_kwargs == {
+        "net_arch": [64, 64],
+        "activation_fn": nn.Tanh,
+    }
 
 
 @pytest.mark.parametrize(
@@ -115,8 +120,13 @@ def test_bad_settings_are_named(settings, message):
 
 @pytest.mark.parametrize("algo", ["dagger", "ppo_bc", "ppo"])
 @pytest.mark.parametrize("n_timesteps", [1000, 60_000, 130_000, 6_000_000])
-def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_trained(algo, n_timesteps):
-    config, shipped = load_config(algo, ENV, None, {"n_timesteps": n_timesteps}), load_config(algo, ENV)
+def test_a_budget_of_less_than_a_rollout_shortens_it_and_the_line_says_what_is_trained(
+    algo, n_timesteps
+):
+    config, shipped = (
+        load_config(algo, ENV, None, {"n_timesteps": n_timesteps}),
+        load_config(algo, ENV),
+    )
     rollout = config.hyperparams["n_steps"] * config.n_envs
     assert rollout < n_timesteps + config.n_envs and config.hyperparams["batch_size"] <= rollout
     longest = shipped.hyperparams["n_steps"] * shipped.n_envs
@@ -143,14 +153,26 @@ def test_unknown_names_come_with_the_nearest():
 
 def test_whole_numbers_may_be_written_as_powers():
     config = build(n_timesteps="1e6", n_envs=4.0, n_steps="2_000")
-    assert (config.n_timesteps, config.n_envs, config.hyperparams["n_steps"]) == (1_000_000, 4, 2000)
+    assert (config.n_timesteps, config.n_envs, config.hyperparams["n_steps"]) == (
+        1_000_000,
+        4,
+        2000,
+    )
     assert isinstance(config.hyperparams["n_steps"], int)
 
 
 def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
     path = tmp_path / "mine.yml"
     path.write_text(
-        yaml.safe_dump({ENV: {"n_timesteps": 10_000, "gamma": 0.9, "env_kwargs": {"noise": 0.1, "vehicle": "itm"}}})
+        yaml.safe_dump(
+            {
+                ENV: {
+                    "n_timesteps": 10_000,
+                    "gamma": 0.9,
+                    "env_kwargs": {"noise": 0.1, "vehicle": "itm"},
+                }
+            }
+        )
     )
     config = load_config("ppo", ENV, path, {"gamma": 0.8, "env_kwargs": {"noise": 0}})
     assert config.hyperparams == {"gamma": 0.8}
@@ -160,17 +182,28 @@ def test_overrides_go_over_the_file_and_into_env_kwargs(tmp_path):
 
 
 def test_settings_can_be_written_and_read_again():
-    config = load_config("dagger", ENV, None, {"policy_kwargs": parse_value("dict(net_arch=(8, 8), activation_fn=nn.ReLU)")})
+    config = load_config(
+        "dagger",
+        ENV,
+        None,
+        {"policy_kwargs": parse_value("dict(net_arch=(8, 8), activation_fn=nn.ReLU)")},
+    )
     again = build_config("dagger", ENV, yaml.safe_load(yaml.safe_dump(config.settings)))
     assert again.policy_kwargs["activation_fn"] is nn.ReLU
     assert repr(sorted(again.hyperparams.items())) == repr(sorted(config.hyperparams.items()))
 
 
-@pytest.mark.parametrize("algorithm", [A2C, DDPG, DQN, PPO, SAC, TD3, *map(get_algorithm, ALGORITHMS)])
+@pytest.mark.parametrize(
+    "algorithm", [A2C, DDPG, DQN, PPO, SAC, TD3, *map(get_algorithm, ALGORITHMS)]
+)
 def test_the_types_of_every_algorithm_are_resolved(algorithm):
     parameters = constructor_parameters(algorithm)
     assert not [name for name, parameter in parameters.items() if parameter.annotation is Any]
-    given = {name: parameter for name, parameter in parameters.items() if parameter.default is not parameter.empty}
+    given = {
+        name: parameter
+        for name, parameter in parameters.items()
+        if parameter.default is not parameter.empty
+    }
     assert {name: convert(each.default, each, name) for name, each in given.items()} == {
         name: each.default for name, each in given.items()
     }
@@ -179,10 +212,14 @@ def test_the_types_of_every_algorithm_are_resolved(algorithm):
 
 
 def test_the_types_are_resolved_whichever_algorithm_is_asked_first():
-    """A name that SB3 leaves as a string is resolved once for the process; here nobody has done so yet."""
+    """A name that SB3 leaves as a string is resolved once for the process; here nobody has done so
+    yet.
+    """
 
     class Own(PPO):
-        def __init__(self, policy: str, env: Optional["VecEnv"], learning_rate: float = 0.1) -> None:  # noqa: F821
+        def __init__(
+            self, policy: str, env: Optional["VecEnv"], learning_rate: float = 0.1
+        ) -> None:  # noqa: F821
             raise NotImplementedError
 
     assert constructor_parameters(Own)["learning_rate"].annotation is float
@@ -202,7 +239,9 @@ def test_the_types_are_resolved_whichever_algorithm_is_asked_first():
     ],
 )
 def test_a_value_becomes_what_its_type_says(kind, value, expected):
-    found = convert(value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x")
+    found = convert(
+        value, inspect.Parameter("x", inspect.Parameter.KEYWORD_ONLY, annotation=kind), "x"
+    )
     assert found == expected and type(found) is type(expected)
 
 
@@ -223,7 +262,9 @@ def test_a_value_of_another_type_is_refused(kind, value, message):
 PIPELINES = "two_stage.yml", "imitation.yml", "robust/crazyflie.yml", THESIS
 
 
-@pytest.mark.parametrize("name", [name for name in SETTINGS.names() if not name.endswith(PIPELINES)])
+@pytest.mark.parametrize(
+    "name", [name for name in SETTINGS.names() if not name.endswith(PIPELINES)]
+)
 def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of_tasks(name):
     algo = name.rpartition("/")[2].removesuffix(".yml").replace("reference", "ppo_bc")
     assert {*ENVIRONMENTS} <= SETTINGS.read(name)[0].keys()
@@ -239,22 +280,38 @@ def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of
 @pytest.mark.parametrize("env_id", ENVIRONMENTS)
 def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_id):
     for algo in ("dagger", "ppo_bc"):
-        assert load_config(algo, env_id, f"robust/{algo}.yml").expert == "told_cautious"  # in random worlds
+        assert (
+            load_config(algo, env_id, f"robust/{algo}.yml").expert == "told_cautious"
+        )  # in random worlds
         assert load_config(algo, env_id, f"nominal/{algo}.yml").expert == "geometric"
-        assert load_config(algo, env_id).expert == load_config("sac_bc", env_id).expert == DEFAULT_EXPERT == "pid"
+        assert (
+            load_config(algo, env_id).expert
+            == load_config("sac_bc", env_id).expert
+            == DEFAULT_EXPERT
+            == "pid"
+        )
         assert build_config(algo, env_id, MINIMAL).expert == DEFAULT_EXPERT
-        assert build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT  # which config.yml then names
+        assert (
+            build_config(algo, env_id, MINIMAL).settings["expert"] == DEFAULT_EXPERT
+        )  # which config.yml then names
         assert load_config(algo, env_id, f"thesis/{algo}.yml").expert == "pid"
-    robust = dict.fromkeys((DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "told_cautious")
+    robust = dict.fromkeys(
+        (DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "told_cautious"
+    )
     pipelines = {**robust, "nominal/two_stage.yml": "geometric"}
     for file, expert in {**pipelines, THESIS: "pid", "thesis/two_stage.yml": "pid"}.items():
         stages = load_pipeline(file).stages
-        assert {load_config(each.algo, each.env, each.conf_file, each.settings).expert for each in stages} == {expert}
+        assert {
+            load_config(each.algo, each.env, each.conf_file, each.settings).expert
+            for each in stages
+        } == {expert}
 
 
 def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
     pipeline = load_pipeline("thesis/two_stage.yml")
-    configs = {each.name: load_config(each.algo, each.env, each.conf_file) for each in pipeline.stages}
+    configs = {
+        each.name: load_config(each.algo, each.env, each.conf_file) for each in pipeline.stages
+    }
     configs["PPO only"] = load_config("ppo_bc", "QuadStateRecovery-v0", "thesis/reference.yml")
     batches = {"IL-agent": 8, "RL-agent": 3, "PPO only": 3}
     epochs = {"IL-agent": 12, "RL-agent": 6, "PPO only": 6}
@@ -262,19 +319,42 @@ def test_the_printed_recipe_holds_every_value_of_tables_a3_and_a4():
     for name, config in configs.items():
         used = config.hyperparams
         assert (config.n_envs, used["n_steps"]) == (240, 1500)
-        assert config.n_envs * used["n_steps"] / used["batch_size"] == batches[name] and used["n_epochs"] == epochs[name]
+        assert (
+            config.n_envs * used["n_steps"] / used["batch_size"] == batches[name]
+            and used["n_epochs"] == epochs[name]
+        )
         assert config.n_timesteps == rollouts[name] * 240 * 1500
-        assert (used["gamma"], used["gae_lambda"], used["vf_coef"], used["l2_coef"]) == (0.998, 0.95, 0.5, 1e-4)
+        assert (used["gamma"], used["gae_lambda"], used["vf_coef"], used["l2_coef"]) == (
+            0.998,
+            0.95,
+            0.5,
+            1e-4,
+        )
         assert (used["max_grad_norm"], used["clip_range_vf"], used["shuffle"]) == (0.5, 0.2, False)
-        assert config.policy_kwargs["net_arch"] == [64, 64] and config.policy_kwargs["activation_fn"] is nn.Tanh  # 4.2
+        assert (
+            config.policy_kwargs["net_arch"] == [64, 64]
+            and config.policy_kwargs["activation_fn"] is nn.Tanh
+        )  # 4.2
     imitated = configs["IL-agent"].hyperparams
     assert (imitated["beta"], imitated["beta_final"], imitated["beta_decay"]) == (0.5, 0.3, 0.001)
     assert (imitated["learning_rate"], imitated["ent_coef"]) == (5e-5, 5e-4)
     assert (imitated["bc_loss"], imitated["dataset_capacity"]) == ("nll", 0)
     for name, c_bc in {"RL-agent": 0.005, "PPO only": 0.0}.items():
         used = configs[name].hyperparams
-        assert (used["learning_rate"], used["clip_range"], used["ent_coef"], used["bc_coef"]) == (7.5e-4, 0.2, 1e-4, c_bc)
-    assert (configs["RL-agent"].hyperparams["bc_loss"], configs["RL-agent"].expert) == ("nll", "pid")
+        assert (used["learning_rate"], used["clip_range"], used["ent_coef"], used["bc_coef"]) == (
+            7.5e-4,
+            0.2,
+            1e-4,
+            c_bc,
+        )
+    assert (configs["RL-agent"].hyperparams["bc_loss"], configs["RL-agent"].expert) == (
+        "nll",
+        "pid",
+    )
     reward = TASKS["state_recovery"]
-    assert (reward.position_cost, reward.tilt_cost, reward.body_rates_cost) == (0.003, 0.002, 0.0005)
+    assert (reward.position_cost, reward.tilt_cost, reward.body_rates_cost) == (
+        0.003,
+        0.002,
+        0.0005,
+    )
     assert (reward.collision_cost, reward.out_of_range_cost) == (15.0, 15.0)

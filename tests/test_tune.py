@@ -1,4 +1,6 @@
-"""The search for hyperparameters: trials that are trainings, in a study that is shared, resumed and never lost."""
+"""The search for hyperparameters: trials that are trainings, in a study that is shared, resumed and
+never lost.
+"""
 
 import csv
 import os
@@ -34,17 +36,32 @@ SMALL = {
     "policy_kwargs": "dict(net_arch=[8])",
     "env_kwargs": {"max_episode_steps": 60},
 }
-SPACE = {"learning_rate": {"around": 4}, "bc_loss": ["mse", "huber"], "policy_kwargs.log_std_init": {"low": -3, "high": 0}}
+SPACE = {
+    "learning_rate": {"around": 4},
+    "bc_loss": ["mse", "huber"],
+    "policy_kwargs.log_std_init": {"low": -3, "high": 0},
+}
 FEW = ["--eval-episodes", "4", "--n-evaluations", "2", "--no-progress", "--sampler", "random"]
 
 
 @pytest.fixture
 def command(tmp_path, monkeypatch):
-    """A search in an empty folder, of a few hundred timesteps a trial; the settings and the space are files there."""
+    """A search in an empty folder, of a few hundred timesteps a trial; the settings and the space
+    are files there.
+    """
     monkeypatch.chdir(tmp_path)
     Path("small.yml").write_text(yaml.safe_dump({ENV: SMALL}))
     Path("space.yml").write_text(yaml.safe_dump(SPACE))
-    return ["tune", "--algo", "dagger", "--conf-file", "small.yml", "--search-space", "space.yml", *FEW]
+    return [
+        "tune",
+        "--algo",
+        "dagger",
+        "--conf-file",
+        "small.yml",
+        "--search-space",
+        "space.yml",
+        *FEW,
+    ]
 
 
 def folder(number=1):
@@ -57,7 +74,11 @@ def trials(number=1):
 
 
 def one_line_of_error(capsys):
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("sb3_quad: compiling")]
+    lines = [
+        line
+        for line in capsys.readouterr().err.splitlines()
+        if not line.startswith("sb3_quad: compiling")
+    ]
     assert len(lines) == 1 and lines[0].startswith("error: "), lines
     return lines[0]
 
@@ -73,33 +94,65 @@ def varied(row):
 def test_a_search_leaves_settings_that_train_takes_and_goes_on_where_it_was_left(command, capsys):
     assert main([*command, "--n-trials", "2", "--seed", "3"]) == 0
     output = capsys.readouterr().out
-    assert "2 finished" in output and "fresh episodes" in output and str(folder() / "best.yml") in output
+    assert (
+        "2 finished" in output
+        and "fresh episodes" in output
+        and str(folder() / "best.yml") in output
+    )
     files = {path.name for path in folder().iterdir()}
     assert files == {"best.yml", "trials.csv", "study.log", "dagger"}
 
     rows = trials()
-    assert [row["state"] for row in rows] == ["COMPLETE"] * 2 and [row["evaluations"] for row in rows] == ["2"] * 2
+    assert [row["state"] for row in rows] == ["COMPLETE"] * 2 and [
+        row["evaluations"] for row in rows
+    ] == ["2"] * 2
     best = max(rows, key=lambda row: float(row["value"]))
     content = yaml.safe_load((folder() / "best.yml").read_text())[ENV]
-    assert content["learning_rate"] == best["learning_rate"] and content["learning_rate"].startswith("lin_")
+    assert content["learning_rate"] == best["learning_rate"] and content[
+        "learning_rate"
+    ].startswith("lin_")
     assert len(content["learning_rate"]) <= len("lin_0.0001234")
     assert str(content["policy_kwargs"]["log_std_init"]) == best["policy_kwargs.log_std_init"]
     assert content["policy_kwargs"]["net_arch"] == [8] and content["n_timesteps"] == 800
     assert PPO.load(Path(best["run"]) / f"{ENV}.zip").num_timesteps == 800
     with np.load(Path(best["run"]) / "evaluations.npz") as file:
         assert file["timesteps"].tolist() == [400, 800]
-        assert float(best["value"]) == score(file["successes"][-1].mean(), file["results"][-1].mean(), 4)
+        assert float(best["value"]) == score(
+            file["successes"][-1].mean(), file["results"][-1].mean(), 4
+        )
 
-    assert main(["train", "--algo", "dagger", "--conf-file", str(folder() / "best.yml"), "--eval-episodes", "0"]) == 0
+    assert (
+        main(
+            [
+                "train",
+                "--algo",
+                "dagger",
+                "--conf-file",
+                str(folder() / "best.yml"),
+                "--eval-episodes",
+                "0",
+            ]
+        )
+        == 0
+    )
     trained = PPO.load(Path("logs", "dagger", f"{ENV}_1", f"{ENV}.zip"))
-    assert trained.policy.net_arch == [8] and trained.policy_kwargs["log_std_init"] == content["policy_kwargs"]["log_std_init"]
+    assert (
+        trained.policy.net_arch == [8]
+        and trained.policy_kwargs["log_std_init"] == content["policy_kwargs"]["log_std_init"]
+    )
 
-    before = {path: path.read_bytes() for path in folder().rglob("*") if path.is_file() and path.name != "study.log"}
+    before = {
+        path: path.read_bytes()
+        for path in folder().rglob("*")
+        if path.is_file() and path.name != "study.log"
+    }
     resumed = [*command, "--n-trials", "1", "--seed", "3", "--storage", str(folder() / "study.log")]
     assert main(resumed) == 0
     assert main([*command, "--n-trials", "3", "--seed", "3"]) == 0
     assert all(path.read_bytes() == content for path, content in before.items())
-    assert [varied(row) for row in trials(2)] == [varied(row) for row in trials(3)]  # as if it had never been left
+    assert [varied(row) for row in trials(2)] == [
+        varied(row) for row in trials(3)
+    ]  # as if it had never been left
     assert [row["value"] for row in trials(2)] == [row["value"] for row in trials(3)]
     assert len({varied(row) for row in trials(3)}) == 3
 
@@ -111,7 +164,11 @@ def test_a_search_leaves_settings_that_train_takes_and_goes_on_where_it_was_left
 
 
 def test_the_first_trial_has_the_settings_as_they_are(command):
-    settings = {**SMALL, "policy_kwargs": "dict(net_arch=[8], log_std_init=-1.5)", "bc_loss": "huber"}
+    settings = {
+        **SMALL,
+        "policy_kwargs": "dict(net_arch=[8], log_std_init=-1.5)",
+        "bc_loss": "huber",
+    }
     Path("small.yml").write_text(yaml.safe_dump({ENV: settings}))
     assert main([*command, "--n-trials", "1"]) == 0
     assert varied(trials()[0]) == ("lin_0.001", "huber", "-1.5")
@@ -120,9 +177,15 @@ def test_the_first_trial_has_the_settings_as_they_are(command):
 @pytest.mark.slow
 def test_two_processes_share_a_study(command):
     shared = [*command, "--n-trials", "2", "--storage", "shared.log"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent.parent)}
+    environment = {
+        **os.environ,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONPATH": str(Path(__file__).parent.parent),
+    }
     arguments = [sys.executable, "-m", "sb3_quad.cli", *shared]
-    other = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+    other = subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment
+    )
     assert main(shared) == 0
     output, errors = other.communicate(timeout=120)
     assert other.returncode == 0, errors
@@ -136,11 +199,17 @@ def test_two_processes_share_a_study(command):
 
 
 def test_pruned_trials_end_early_and_are_never_the_best(command, monkeypatch, capsys):
-    monkeypatch.setitem(search_module.PRUNERS, "median", lambda *arguments: optuna.pruners.ThresholdPruner(lower=10.0))
+    monkeypatch.setitem(
+        search_module.PRUNERS,
+        "median",
+        lambda *arguments: optuna.pruners.ThresholdPruner(lower=10.0),
+    )
     assert main([*command, "--n-trials", "2"]) == 0
     assert "trial 0 pruned, success" in capsys.readouterr().out
     rows = trials()
-    assert [(row["state"], row["evaluations"], row["value"]) for row in rows] == [("PRUNED", "1", "")] * 2
+    assert [(row["state"], row["evaluations"], row["value"]) for row in rows] == [
+        ("PRUNED", "1", "")
+    ] * 2
     assert PPO.load(Path(rows[0]["run"]) / f"{ENV}.zip").num_timesteps == 400
     assert not (folder() / "best.yml").exists()
 
@@ -153,7 +222,9 @@ def test_a_trial_that_fails_is_told_and_the_others_go_on(command, capsys):
     assert failed and len(failed) < 5
     assert all(row["batch_size"] == "0" and "batch_size is 0" in row["error"] for row in failed)
     assert all(row["state"] == "COMPLETE" for row in rows if row["batch_size"] == "100")
-    assert f"ConfigError: trial {failed[0]['number']}: batch_size is 0, must be at least 1" in output
+    assert (
+        f"ConfigError: trial {failed[0]['number']}: batch_size is 0, must be at least 1" in output
+    )
     assert f"{len(failed)} failed" in output
 
 
@@ -179,7 +250,10 @@ def test_ctrl_c_keeps_what_is_finished_and_the_rest_is_tried_again(command, caps
     InterruptSecond.made = 0
     assert main([*command, "--n-trials", "9"]) == 130
     assert "1 finished, 1 failed" in capsys.readouterr().out
-    assert [(row["state"], row["error"]) for row in trials()] == [("COMPLETE", ""), ("FAIL", "interrupted")]
+    assert [(row["state"], row["error"]) for row in trials()] == [
+        ("COMPLETE", ""),
+        ("FAIL", "interrupted"),
+    ]
     assert (folder() / "best.yml").is_file()
     assert main([*command, "--n-trials", "1", "--storage", str(folder() / "study.log")]) == 0
     assert [row["state"] for row in trials(2)] == ["COMPLETE", "FAIL", "COMPLETE"]
@@ -190,19 +264,35 @@ def test_a_database_and_another_environment(command, capsys):
     pendulum = {"n_timesteps": 128, "n_envs": 2, "n_steps": 32, "batch_size": 32}
     Path("small.yml").write_text(yaml.safe_dump({"Pendulum-v1": pendulum}))
     Path("space.yml").write_text("n_minibatches: {low: 1, high: 4}\n")
-    known = ["--env", "Pendulum-v1", "--storage", "sqlite:///study.db", "--study-name", "swing", "--n-evaluations", "1"]
+    known = [
+        "--env",
+        "Pendulum-v1",
+        "--storage",
+        "sqlite:///study.db",
+        "--study-name",
+        "swing",
+        "--n-evaluations",
+        "1",
+    ]
     assert main([*command, "--algo", "ppo", *known, "--n-trials", "2", "--eval-episodes", "1"]) == 0
     with Path("logs/tune/ppo/Pendulum-v1_1/trials.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
-    assert [row["value"] for row in rows] == [row["mean_reward"] for row in rows]  # no success there: as in rl-zoo
+    assert [row["value"] for row in rows] == [
+        row["mean_reward"] for row in rows
+    ]  # no success there: as in rl-zoo
     study = optuna.load_study(study_name="swing", storage="sqlite:///study.db")
     assert len(study.trials) == 2
-    sizes = [yaml.safe_load((Path(row["run"]) / "Pendulum-v1" / "config.yml").read_text())["batch_size"] for row in rows]
+    sizes = [
+        yaml.safe_load((Path(row["run"]) / "Pendulum-v1" / "config.yml").read_text())["batch_size"]
+        for row in rows
+    ]
     assert sizes == [-(-64 // int(row["n_minibatches"])) for row in rows]
 
 
 def test_studies_of_others_are_refused_and_one_that_was_left_at_its_birth_is_begun(command, capsys):
-    storage = optuna.storages.JournalStorage(optuna.storages.journal.JournalFileBackend("studies.log"))
+    storage = optuna.storages.JournalStorage(
+        optuna.storages.journal.JournalFileBackend("studies.log")
+    )
     others = optuna.create_study(study_name="others", storage=storage, direction="maximize")
     others.add_trial(optuna.trial.create_trial(value=1.0))
     optuna.create_study(study_name="left", storage=storage, direction="maximize")
@@ -222,7 +312,10 @@ def test_studies_of_others_are_refused_and_one_that_was_left_at_its_birth_is_beg
         (["--n-startup-trials", "-1"], "n_startup_trials"),
         (["--eval-episodes", "0"], "eval_episodes"),
         (["--storage", "broken.log"], "storage broken.log: cannot be used"),
-        (["--storage", "cut.log"], "storage cut.log: cannot be used (ConfigError: the last line is cut"),
+        (
+            ["--storage", "cut.log"],
+            "storage cut.log: cannot be used (ConfigError: the last line is cut",
+        ),
         (["--storage", "mysql+nothing://x/y"], "storage mysql+nothing://x/y: cannot be used"),
         (["--search-space", "nowhere.yml"], "nowhere.yml"),
         (["-i", "nowhere.zip"], "nowhere.zip"),
@@ -262,7 +355,11 @@ def test_spaces_that_are_none_are_refused(tmp_path, space, message):
 
 
 def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
-    for name in [name for name in sys.modules if name.startswith(("sb3_quad.tuning", "sb3_quad.cli.commands.tune"))]:
+    for name in [
+        name
+        for name in sys.modules
+        if name.startswith(("sb3_quad.tuning", "sb3_quad.cli.commands.tune"))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "optuna", None)
     assert main(command) == 2
@@ -272,8 +369,24 @@ def test_without_optuna_it_says_what_to_install(command, monkeypatch, capsys):
 @pytest.mark.parametrize(
     ("algo", "file"),
     [
-        *(("dagger", name) for name in ("dagger.yml", "robust/dagger.yml", "nominal/dagger.yml", "thesis/dagger.yml")),
-        *(("ppo_bc", name) for name in ("ppo_bc.yml", "nominal/ppo_bc.yml", "robust/ppo_bc.yml", "thesis/ppo_bc.yml")),
+        *(
+            ("dagger", name)
+            for name in (
+                "dagger.yml",
+                "robust/dagger.yml",
+                "nominal/dagger.yml",
+                "thesis/dagger.yml",
+            )
+        ),
+        *(
+            ("ppo_bc", name)
+            for name in (
+                "ppo_bc.yml",
+                "nominal/ppo_bc.yml",
+                "robust/ppo_bc.yml",
+                "thesis/ppo_bc.yml",
+            )
+        ),
         ("ppo", "ppo.yml"),
     ],
 )

@@ -1,4 +1,6 @@
-"""Validation: data becomes a frozen model, or one line says which key is wrong, how, and what it means."""
+"""Validation: data becomes a frozen model, or one line says which key is wrong, how, and what it
+means.
+"""
 
 from typing import Literal
 
@@ -49,18 +51,33 @@ def test_data_become_a_frozen_model():
         ({"mass": -1}, "x: mass: Input should be greater than 0 (m, kg)"),
         ({"mass": float("nan")}, "x: mass: Input should be a finite number (m, kg)"),
         ({"mass": "1 kg"}, "x: mass: '1 kg' must be a number alone, its unit left out (m, kg)"),
-        ({"mass": 1, "count": "four"}, "x: count: 'four' must be a number alone, its unit left out"),
+        (
+            {"mass": 1, "count": "four"},
+            "x: count: 'four' must be a number alone, its unit left out",
+        ),
         (
             {"mass": 1, "cuont": 4},
             "x: unknown key 'cuont': did you mean 'count'? "
             "(valid: by_name, count, fault, length, mass, rotors, saved, second)",
         ),
-        ({"mass": 1, "rotors": [{"thrust": 1}, {"thrust": "x"}]}, "x: rotors.1.thrust: 'x' must be a number alone"),
-        ({"mass": 1, "rotors": [{"thrust": 1, "thurst": 2}]}, "x: rotors.0: unknown key 'thurst': did you mean 'thrust'?"),
-        ({"mass": 1, "by_name": {"left": {"thurst": 1}}}, "x: by_name.thrust: is missing (N); by_name: unknown key 'thurst'"),
+        (
+            {"mass": 1, "rotors": [{"thrust": 1}, {"thrust": "x"}]},
+            "x: rotors.1.thrust: 'x' must be a number alone",
+        ),
+        (
+            {"mass": 1, "rotors": [{"thrust": 1, "thurst": 2}]},
+            "x: rotors.0: unknown key 'thurst': did you mean 'thrust'?",
+        ),
+        (
+            {"mass": 1, "by_name": {"left": {"thurst": 1}}},
+            "x: by_name.thrust: is missing (N); by_name: unknown key 'thurst'",
+        ),
         ({"mass": 1, "saved": {}}, "x: saved.thrust: is missing (N)"),
         ({"mass": 1, "length": [1]}, "x: length: Input should be a valid number"),
-        ({"count": "x", "mass": 0}, "x: mass: Input should be greater than 0 (m, kg); count: 'x' must"),
+        (
+            {"count": "x", "mass": 0},
+            "x: mass: Input should be greater than 0 (m, kg); count: 'x' must",
+        ),
         ([1], "x: Input should be a valid dictionary"),
     ],
 )

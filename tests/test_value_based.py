@@ -42,13 +42,20 @@ CASES = {"sac": {}, "td3": {"noise_type": "normal"}, "sac_bc": WITH_EXPERT}
 
 def make_job(folder, algo, **changes):
     config = build_config(algo, ENV, {**TINY, **CASES[algo], **changes})
-    return TrainingJob(config=config, log_folder=str(folder), eval_freq=120, eval_episodes=4, seed=5)
+    return TrainingJob(
+        config=config, log_folder=str(folder), eval_freq=120, eval_episodes=4, seed=5
+    )
 
 
 @pytest.fixture
 def short_clone(monkeypatch):
     """A hand-over to SAC takes no time, and its clone flies badly."""
-    for name, value in {"CLONE_STEPS": 20, "CLONE_BATCH": 32, "CLONE_ROWS": 80, "CLONE_FLIGHT": 10}.items():
+    for name, value in {
+        "CLONE_STEPS": 20,
+        "CLONE_BATCH": 32,
+        "CLONE_ROWS": 80,
+        "CLONE_FLIGHT": 10,
+    }.items():
         monkeypatch.setattr(transfer, name, value)
 
 
@@ -66,9 +73,13 @@ def test_an_interrupted_run_goes_on_to_the_same_agent(tmp_path, algo):
         broken = train(
             make_job(tmp_path / f"broken{evaluation}", algo),
             print,
-            should_continue=lambda *_, count=count, at=evaluation: next(count) != at or not signal.raise_signal(signal.SIGINT),
+            should_continue=lambda *_, count=count, at=evaluation: (
+                next(count) != at or not signal.raise_signal(signal.SIGINT)
+            ),
         )
-        assert broken.exit_code == 130 and 0 < int(np.load(broken.run.resume_state)["timesteps"]) < 800
+        assert (
+            broken.exit_code == 130 and 0 < int(np.load(broken.run.resume_state)["timesteps"]) < 800
+        )
         again = resume(str(broken.run.path), print).run
         mine, theirs = state(again), state(whole.run)
         assert all(th.equal(mine[name], theirs[name]) for name in theirs)
@@ -91,9 +102,14 @@ def test_a_pipeline_goes_on_from_an_imitation_by_values(tmp_path, short_clone):
     path.write_text(yaml.safe_dump({"stages": [one, two]}), encoding="utf-8")
     shared = {"n_envs": 8, "n_timesteps": 256, "env_kwargs": {"max_episode_steps": 12}}
     job = {"log_folder": str(tmp_path / "logs"), "eval_episodes": 4, "eval_freq": 0}
-    result = run_pipeline(with_settings(load_pipeline(path), shared), job, "stages", lambda line: None)
+    result = run_pipeline(
+        with_settings(load_pipeline(path), shared), job, "stages", lambda line: None
+    )
     assert result.exit_code == 0 and saved_algorithm(result.stages["two"].agent) == "SACBC"
-    assert [stage.algo for stage in load_pipeline("value_based/two_stage.yml").stages] == ["dagger", "sac_bc"]
+    assert [stage.algo for stage in load_pipeline("value_based/two_stage.yml").stages] == [
+        "dagger",
+        "sac_bc",
+    ]
 
 
 def test_n_step_returns_are_loaded_without_a_warning(tmp_path, recwarn):
@@ -108,7 +124,9 @@ def clone(tmp_path_factory):
     """An agent of SAC's that flies as one that came with the package."""
     env = QuadcopterVecEnv(240, "recovery_and_tracking", seed=0, max_episode_steps=500)
     policy_kwargs = {"net_arch": {"pi": [64, 64], "qf": [8]}, "activation_fn": th.nn.Tanh}
-    model = SAC("MlpPolicy", env, policy_kwargs=policy_kwargs, buffer_size=240, seed=0, device="cpu")
+    model = SAC(
+        "MlpPolicy", env, policy_kwargs=policy_kwargs, buffer_size=240, seed=0, device="cpu"
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(transfer, "CLONE_STEPS", 1000)
         patch.setattr(transfer, "CLONE_BATCH", 512)
@@ -121,7 +139,10 @@ def clone(tmp_path_factory):
 
 @pytest.mark.slow
 def test_an_agent_is_handed_over_to_sac_and_flies(clone):
-    before, after = (fly(load_model(path), "state_recovery", 240, 3) for path in (pretrained("itm-recovery"), clone))
+    before, after = (
+        fly(load_model(path), "state_recovery", 240, 3)
+        for path in (pretrained("itm-recovery"), clone)
+    )
     assert before.survival.mean() > 0.98 and after.survival.mean() > before.survival.mean() - 0.03
     assert fly(load_model(clone), "target_tracking", 48, 3).survival.all()
 
@@ -130,7 +151,9 @@ def test_an_agent_is_handed_over_to_sac_and_flies(clone):
 def test_its_offset_is_trimmed(clone):
     model = load_model(clone)
     with th.no_grad():
-        model.actor.latent_pi[0].bias -= 0.3 * model.actor.latent_pi[0].weight[:, 0]  # sees itself where it is not
+        model.actor.latent_pi[0].bias -= (
+            0.3 * model.actor.latent_pi[0].weight[:, 0]
+        )  # sees itself where it is not
     before = np.linalg.norm(hover_offset(model))
     assert trim(model).after < 0.1 * before > 0.1
 
@@ -138,7 +161,10 @@ def test_its_offset_is_trimmed(clone):
 @pytest.mark.slow
 def test_its_export_flies_where_it_flies(clone, tmp_path):
     """In closed loop: the file's thrusts lead to the same ends."""
-    assert main(["export", str(clone), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")]) == 0
+    assert (
+        main(["export", str(clone), "--format", "torchscript", "-o", str(tmp_path / "agent.pt")])
+        == 0
+    )
     module = th.jit.load(tmp_path / "agent.pt")
     env = QuadcopterVecEnv(1)
     low, high = env.vehicle.thrust_range
@@ -148,7 +174,9 @@ def test_its_export_flies_where_it_flies(clone, tmp_path):
         thrusts = module(th.as_tensor(observation * std + mean, dtype=th.float32)).numpy()
         return (2.0 * thrusts - high - low) / (high - low)
 
-    own, theirs = (fly(each, "state_recovery", 48, 9, noise=0.0) for each in (load_model(clone), exported))
+    own, theirs = (
+        fly(each, "state_recovery", 48, 9, noise=0.0) for each in (load_model(clone), exported)
+    )
     assert own.survival.mean() > 0.9 and (own.survival == theirs.survival).mean() > 0.95
     both = own.survival & theirs.survival
     np.testing.assert_allclose(own.final_error[both], theirs.final_error[both], atol=0.01)
@@ -161,7 +189,9 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
     line = describe(TrainingJob(config=config))
     assert f"{algo} on {ENV}: " in line and f"rollouts of {config.rollout_steps} steps" in line
     short = load_config(algo, ENV, overrides={"n_timesteps": config.n_envs})
-    assert short.rollout_steps == 1 and short.keyword("n_steps") == config.keyword("n_steps")  # of the returns: it stays
+    assert short.rollout_steps == 1 and short.keyword("n_steps") == config.keyword(
+        "n_steps"
+    )  # of the returns: it stays
     space = load_space(algo, config.settings)
     assert space.start() is not None and "n_minibatches" not in space.dimensions
 
@@ -180,5 +210,11 @@ def test_settings_of_the_package_describe_a_training_of_rows_with_gradient_steps
 def test_bad_settings_are_one_line(tmp_path, algo, changes, message):
     base = {"n_timesteps": 100, "n_envs": 2} if algo == "ppo" else {**TINY, **CASES[algo]}
     with pytest.raises(ConfigError, match=message) as raised:
-        train(TrainingJob(config=build_config(algo, ENV, {**base, **changes}), log_folder=str(tmp_path), eval_episodes=0))
+        train(
+            TrainingJob(
+                config=build_config(algo, ENV, {**base, **changes}),
+                log_folder=str(tmp_path),
+                eval_episodes=0,
+            )
+        )
     assert "\n" not in str(raised.value)

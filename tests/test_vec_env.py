@@ -1,4 +1,6 @@
-"""QuadcopterVecEnv: the same flights as QuadcopterEnv, rows apart from each other, and Stable-Baselines3's interface."""
+"""QuadcopterVecEnv: the same flights as QuadcopterEnv, rows apart from each other, and
+Stable-Baselines3's interface.
+"""
 
 import subprocess
 import sys
@@ -28,9 +30,15 @@ MIXTURE = {"target_tracking": 1.0, "state_recovery": 2.0}
 
 
 def fly(env, steps, actions=None):
-    """Observations, rewards, dones and infos of ``steps`` steps with the same random actions for the same number of rows."""
+    """Observations, rewards, dones and infos of ``steps`` steps with the same random actions for
+    the same number of rows.
+    """
     rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (steps, env.num_envs, 4)).astype(np.float32) if actions is None else actions
+    actions = (
+        rng.uniform(-1, 1, (steps, env.num_envs, 4)).astype(np.float32)
+        if actions is None
+        else actions
+    )
     steps_taken = [env.step(action) for action in actions]
     infos = [[dict(info) for info in step[3]] for step in steps_taken[-1:]]
     return *(np.array([step[k] for step in steps_taken]) for k in range(3)), infos
@@ -82,8 +90,14 @@ def test_whole_episodes_are_pybullets(task, controller):
     rewards, infos = first_episodes(batch, choose_all, limit)
     for row in range(n):
         flown = iter(table[row])
-        choose = (lambda state: pid.actions(state)[0]) if controller == "pid" else (lambda state, flown=flown: next(flown))
-        expected, observation, terminated, info = episode_of_one(single, row_seeds(20, n)[row], choose, limit)
+        choose = (
+            (lambda state: pid.actions(state)[0])
+            if controller == "pid"
+            else (lambda state, flown=flown: next(flown))
+        )
+        expected, observation, terminated, info = episode_of_one(
+            single, row_seeds(20, n)[row], choose, limit
+        )
         assert len(expected) == len(rewards[row])
         np.testing.assert_allclose(rewards[row], expected, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(infos[row]["terminal_observation"], observation, atol=2e-6)
@@ -99,12 +113,19 @@ def test_whole_episodes_are_pybullets(task, controller):
 
 
 def test_noise_is_the_same_in_both():
-    batch, single = QuadcopterVecEnv(3, task="state_recovery", seed=7), envs.QuadcopterEnv(task="state_recovery")
+    batch, single = (
+        QuadcopterVecEnv(3, task="state_recovery", seed=7),
+        envs.QuadcopterEnv(task="state_recovery"),
+    )
     first = batch.reset()
     for row in range(3):
-        np.testing.assert_allclose(single.reset(seed=row_seeds(7, 3)[row])[0], first[row], atol=1e-6)
+        np.testing.assert_allclose(
+            single.reset(seed=row_seeds(7, 3)[row])[0], first[row], atol=1e-6
+        )
     action = np.full(4, 0.1, dtype=np.float32)
-    np.testing.assert_allclose(single.step(action)[0], batch.step(np.tile(action, (3, 1)))[0][2], atol=1e-6)
+    np.testing.assert_allclose(
+        single.step(action)[0], batch.step(np.tile(action, (3, 1)))[0][2], atol=1e-6
+    )
     single.close()
 
 
@@ -181,7 +202,9 @@ for _ in range(20): observations = env.step(np.ones((512, 4)))[0]
 os.write(1, f"{observations.sum()}\\n".encode())
 if child: assert os.waitpid(child, 0)[1] == 0
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=True)
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=100, check=True
+    )
     sums = result.stdout.split()
     assert len(sums) == 2 and sums[0] == sums[1]
 
@@ -225,13 +248,21 @@ def test_the_end_of_an_episode():
                 assert infos[row]["episode"]["r"] == pytest.approx(total[row], abs=1e-4)
                 terminal = infos[row]["terminal_observation"]
                 position = before.position[row] - before.target[row] + 0.01 * before.velocity[row]
-                np.testing.assert_allclose(terminal[:3] * env.observation_std[row, :3], position, atol=0.01)
+                np.testing.assert_allclose(
+                    terminal[:3] * env.observation_std[row, :3], position, atol=0.01
+                )
                 start = env.true_state()
                 np.testing.assert_array_equal(start.position[row], (0, 0, 15))
                 relative = start.position[row] - start.target[row]
-                np.testing.assert_allclose(observations[row, :3] * env.observation_std[row, :3], relative, atol=1e-5)
+                np.testing.assert_allclose(
+                    observations[row, :3] * env.observation_std[row, :3], relative, atol=1e-5
+                )
     for row in range(3):
-        assert ends[row]["collision"] and not ends[row]["survival"] and not ends[row]["TimeLimit.truncated"]
+        assert (
+            ends[row]["collision"]
+            and not ends[row]["survival"]
+            and not ends[row]["TimeLimit.truncated"]
+        )
         assert total[row] < -15.0
     for row in range(3, 6):
         assert (
@@ -257,7 +288,12 @@ def test_the_end_of_an_episode():
 def test_success_is_to_be_at_the_target_in_the_end(task, distance, tilt, succeeds):
     batch, single = QuadcopterVecEnv(2, task, max_episode_steps=1), envs.QuadcopterEnv(task)
     quaternion = [np.cos(np.radians(tilt / 2)), np.sin(np.radians(tilt / 2)), 0.0, 0.0]
-    start = {"position": [0, 0, 15], "quaternion": quaternion, "velocity": [0, 0, 0], "body_rates": [0, 0, 0]}
+    start = {
+        "position": [0, 0, 15],
+        "quaternion": quaternion,
+        "velocity": [0, 0, 0],
+        "body_rates": [0, 0, 0],
+    }
     single.reset(options={"state": start, "target": [0, 0, 15 + distance]})
     batch.reset()
     for name, value in start.items():
@@ -291,7 +327,11 @@ def test_out_of_range_ends():
     env.set_target((100.0, 0.0, 15.0), indices=[1])
     _, rewards, dones, infos = env.step(np.zeros((2, 4)))
     assert dones.tolist() == [False, True]
-    assert infos[1]["out_of_range"] and not infos[1]["is_success"] and not infos[1]["TimeLimit.truncated"]
+    assert (
+        infos[1]["out_of_range"]
+        and not infos[1]["is_success"]
+        and not infos[1]["TimeLimit.truncated"]
+    )
     assert rewards[1] == pytest.approx(-15.3, abs=0.01) and rewards[0] > -0.1
 
 
@@ -302,7 +342,10 @@ def test_returned_arrays_are_fresh():
     env.step(np.ones((3, 4)))
     for array, copy in zip(first, kept, strict=True):
         np.testing.assert_array_equal(array, copy)
-    assert first[0].dtype == first[1].dtype == first[2].dtype == np.float32 and first[3].dtype == np.bool_
+    assert (
+        first[0].dtype == first[1].dtype == first[2].dtype == np.float32
+        and first[3].dtype == np.bool_
+    )
 
 
 # --- what users set
@@ -323,15 +366,25 @@ def test_setters_reach_the_rows_they_name():
     assert env.get_attr("noise") == [0.0, 0.0, 0.1, 0.0]
     assert env.get_attr("vehicle")[3].name == env.vehicle.name == "itm"
     assert [state.n for state in env.env_method("true_state")] == [1] * 4
-    assert env.get_attr("render_mode") == [None] * 4 and env.env_is_wrapped(VecMonitor) == [False] * 4
+    assert (
+        env.get_attr("render_mode") == [None] * 4 and env.env_is_wrapped(VecMonitor) == [False] * 4
+    )
     env.set_wrench(force=(0.0, 2.0, 0.0), indices=[1])
-    assert [wrench.tolist() for wrench in env.get_attr("wrench", [0, 1])] == [[0.0] * 12, [0.0, 2.0] + [0.0] * 10]
-    assert env.get_attr("task") == ["target_tracking"] * 4 and env.get_attr("task_kwargs") == [{}] * 4
+    assert [wrench.tolist() for wrench in env.get_attr("wrench", [0, 1])] == [
+        [0.0] * 12,
+        [0.0, 2.0] + [0.0] * 10,
+    ]
+    assert (
+        env.get_attr("task") == ["target_tracking"] * 4 and env.get_attr("task_kwargs") == [{}] * 4
+    )
 
 
 def test_its_episodes_are_a_monitors():
     env = QuadcopterVecEnv(3, seed=0, max_episode_steps=20)
-    assert env.env_is_wrapped(Monitor, [0, 2]) == [True] * 2 and env.env_is_wrapped(TimeLimit) == [False] * 3
+    assert (
+        env.env_is_wrapped(Monitor, [0, 2]) == [True] * 2
+        and env.env_is_wrapped(TimeLimit) == [False] * 3
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         rewards, lengths = evaluate_policy(_Hover(), env, 3, return_episode_rewards=True)
@@ -359,7 +412,9 @@ def test_staggered_episodes_end_at_times_spread_evenly():
     assert ends == [(5 * k, min(5 * k, 100)) for k in range(1, 61)]
     again = QuadcopterVecEnv(20, max_episode_steps=100)
     again.batch.restore(kept)
-    lengths = [info["episode"]["l"] for _ in range(10) for info in again.step(np.zeros((20, 4)))[3] if info]
+    lengths = [
+        info["episode"]["l"] for _ in range(10) for info in again.step(np.zeros((20, 4)))[3] if info
+    ]
     assert lengths == [55, 60]
 
 
@@ -386,7 +441,9 @@ def test_scaling_and_noise_of_one_row_act_on_that_row():
     expected, got = plain.reset(), changed.reset()
     others = [row for row in range(70) if row not in (1, 66)]
     np.testing.assert_array_equal(got[others], expected[others])
-    np.testing.assert_allclose(got[66], (expected[66] * plain.observation_std[66] - 0.5) / 4.0, atol=1e-6)
+    np.testing.assert_allclose(
+        got[66], (expected[66] * plain.observation_std[66] - 0.5) / 4.0, atol=1e-6
+    )
     assert not np.allclose(got[1], expected[1])
 
 
@@ -413,7 +470,9 @@ def test_vehicles_by_row():
     assert [vehicle.mass for vehicle in env.get_attr("vehicle")] == [light.mass, 3.0, light.mass]
     env.set_wrench(force=(3.0, 0.0, 0.0))
     env.step(np.zeros((3, 4)))
-    assert env.true_state().velocity[:, 0] == pytest.approx(0.03 / np.array([light.mass, 3.0, light.mass]))
+    assert env.true_state().velocity[:, 0] == pytest.approx(
+        0.03 / np.array([light.mass, 3.0, light.mass])
+    )
     np.testing.assert_allclose(env.true_state().velocity[:, 2], 0.0, atol=1e-12)
 
 

@@ -24,7 +24,9 @@ finite = st.floats(-2.0, 2.0)
 def vehicles() -> st.SearchStrategy[Vehicle]:
     """Vehicles unlike the default one: other sizes, masses, limits and rotor order."""
 
-    def build(scale: float, mass: float, low: float, high: float, wide: float, long: float, mirrored: bool) -> Vehicle:
+    def build(
+        scale: float, mass: float, low: float, high: float, wide: float, long: float, mirrored: bool
+    ) -> Vehicle:
         sign = -1 if mirrored else 1
         return ITM.model_copy(
             update={
@@ -38,7 +40,14 @@ def vehicles() -> st.SearchStrategy[Vehicle]:
 
     arm = st.floats(0.05, 1.0)
     return st.builds(
-        build, st.floats(0.1, 10), st.floats(0.05, 20), st.floats(0, 0.9), st.floats(1.1, 5), arm, arm, st.booleans()
+        build,
+        st.floats(0.1, 10),
+        st.floats(0.05, 20),
+        st.floats(0, 0.9),
+        st.floats(1.1, 5),
+        arm,
+        arm,
+        st.booleans(),
     )
 
 
@@ -50,13 +59,29 @@ def write(path: Path, **changes: Any) -> Path:
 
 
 # Their gains are derived.
-OF_OTHERS = {"cf2x_L250", "cf21B_500", "rotorpy_crazyflie", "rotorpy_hummingbird", "l2f_crazyflie", "x500"}
+OF_OTHERS = {
+    "cf2x_L250",
+    "cf21B_500",
+    "rotorpy_crazyflie",
+    "rotorpy_hummingbird",
+    "l2f_crazyflie",
+    "x500",
+}
 
 
 def test_default_vehicle_is_the_specified_one() -> None:
     assert {"itm", "crazyflie", "hummingbird"} < {*VEHICLES.names()}
-    assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (1.727, (0.006687, 0.0101, 0.00996), 0.016)
-    assert (ITM.thrust_coefficient, ITM.motor_gain_up, ITM.motor_gain_down, ITM.gravity) == (8.54858e-6, 20.0, 20.0, 9.81)
+    assert (ITM.mass, ITM.inertia, ITM.moment_thrust_ratio) == (
+        1.727,
+        (0.006687, 0.0101, 0.00996),
+        0.016,
+    )
+    assert (ITM.thrust_coefficient, ITM.motor_gain_up, ITM.motor_gain_down, ITM.gravity) == (
+        8.54858e-6,
+        20.0,
+        20.0,
+        9.81,
+    )
     assert (ITM.physics_step, ITM.control_step, ITM.substeps, ITM.delay) == (0.0025, 0.01, 4, 1)
     d, c = 0.17104913036744201, 0.016
     mixer = [[1, 1, 1, 1], [d, -d, -d, d], [-d, -d, d, d], [c, -c, c, -c]]
@@ -75,7 +100,9 @@ def test_mixer_inverse(vehicle: Vehicle, wrench: tuple[float, ...]) -> None:
 def test_hover_carries_the_weight_and_nothing_else(vehicle: Vehicle) -> None:
     wrench = vehicle.mixer @ np.full(4, vehicle.hover_thrust)
     np.testing.assert_allclose(wrench, [vehicle.mass * vehicle.gravity, 0, 0, 0], atol=1e-12)
-    np.testing.assert_allclose(vehicle.thrust_coefficient * vehicle.hover_rotor_speed**2, vehicle.hover_thrust)
+    np.testing.assert_allclose(
+        vehicle.thrust_coefficient * vehicle.hover_rotor_speed**2, vehicle.hover_thrust
+    )
     low, high = vehicle.rotor_speed_range
     assert low < vehicle.hover_rotor_speed < high
 
@@ -88,7 +115,8 @@ def test_thrust_and_action_are_inverse(vehicle: Vehicle, actions: list[float]) -
     assert (thrust >= low - 1e-9).all() and (thrust <= high + 1e-9).all()
     np.testing.assert_allclose(vehicle.thrust_to_action(thrust), action, atol=1e-9)
     np.testing.assert_array_equal(
-        vehicle.action_to_thrust(np.array([-7.0, 7.0])), vehicle.action_to_thrust(np.array([-1.0, 1.0]))
+        vehicle.action_to_thrust(np.array([-7.0, 7.0])),
+        vehicle.action_to_thrust(np.array([-1.0, 1.0])),
     )
 
 
@@ -97,9 +125,16 @@ def test_kernel_parameters_are_in_their_order(vehicle: Vehicle) -> None:
     values = dict(zip(PARAMETER_NAMES, vehicle.parameters(), strict=True))
     low, high = vehicle.thrust_range
     assert values["mass"] == vehicle.mass and values["izz"] == vehicle.inertia[2]
-    assert values["roll_arm_2"] == vehicle.mixer[1, 2] and values["yaw_arm_3"] == vehicle.mixer[3, 3]
-    ends = [values["thrust_middle"] - values["thrust_half_range"], values["thrust_middle"] + values["thrust_half_range"]]
-    np.testing.assert_allclose([*ends, values["hover_thrust"]], [low, high, vehicle.hover_thrust], atol=1e-12)
+    assert (
+        values["roll_arm_2"] == vehicle.mixer[1, 2] and values["yaw_arm_3"] == vehicle.mixer[3, 3]
+    )
+    ends = [
+        values["thrust_middle"] - values["thrust_half_range"],
+        values["thrust_middle"] + values["thrust_half_range"],
+    ]
+    np.testing.assert_allclose(
+        [*ends, values["hover_thrust"]], [low, high, vehicle.hover_thrust], atol=1e-12
+    )
     assert ends[0] >= 0.0  # its square root is a rotor speed
 
 
@@ -140,20 +175,32 @@ def test_shipped_vehicles_hold_what_was_measured_with_them(name: str) -> None:
     assert vehicle.name == name
     assert (vehicle.geometric_gains is None) == (name in OF_OTHERS)
     assert vehicle.geometric_gains is None or vehicle.geometric_gains.measured is not None
-    assert float(vehicle.action_to_thrust(np.array(vehicle.hover_action))) == pytest.approx(vehicle.hover_thrust)
+    assert float(vehicle.action_to_thrust(np.array(vehicle.hover_action))) == pytest.approx(
+        vehicle.hover_thrust
+    )
 
 
 @given(vehicles())
 def test_limits_in_newtons_and_rotor_speeds_are_the_same_limits(vehicle: Vehicle) -> None:
     data = vehicle.model_dump(exclude={"thrust_limits"})
-    for key, limits in (("rotor_thrust_limits", vehicle.thrust_range), ("rotor_speed_limits", vehicle.rotor_speed_range)):
+    for key, limits in (
+        ("rotor_thrust_limits", vehicle.thrust_range),
+        ("rotor_speed_limits", vehicle.rotor_speed_range),
+    ):
         again = Vehicle.model_validate({**data, key: limits})
-        np.testing.assert_allclose(again.thrust_limits, vehicle.thrust_limits, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(
+            again.thrust_limits, vehicle.thrust_limits, rtol=1e-12, atol=1e-15
+        )
         assert vehicle.model_copy(update={key: limits}).thrust_limits == again.thrust_limits
 
 
-@pytest.mark.parametrize("limits", [{"thrust_limits": [0.1, 0.9]}, {"rotor_thrust_limits": [0.1, 4.0], "thrust_limits": ...}])
-def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, limits: dict[str, Any]) -> None:
+@pytest.mark.parametrize(
+    "limits",
+    [{"thrust_limits": [0.1, 0.9]}, {"rotor_thrust_limits": [0.1, 4.0], "thrust_limits": ...}],
+)
+def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(
+    tmp_path: Path, limits: dict[str, Any]
+) -> None:
     with pytest.raises(CannotHover, match="hover"):
         load_vehicle(write(tmp_path / "weak.yaml", **limits))
     with pytest.raises(ConfigError) as caught:
@@ -164,9 +211,15 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"rotor_thrust_limits": [1, 9]}, "thrust_limits and rotor_thrust_limits: give exactly one"),
+        (
+            {"rotor_thrust_limits": [1, 9]},
+            "thrust_limits and rotor_thrust_limits: give exactly one",
+        ),
         ({"rotor_thrust_limits": [9, 1], "thrust_limits": ...}, "rotor_thrust_limits .*rise"),
-        ({"rotor_speed_limits": [1, "fast"], "thrust_limits": ...}, "rotor_speed_limits.*number.*rad/s"),
+        (
+            {"rotor_speed_limits": [1, "fast"], "thrust_limits": ...},
+            "rotor_speed_limits.*number.*rad/s",
+        ),
         ({"rotor_speed_limits": [100, 900], "thrust_limits": ..., "mass": ...}, "mass: is missing"),
         ({"rotor_speed_limit": [100, 900]}, "did you mean 'rotor_speed_limits'"),
         ({"mas": 1.0}, "'mas': did you mean 'mass'"),
@@ -174,8 +227,14 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
         ({"mass": -1}, "mass: .*greater than 0.*kg"),
         ({"mass": float("inf")}, "mass: .*finite"),
         ({"inertia": [0.1, 0.1, 0.5]}, "inertia .*no rigid body"),
-        ({"rotor_positions": [[1, 1], [1, -1], [-1, -1], [-1, 0.5]]}, "rotor_positions: equal thrusts"),
-        ({"rotor_positions": [[1, 0], [1, 0], [-1, 0], [-1, 0]]}, "rotor_positions: these rotors cannot"),
+        (
+            {"rotor_positions": [[1, 1], [1, -1], [-1, -1], [-1, 0.5]]},
+            "rotor_positions: equal thrusts",
+        ),
+        (
+            {"rotor_positions": [[1, 0], [1, 0], [-1, 0], [-1, 0]]},
+            "rotor_positions: these rotors cannot",
+        ),
         ({"rotor_directions": [1, 1, 1, -1]}, "rotor_directions .*two of 1"),
         ({"thrust_limits": [1.1, 1.5]}, "thrust_limits .*hover"),
         ({"control_step": 0.011}, "control_step .*whole multiple"),
@@ -184,7 +243,10 @@ def test_a_vehicle_that_cannot_hover_is_told_from_a_bad_file(tmp_path: Path, lim
         ({"drag": [0, 0, -1]}, "drag.2: .*greater than or equal to 0.*N s/m"),
         ({"delay": 1.5}, "delay"),
         ({"name": ""}, "name"),
-        ({"geometric_gains": {**GAINS, "velocity": -1}}, "geometric_gains.velocity: .*greater than 0.*1/s"),
+        (
+            {"geometric_gains": {**GAINS, "velocity": -1}},
+            "geometric_gains.velocity: .*greater than 0.*1/s",
+        ),
     ],
 )
 def test_bad_files_name_the_key(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
@@ -204,12 +266,20 @@ def test_files_that_are_no_vehicle(tmp_path: Path, content: str) -> None:
 
 
 @pytest.mark.parametrize("excess", [0.001, 0.049, 0.06])
-def test_a_little_too_large_a_moment_is_a_warning_and_more_is_refused(tmp_path: Path, capfd: Any, excess: float) -> None:
-    path = write(tmp_path / "own.yaml", inertia=[0.01, 0.01, 0.02 * (1.0 + excess)], geometric_gains=None)
+def test_a_little_too_large_a_moment_is_a_warning_and_more_is_refused(
+    tmp_path: Path, capfd: Any, excess: float
+) -> None:
+    path = write(
+        tmp_path / "own.yaml", inertia=[0.01, 0.01, 0.02 * (1.0 + excess)], geometric_gains=None
+    )
     arguments = ["check-vehicle", str(path), "-n", "0"]
     assert main(arguments) == (2 if excess > 0.05 else 0)
     said = capfd.readouterr()
-    assert said.err.count("\n") == 1 and f"here by {100 * excess:.2g} %" in said.err and str(path) in said.err
+    assert (
+        said.err.count("\n") == 1
+        and f"here by {100 * excess:.2g} %" in said.err
+        and str(path) in said.err
+    )
     assert ("warning" in said.err) == (excess < 0.05) == ("unphysical" in said.out)
 
 
@@ -221,7 +291,10 @@ def test_unknown_name_gives_the_nearest() -> None:
 def rotors(vehicle: Vehicle, turn: float = 0.0) -> set[tuple[complex, int]]:
     """Where the rotors are after a turn of the body, rad, and which way they turn."""
     places = np.array(vehicle.rotor_positions) @ (1.0, 1.0j) * np.exp(1j * turn)
-    return {(complex(np.round(place, 9)), sign) for place, sign in zip(places, vehicle.rotor_directions, strict=True)}
+    return {
+        (complex(np.round(place, 9)), sign)
+        for place, sign in zip(places, vehicle.rotor_directions, strict=True)
+    }
 
 
 @pytest.mark.parametrize("name", ["crazyflie", "hummingbird"])
@@ -232,14 +305,19 @@ def test_a_vehicle_in_another_layout_is_the_same_vehicle_with_its_axes_turned(na
     assert turned.rotor_directions == ITM.rotor_directions
     assert any(rotors(own, k * np.pi / 4) == rotors(turned) for k in range(8))
     assert turned.geometric_gains == own.geometric_gains and turned.in_layout_of(ITM) is turned
-    assert QuadcopterBatch(3, FlightSettings(vehicle=name, rotor_layout="itm")).vehicle_list == [turned] * 3
+    assert (
+        QuadcopterBatch(3, FlightSettings(vehicle=name, rotor_layout="itm")).vehicle_list
+        == [turned] * 3
+    )
 
 
 def test_a_layout_that_cannot_be_had_is_refused() -> None:
     plus = load_vehicle("hummingbird").model_copy(update={"inertia": (2e-3, 4e-3, 5e-3)})
     with pytest.raises(ConfigError, match="Ixx and Iyy differ"):
         plus.in_layout_of(ITM)
-    long = ITM.model_copy(update={"rotor_positions": ((0.3, 0.05), (0.3, -0.05), (-0.3, -0.05), (-0.3, 0.05))})
+    long = ITM.model_copy(
+        update={"rotor_positions": ((0.3, 0.05), (0.3, -0.05), (-0.3, -0.05), (-0.3, 0.05))}
+    )
     with pytest.raises(ConfigError, match="no turn brings the rotors"):
         long.in_layout_of(ITM)
 

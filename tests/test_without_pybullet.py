@@ -1,4 +1,6 @@
-"""Where PyBullet cannot be imported, the batch flies and trains, and what needs PyBullet says how to get it."""
+"""Where PyBullet cannot be imported, the batch flies and trains, and what needs PyBullet says how
+to get it.
+"""
 
 import subprocess
 import sys
@@ -17,7 +19,11 @@ LINE = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend pyb
 
 def modules():
     """Every module of the package, by the name it is imported under."""
-    for path in (path for folder in ("sb3_quad", "envs", "callbacks") for path in (ROOT / folder).rglob("*.py")):
+    for path in (
+        path
+        for folder in ("sb3_quad", "envs", "callbacks")
+        for path in (ROOT / folder).rglob("*.py")
+    ):
         parts = path.relative_to(ROOT).with_suffix("").parts
         name = ".".join(parts if parts[0] == "sb3_quad" else ("sb3_quad", *parts))
         if not name.endswith("__main__"):
@@ -25,7 +31,11 @@ def modules():
 
 
 def test_all_else_is_imported_and_a_batch_flies():
-    names = [name for name in modules() if not name.startswith(tuple(f"sb3_quad.{each}" for each in ON_PYBULLET))]
+    names = [
+        name
+        for name in modules()
+        if not name.startswith(tuple(f"sb3_quad.{each}" for each in ON_PYBULLET))
+    ]
     code = f"""
 import importlib, sys
 sys.modules["pybullet"] = sys.modules["pybullet_data"] = None
@@ -33,17 +43,27 @@ for name in {names}: importlib.import_module(name)
 from sb3_quad.evaluation.flights import fly
 print(fly(sys.modules["sb3_quad.experts.pid"].PIDExpert(), "target_tracking", 8).survival.sum())
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert len(names) > 100 and done.stdout.split() == ["8"], done.stderr
 
 
 @pytest.fixture
 def without_pybullet(monkeypatch):
     """No module of PyBullet can be imported, nor be found as imported before."""
-    for name in [name for name in sys.modules if name.startswith(tuple(f"sb3_quad.{each}" for each in ON_PYBULLET))]:
+    for name in [
+        name
+        for name in sys.modules
+        if name.startswith(tuple(f"sb3_quad.{each}" for each in ON_PYBULLET))
+    ]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    monkeypatch.setattr(sys, "meta_path", [each for each in sys.meta_path if type(each).__name__ != "WithoutPyBullet"])
+    monkeypatch.setattr(
+        sys,
+        "meta_path",
+        [each for each in sys.meta_path if type(each).__name__ != "WithoutPyBullet"],
+    )
 
 
 @pytest.mark.parametrize(
@@ -54,11 +74,15 @@ def without_pybullet(monkeypatch):
         "train --algo ppo --vec-env subproc -n 100 --n-envs 2",
     ],
 )
-def test_a_command_that_needs_it_says_so_in_one_line(without_pybullet, tmp_path, monkeypatch, capsys, command):
+def test_a_command_that_needs_it_says_so_in_one_line(
+    without_pybullet, tmp_path, monkeypatch, capsys, command
+):
     monkeypatch.chdir(tmp_path)
     assert main(command.split()) == 2
     (said,) = capsys.readouterr().err.splitlines()
-    assert said.startswith(f"error: {LINE}") and said.endswith("pip install '.[pybullet]' from a clone of sb3_quad")
+    assert said.startswith(f"error: {LINE}") and said.endswith(
+        "pip install '.[pybullet]' from a clone of sb3_quad"
+    )
     assert not [*tmp_path.iterdir()]
 
 

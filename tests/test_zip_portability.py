@@ -37,8 +37,18 @@ json.dump([actions, [model.num_timesteps for model in models]], sys.stdout)
 """
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "load_in_plain_sb3.py"
 RUN = "import runpy, sys; sys.modules['sb3_quad'] = None; runpy.run_path(sys.argv.pop(1), run_name='__main__')"
-BESIDE = {"thesis-ppo": 1.5, "thesis-printed-recovery": 1.0, "thesis-printed-ppo": 9.0}  # m: who ends beside its target
-SMALL = {"n_steps": 32, "batch_size": 128, "learning_rate": LinearSchedule(1e-3, 0.0, 1.0), "seed": 0, "device": "cpu"}
+BESIDE = {
+    "thesis-ppo": 1.5,
+    "thesis-printed-recovery": 1.0,
+    "thesis-printed-ppo": 9.0,
+}  # m: who ends beside its target
+SMALL = {
+    "n_steps": 32,
+    "batch_size": 128,
+    "learning_rate": LinearSchedule(1e-3, 0.0, 1.0),
+    "seed": 0,
+    "device": "cpu",
+}
 
 
 @pytest.mark.slow
@@ -53,10 +63,21 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     for number, model in enumerate(models):
         model.learn(256, callback=CoefficientSchedule("bc_coef", 1.0, 0.0) if number == 2 else None)
         assert model.ep_info_buffer  # it is saved too, so it must not be empty here
-        FlightSettings(vehicle="crazyflie", noise=0.1 * number, observation_mean=np.full(18, 0.5)).write_into(model)
+        FlightSettings(
+            vehicle="crazyflie", noise=0.1 * number, observation_mean=np.full(18, 0.5)
+        ).write_into(model)
         model.save(tmp_path / f"{number}.zip")
     additions = {"bc_coef": LinearSchedule(0.5, 0.0, 1.0)}
-    sac = SACBC("MlpPolicy", env, expert=PIDExpert(), buffer_size=2000, learning_starts=0, seed=0, device="cpu", **additions)
+    sac = SACBC(
+        "MlpPolicy",
+        env,
+        expert=PIDExpert(),
+        buffer_size=2000,
+        learning_starts=0,
+        seed=0,
+        device="cpu",
+        **additions,
+    )
     sac.learn(320)
     FlightSettings().write_into(sac)
     sac.save(tmp_path / "sac.zip")
@@ -72,20 +93,36 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
     for path, noise in (("again.zip", 0.0), ("2.zip", 0.2)):
         settings, source = agent_settings(tmp_path / path)
         assert source == tmp_path / path and settings.vehicle == load_vehicle("crazyflie")
-        assert (settings.noise, settings.observation_mean, settings.task) == (noise, [0.5] * 18, "target_tracking")
+        assert (settings.noise, settings.observation_mean, settings.task) == (
+            noise,
+            [0.5] * 18,
+            "target_tracking",
+        )
     for model, flown in zip([*models, sac, *map(PPO.load, shipped)], actions, strict=True):
         seen = np.resize(observations, (len(observations), *model.observation_space.shape))
         # Both processes may use different numbers of threads, whose sums round differently.
-        np.testing.assert_allclose(np.float32(flown), model.predict(seen, deterministic=True)[0], atol=1e-5)
+        np.testing.assert_allclose(
+            np.float32(flown), model.predict(seen, deterministic=True)[0], atol=1e-5
+        )
 
 
 def save_extended(folder):
-    """A zip as `train` leaves it, of an agent that sees frames, its last action and the integral, by a scaling of its own."""
-    scaling = {"observation_mean": np.linspace(-0.3, 0.4, 18), "observation_std": np.linspace(2.0, 3.0, 18)}
+    """A zip as `train` leaves it, of an agent that sees frames, its last action and the integral,
+    by a scaling of its own.
+    """
+    scaling = {
+        "observation_mean": np.linspace(-0.3, 0.4, 18),
+        "observation_std": np.linspace(2.0, 3.0, 18),
+    }
     integral = {"gain": 2.0, "distance": 2.0, "speed": 9.0, "limit": 0.1}
     frames = {"last_action": True, "history": [0, 2, 5], "position_integral": integral}
     settings = FlightSettings(vehicle="hummingbird", **frames, **scaling)
-    model = DAgger("MlpPolicy", QuadcopterVecEnv(4, **settings.in_any_task()), GeometricExpert("hummingbird"), **SMALL)
+    model = DAgger(
+        "MlpPolicy",
+        QuadcopterVecEnv(4, **settings.in_any_task()),
+        GeometricExpert("hummingbird"),
+        **SMALL,
+    )
     settings.write_into(model)
     model.save(folder / "extended.zip")
     return folder / "extended.zip"
@@ -98,13 +135,20 @@ def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_pa
     path = save_extended(tmp_path) if name == "extended" else sb3_quad.pretrained(name)
     model = PPO.load(path, device="cpu")
     settings = {**sb3_quad.env_kwargs(path), "noise": 0.0, "vehicles": None}
-    env = QuadcopterVecEnv(1, "state_recovery", {"velocity_std": 1.0}, max_episode_steps=1000, seed=3, **settings)
-    observation, action = runpy.run_path(str(EXAMPLE))["Observation"](model.flight_settings), np.zeros((1, 4))
+    env = QuadcopterVecEnv(
+        1, "state_recovery", {"velocity_std": 1.0}, max_episode_steps=1000, seed=3, **settings
+    )
+    observation, action = (
+        runpy.run_path(str(EXAMPLE))["Observation"](model.flight_settings),
+        np.zeros((1, 4)),
+    )
     expected = env.reset()
     for _ in range(150 if name == "extended" else 500):
         state = env.true_state()
         position = (state.position - state.target)[0]
-        seen = observation(position, state.rotation[0], state.velocity[0], state.body_rates[0], action[0])
+        seen = observation(
+            position, state.rotation[0], state.velocity[0], state.body_rates[0], action[0]
+        )
         np.testing.assert_allclose(seen, expected[0], rtol=1e-6, atol=1e-6)
         action = model.predict(seen[None], deterministic=True)[0]
         expected, _, done, _ = env.step(action)
@@ -118,13 +162,23 @@ def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_pa
 def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path):
     zips = [str(sb3_quad.pretrained(name)) for name in pretrained_names()]
     command = [sys.executable, "-W", "error", "-c", RUN, str(EXAMPLE)]
-    result = subprocess.run([*command, *zips, str(save_extended(tmp_path))], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        [*command, *zips, str(save_extended(tmp_path))], capture_output=True, text=True, check=False
+    )
     assert result.returncode == 0, result.stderr
-    distances = [float(line.rpartition(": ")[2].split(" m from")[0]) for line in result.stdout.splitlines()]
+    distances = [
+        float(line.rpartition(": ")[2].split(" m from")[0]) for line in result.stdout.splitlines()
+    ]
     assert len(distances) == len(zips) + 1
     for name, distance in zip(pretrained_names(), distances, strict=False):
         assert distance < BESIDE.get(name, 0.1), name
     model = DAgger("MlpPolicy", QuadcopterVecEnv(4), PIDExpert(), **SMALL)
     model.save(tmp_path / "silent.zip")
-    result = subprocess.run([*command, str(tmp_path / "silent.zip")], capture_output=True, text=True, check=False)
-    assert result.returncode == 1 and "flight_settings" in result.stderr and "Traceback" not in result.stderr
+    result = subprocess.run(
+        [*command, str(tmp_path / "silent.zip")], capture_output=True, text=True, check=False
+    )
+    assert (
+        result.returncode == 1
+        and "flight_settings" in result.stderr
+        and "Traceback" not in result.stderr
+    )

@@ -1,6 +1,8 @@
-"""rl_zoo3 and this package: docs/reference/zoo_flags.md, and the bridge in rl_zoo3's own environment (``make test-zoo``).
+"""rl_zoo3 and this package: docs/reference/zoo_flags.md, and the bridge in rl_zoo3's own
+environment (``make test-zoo``).
 
-rl_zoo3 patches Gymnasium where it is imported, so everything of it runs in processes of its own; skipped where it is missing.
+rl_zoo3 patches Gymnasium where it is imported, so everything of it runs in processes of its own;
+skipped where it is missing.
 """
 
 import argparse
@@ -22,15 +24,33 @@ from sb3_quad.training.runs import open_run
 
 ROOT = Path(__file__).resolve().parent.parent
 ENV = "QuadStateRecovery-v0"
-OURS = {"train": "train", "enjoy": "enjoy", "plot_from_file": "plot", "plot_train": "plot", "all_plots": "plot"}
+OURS = {
+    "train": "train",
+    "enjoy": "enjoy",
+    "plot_from_file": "plot",
+    "plot_train": "plot",
+    "all_plots": "plot",
+}
 OURS |= {"record_video": "enjoy", "benchmark": "evaluate"}
-SCRIPTS = ("train", "enjoy", "plot_train", "all_plots", "plot_from_file", "record_video", "record_training", "benchmark")
+SCRIPTS = (
+    "train",
+    "enjoy",
+    "plot_train",
+    "all_plots",
+    "plot_from_file",
+    "record_video",
+    "record_training",
+    "benchmark",
+)
 SETTINGS = {
     "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.Tanh)",
     "policy": "MlpPolicy",
     "n_timesteps": 800,
     "n_envs": 8,
-    "env_kwargs": {"task": {"state_recovery": 0.5, "target_tracking": 0.5}, "max_episode_steps": 30},
+    "env_kwargs": {
+        "task": {"state_recovery": 0.5, "target_tracking": 0.5},
+        "max_episode_steps": 30,
+    },
     "eval_env_kwargs": {"task": "state_recovery", "max_episode_steps": 20},
     "expert": "geometric",
     "n_steps": 50,
@@ -40,18 +60,26 @@ SETTINGS = {
 }
 
 pytestmark = pytest.mark.timeout(900)
-with_zoo = pytest.mark.skipif(importlib.util.find_spec("rl_zoo3") is None, reason="needs rl_zoo3, the extra [zoo]")
+with_zoo = pytest.mark.skipif(
+    importlib.util.find_spec("rl_zoo3") is None, reason="needs rl_zoo3, the extra [zoo]"
+)
 
 
 def table():
     """From a script of rl_zoo3 to its rows: option strings, status, remark."""
-    sections = re.split(r"^## ", (ROOT / "docs/reference/zoo_flags.md").read_text(encoding="utf-8"), flags=re.MULTILINE)
+    sections = re.split(
+        r"^## ",
+        (ROOT / "docs/reference/zoo_flags.md").read_text(encoding="utf-8"),
+        flags=re.MULTILINE,
+    )
     found = {}
     for section in sections:
         name = section.split("\n", 1)[0].strip()
         if name in SCRIPTS:
             rows = re.findall(r"^\| (`-[^|]*) \| (\w+) \|([^\n]*)\|$", section, flags=re.MULTILINE)
-            found[name] = [(re.findall(r"`([^`]+)`", flags), status, remark) for flags, status, remark in rows]
+            found[name] = [
+                (re.findall(r"`([^`]+)`", flags), status, remark) for flags, status, remark in rows
+            ]
     return found
 
 
@@ -62,7 +90,9 @@ def our_flags(command):
 
 
 def test_the_table_is_true_of_ours():
-    """What is the same has all its spellings here, what is missing has none, what is elsewhere is there."""
+    """What is the same has all its spellings here, what is missing has none, what is elsewhere is
+    there.
+    """
     tables = table()
     assert set(tables) == set(SCRIPTS) and all(len(rows) > 8 for rows in tables.values())
     for script, rows in tables.items():
@@ -72,7 +102,10 @@ def test_the_table_is_true_of_ours():
             if command is not None:
                 there = our_flags(command)
                 assert status != "same" or set(flags) <= there, (script, flags)
-                assert status != "missing" or not {flag for flag in flags if flag.startswith("--")} & there, (script, flags)
+                assert (
+                    status != "missing"
+                    or not {flag for flag in flags if flag.startswith("--")} & there
+                ), (script, flags)
             for elsewhere, flag in re.findall(r"`sb3-quad ([\w-]+) (--[\w-]+)`", remark):
                 assert flag in our_flags(elsewhere), (script, flags, remark)
 
@@ -99,9 +132,23 @@ json.dump(found, open("flags.json", "w"))
 def run(*arguments, cwd, **environment):
     """Output of a command of this interpreter that must succeed."""
     path = os.pathsep.join(map(str, (ROOT, ROOT / "examples" / "zoo_bridge")))
-    given = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg", **environment}
+    given = {
+        **os.environ,
+        "PYTHONPATH": path,
+        "OMP_NUM_THREADS": "1",
+        "MPLBACKEND": "Agg",
+        **environment,
+    }
     command = [sys.executable, *map(str, arguments)]
-    result = subprocess.run(command, cwd=cwd, env=given, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        command,
+        cwd=cwd,
+        env=given,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert result.returncode == 0, f"{command}\n{result.stdout}\n{result.stderr}"
     return result.stdout
 
@@ -132,20 +179,70 @@ for arguments in json.load(open("commands.json")):
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory):
-    """A folder where rl_zoo3 trained and flew our algorithms, and flew a run of ours; and what it said."""
+    """A folder where rl_zoo3 trained and flew our algorithms, and flew a run of ours; and what it
+    said.
+    """
     folder = tmp_path_factory.mktemp("zoo")
     (folder / "small.yml").write_text(yaml.safe_dump({ENV: SETTINGS}))
-    ours = ["train", "--algo", "ppo_bc", "--env", ENV, "-conf", folder / "small.yml", "-f", folder / "ours"]
-    assert main([str(part) for part in [*ours, "--eval-episodes", "2", "--env-kwargs", "noise:0"]]) == 0
-    common = ["--env", ENV, "-conf", "small.yml", "-f", "logs", "--device", "cpu", "--seed", "1", "--verbose", "1"]
+    ours = [
+        "train",
+        "--algo",
+        "ppo_bc",
+        "--env",
+        ENV,
+        "-conf",
+        folder / "small.yml",
+        "-f",
+        folder / "ours",
+    ]
+    assert (
+        main([str(part) for part in [*ours, "--eval-episodes", "2", "--env-kwargs", "noise:0"]])
+        == 0
+    )
+    common = [
+        "--env",
+        ENV,
+        "-conf",
+        "small.yml",
+        "-f",
+        "logs",
+        "--device",
+        "cpu",
+        "--seed",
+        "1",
+        "--verbose",
+        "1",
+    ]
     evaluation = ["--eval-freq", "400", "--eval-episodes", "2"]
-    dagger = ["train", "--algo", "dagger", *common, *evaluation, "--save-freq", "400", "-params", "dataset_capacity:1000"]
+    dagger = [
+        "train",
+        "--algo",
+        "dagger",
+        *common,
+        *evaluation,
+        "--save-freq",
+        "400",
+        "-params",
+        "dataset_capacity:1000",
+    ]
     agent = f"logs/dagger/{ENV}_1/{ENV}.zip"
     ppo_bc = ["train", "--algo", "ppo_bc", *common]
     commands = [
         [*dagger, "--env-kwargs", "noise:0.1"],
         [*ppo_bc, "--eval-freq", "-1", "-i", agent, "-params", "vec_env:'dummy'", "n_envs:2"],
-        ["enjoy", "--algo", "dagger", "--env", ENV, "-f", "logs", "--no-render", "-n", "40", "--load-best"],
+        [
+            "enjoy",
+            "--algo",
+            "dagger",
+            "--env",
+            ENV,
+            "-f",
+            "logs",
+            "--no-render",
+            "-n",
+            "40",
+            "--load-best",
+        ],
         ["enjoy", "--algo", "ppo_bc", "--env", ENV, "-f", "ours", "--no-render", "-n", "40"],
     ]
     (folder / "commands.json").write_text(json.dumps(commands))
@@ -158,11 +255,19 @@ def session(tmp_path_factory):
 def test_rl_zoo3_trains_with_our_settings(session):
     folder, _ = session
     path = folder / "logs" / "dagger" / f"{ENV}_1"
-    assert {f"{ENV}.zip", "best_model.zip", "rl_model_400_steps.zip", "evaluations.npz", "0.monitor.csv"} <= {
-        entry.name for entry in path.iterdir()
-    }
+    assert {
+        f"{ENV}.zip",
+        "best_model.zip",
+        "rl_model_400_steps.zip",
+        "evaluations.npz",
+        "0.monitor.csv",
+    } <= {entry.name for entry in path.iterdir()}
     settings, arguments = open_run(path).read_yaml()
-    assert settings == {**SETTINGS, "env_kwargs": {**SETTINGS["env_kwargs"], "noise": 0.1}, "dataset_capacity": 1000}
+    assert settings == {
+        **SETTINGS,
+        "env_kwargs": {**SETTINGS["env_kwargs"], "noise": 0.1},
+        "dataset_capacity": 1000,
+    }
     assert arguments["env_kwargs"] == {**settings["env_kwargs"], **SETTINGS["eval_env_kwargs"]}
     assert arguments["algo"] == "dagger" and arguments["env"] == ENV
     with np.load(path / "evaluations.npz") as file:
@@ -205,7 +310,22 @@ def test_it_shows_its_runs_and_ours(session, which):
 @with_zoo
 def test_ours_shows_its_runs(session, capsys):
     folder, _ = session
-    assert main(["enjoy", "--algo", "dagger", "--env", ENV, "-f", str(folder / "logs"), "--no-render", "--load-best"]) == 0
+    assert (
+        main(
+            [
+                "enjoy",
+                "--algo",
+                "dagger",
+                "--env",
+                ENV,
+                "-f",
+                str(folder / "logs"),
+                "--no-render",
+                "--load-best",
+            ]
+        )
+        == 0
+    )
     assert "after 0.20 s" in capsys.readouterr().out
 
 

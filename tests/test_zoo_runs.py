@@ -1,4 +1,6 @@
-"""Run folders of rl_zoo3 in ours: their YAML, and agents of algorithms that we do not train. Needs no rl_zoo3."""
+"""Run folders of rl_zoo3 in ours: their YAML, and agents of algorithms that we do not train. Needs
+no rl_zoo3.
+"""
 
 from collections import OrderedDict
 
@@ -50,14 +52,23 @@ def foreign_run(tmp_path):
     path = tmp_path / "logs" / "sac" / f"{ENV}_1"
     (path / ENV).mkdir(parents=True)
     SAC("MlpPolicy", QuadcopterVecEnv(1), buffer_size=1, device="cpu").save(path / f"{ENV}.zip")
-    settings = {"env_kwargs": {"max_episode_steps": 30}, "n_timesteps": 1000.0, "train_freq": 1, "normalize": False}
+    settings = {
+        "env_kwargs": {"max_episode_steps": 30},
+        "n_timesteps": 1000.0,
+        "train_freq": 1,
+        "normalize": False,
+    }
     (path / ENV / "config.yml").write_text(yaml.dump(OrderedDict(settings)))
-    (path / ENV / "args.yml").write_text(yaml.dump(OrderedDict(algo="sac", env=ENV, env_kwargs=None)))
+    (path / ENV / "args.yml").write_text(
+        yaml.dump(OrderedDict(algo="sac", env=ENV, env_kwargs=None))
+    )
     return path
 
 
 def enjoy_sac(path):
-    return main(["enjoy", "--algo", "sac", "--env", ENV, "-f", str(path.parent.parent), "--no-render"])
+    return main(
+        ["enjoy", "--algo", "sac", "--env", ENV, "-f", str(path.parent.parent), "--no-render"]
+    )
 
 
 def test_ours_shows_runs_of_other_algorithms(foreign_run, capsys):

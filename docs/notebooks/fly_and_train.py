@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Fly and train in five minutes
 #
-# First you fly an agent that comes with the package. Then you train one of your own: it imitates a PID controller, and
-# PPO takes it further than its expert. Everything runs on one core of a CPU.
+# First you fly an agent that comes with the package. Then you train one of your own: it imitates a
+# PID controller, and PPO takes it further than its expert. Everything runs on one core of a CPU.
 
 # %%
 import matplotlib.pyplot as plt
@@ -41,9 +41,10 @@ REINFORCEMENT = 3_000_000  # timesteps of stage two
 # %% [markdown]
 # ## Fly
 #
-# A *state recovery* begins in any attitude, upside down included, with random velocity and body rates. The controller
-# has to level the quadcopter and bring it back to where it was let go. `fly` flies any number of episodes side by side,
-# and the same seed gives every controller the same starts. A `Recorder` keeps the trajectories.
+# A *state recovery* begins in any attitude, upside down included, with random velocity and body
+# rates. The controller has to level the quadcopter and bring it back to where it was let go. `fly`
+# flies any number of episodes side by side, and the same seed gives every controller the same
+# starts. A `Recorder` keeps the trajectories.
 
 
 # %%
@@ -56,9 +57,15 @@ def recorded(controller, n=24, seed=7):
 
 # %% tags=["hide-input"]
 def plot_recoveries(controllers):
-    """Tilt and distance from the target over time, one column for each controller; a cross where a flight is lost."""
-    _, axes = plt.subplots(2, len(controllers), figsize=(4.2 * len(controllers), 4.6), sharex=True, sharey="row")
-    for (top, bottom), (name, controller), colour in zip(axes.T, controllers.items(), COLOURS, strict=False):
+    """Tilt and distance from the target over time, one column for each controller; a cross where a
+    flight is lost.
+    """
+    _, axes = plt.subplots(
+        2, len(controllers), figsize=(4.2 * len(controllers), 4.6), sharex=True, sharey="row"
+    )
+    for (top, bottom), (name, controller), colour in zip(
+        axes.T, controllers.items(), COLOURS, strict=False
+    ):
         flights = recorded(controller)
         _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
         tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1)))  # of the body's z axis
@@ -67,7 +74,13 @@ def plot_recoveries(controllers):
             panel.plot(flights["time"], values.T, color=colour, alpha=0.55, linewidth=1)
             for row, samples in zip(values, flights["samples"], strict=True):
                 if samples < len(flights["time"]):
-                    panel.plot(flights["time"][samples - 1], row[samples - 1], "x", color="#1c2430", markersize=5)
+                    panel.plot(
+                        flights["time"][samples - 1],
+                        row[samples - 1],
+                        "x",
+                        color="#1c2430",
+                        markersize=5,
+                    )
         top.set_title(name, loc="left", fontweight="bold")
         bottom.set(xlabel="time (s)", xlim=(0, 6))
     axes[0, 0].set(ylabel="tilt (deg)", yticks=[0, 45, 90, 135, 180])
@@ -76,16 +89,22 @@ def plot_recoveries(controllers):
 
 
 # %%
-plot_recoveries({"PID expert": PIDExpert(), "itm-recovery, which comes with the package": load_pretrained("itm-recovery")})
+plot_recoveries(
+    {
+        "PID expert": PIDExpert(),
+        "itm-recovery, which comes with the package": load_pretrained("itm-recovery"),
+    }
+)
 
 # %% [markdown]
-# Each line is a flight, each cross the end of one. The PID controller linearises at hover, and loses most flights that
-# begin upside down. The agent has learnt to turn over first.
+# Each line is a flight, each cross the end of one. The PID controller linearises at hover, and
+# loses most flights that begin upside down. The agent has learnt to turn over first.
 #
 # ## Stage one: imitate
 #
-# `DAgger` lets the policy fly and asks the expert what it would have done in each state. It is used as any algorithm of
-# Stable-Baselines3 is. `QuadcopterVecEnv` flies all its quadcopters in one compiled call.
+# `DAgger` lets the policy fly and asks the expert what it would have done in each state. It is used
+# as any algorithm of Stable-Baselines3 is. `QuadcopterVecEnv` flies all its quadcopters in one
+# compiled call.
 
 # %%
 imitation = DAgger(
@@ -109,9 +128,9 @@ imitation.save("imitation")
 # %% [markdown]
 # ## Stage two: go beyond the expert
 #
-# `PPOBC` is PPO with a cloning term that keeps the policy near the expert. `bc_filter="agreement"` leaves out the
-# states in which the agent recovers and the PID would do otherwise. The callback notes the mean reward of
-# the last episodes, as any callback of Stable-Baselines3 can.
+# `PPOBC` is PPO with a cloning term that keeps the policy near the expert. `bc_filter="agreement"`
+# leaves out the states in which the agent recovers and the PID would do otherwise. The callback
+# notes the mean reward of the last episodes, as any callback of Stable-Baselines3 can.
 
 
 # %%
@@ -162,15 +181,19 @@ timesteps, rewards = np.array(curve.points).T
 # %% tags=["hide-input"]
 figure, axes = plt.subplots(figsize=(6.4, 3))
 axes.plot(timesteps / 1e6, rewards, color=COLOURS[0])
-axes.set(xlabel="million timesteps of stage two", ylabel="mean reward of an episode", title="Learning curve")
+axes.set(
+    xlabel="million timesteps of stage two",
+    ylabel="mean reward of an episode",
+    title="Learning curve",
+)
 plt.show()
 
 # %% [markdown]
-# The first points are those of few and short episodes. After two rollouts, in which only the critic learns, the policy
-# gets better.
+# The first points are those of few and short episodes. After two rollouts, in which only the critic
+# learns, the policy gets better.
 #
-# A policy that hovers beside its target is corrected without training: `trim` measures the offset and takes it out of
-# the first layer.
+# A policy that hovers beside its target is corrected without training: `trim` measures the offset
+# and takes it out of the first layer.
 
 # %%
 trim(agent)
@@ -183,11 +206,15 @@ agent.save("my_agent")
 
 # %%
 stages = {"PID expert": PIDExpert(), "stage one, DAgger": imitation, "stage two, PPO+BC": agent}
-recoveries = {name: fly(each, "state_recovery", EPISODES, seed=1000) for name, each in stages.items()}
+recoveries = {
+    name: fly(each, "state_recovery", EPISODES, seed=1000) for name, each in stages.items()
+}
 targets = {name: fly(each, "target_tracking", EPISODES, seed=1000) for name, each in stages.items()}
 for name in stages:
     survival, error = recoveries[name].survival.mean(), np.median(targets[name].final_error)
-    print(f"{name:18} {survival:6.1%} of recoveries survive; median final error of targets 10 m away {error:.3f} m")
+    print(
+        f"{name:18} {survival:6.1%} of recoveries survive; median final error of targets 10 m away {error:.3f} m"
+    )
 
 # %% tags=["hide-input"]
 figure, axes = plt.subplots(figsize=(6.4, 3))
@@ -195,7 +222,12 @@ times = np.linspace(0, 6, 301)
 for (name, flights), colour in zip(recoveries.items(), COLOURS, strict=False):
     stable = [(flights.stabilised <= time).mean() * 100 for time in times]
     axes.plot(times, stable, color=colour, label=name, linewidth=2)
-axes.set(xlabel="time since the start (s)", ylabel="flights that are stable (%)", xlim=(0, 6), ylim=(0, 102))
+axes.set(
+    xlabel="time since the start (s)",
+    ylabel="flights that are stable (%)",
+    xlim=(0, 6),
+    ylim=(0, 102),
+)
 axes.set_title("How soon they are stable again")
 axes.legend(loc="lower right")
 plt.show()
@@ -206,6 +238,6 @@ plot_recoveries(stages)
 # %% [markdown]
 # ## Further
 #
-# `my_agent.zip` is a zip of stock `PPO`. The same two stages with more timesteps, evaluations, snapshots and a table at
-# the end are one command: `sb3-quad train --thesis`. `sb3-quad demo my_agent.zip pid` writes a page in which you throw
-# your own agent about.
+# `my_agent.zip` is a zip of stock `PPO`. The same two stages with more timesteps, evaluations,
+# snapshots and a table at the end are one command: `sb3-quad train --thesis`. `sb3-quad demo
+# my_agent.zip pid` writes a page in which you throw your own agent about.

@@ -13,8 +13,8 @@
 # %% [markdown]
 # # Your own expert and reward
 #
-# The experts of the package hurry. Suppose your quadcopter carries a cup of coffee: it should fly slowly and hardly
-# tilt. An expert of your own says so by example, a reward of your own by a price.
+# The experts of the package hurry. Suppose your quadcopter carries a cup of coffee: it should fly
+# slowly and hardly tilt. An expert of your own says so by example, a reward of your own by a price.
 
 # %%
 import matplotlib.pyplot as plt
@@ -42,9 +42,9 @@ REINFORCEMENT = 600_000  # timesteps that another learns from the reward
 # %% [markdown]
 # ## An expert
 #
-# An expert has `actions(state)`: for the true state of n vehicles it returns n rows of four rotor thrusts in [-1, 1].
-# Here the geometric controller of the package does the work, and only ever sees a target close ahead. The nearer that
-# target, the slower it flies.
+# An expert has `actions(state)`: for the true state of n vehicles it returns n rows of four rotor
+# thrusts in [-1, 1]. Here the geometric controller of the package does the work, and only ever sees
+# a target close ahead. The nearer that target, the slower it flies.
 
 
 # %%
@@ -80,7 +80,9 @@ def recorded(controller, n=24, seed=7):
 
 # %% tags=["hide-input"]
 def plot_flights(controllers):
-    """Distance from the target, speed and tilt over time: the median of the flights, and the range of nine in ten."""
+    """Distance from the target, speed and tilt over time: the median of the flights, and the range
+    of nine in ten.
+    """
     _, panels = plt.subplots(1, 3, figsize=(11, 3.2))
     for (name, controller), colour in zip(controllers.items(), COLOURS, strict=False):
         flights = recorded(controller)
@@ -94,7 +96,9 @@ def plot_flights(controllers):
             low, middle, high = np.nanpercentile(each, [5, 50, 95], axis=0)
             panel.fill_between(flights["time"], low, high, color=colour, alpha=0.15, linewidth=0)
             panel.plot(flights["time"], middle, color=colour, label=name)
-    for panel, label in zip(panels, ("distance from the target (m)", "speed (m/s)", "tilt (deg)"), strict=True):
+    for panel, label in zip(
+        panels, ("distance from the target (m)", "speed (m/s)", "tilt (deg)"), strict=True
+    ):
         panel.set(xlabel="time (s)", ylabel=label, xlim=(0, 15), ylim=(0, None))
     panels[0].legend()
     plt.show()
@@ -107,8 +111,8 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert}
 # %% [markdown]
 # ## An agent that imitates it
 #
-# The agent sees 18 noisy features instead of the true state. `beta` is the share of the flights that the expert flies
-# itself: all in the first rollout, fewer in each that follows.
+# The agent sees 18 noisy features instead of the true state. `beta` is the share of the flights
+# that the expert flies itself: all in the first rollout, fewer in each that follows.
 
 # %%
 agent = DAgger(
@@ -134,14 +138,16 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert,
 # %% [markdown]
 # ## A reward
 #
-# The coefficients of the task's reward have names, and are arguments of the environment: `task_kwargs={"tilt_cost":
-# 0.004}` doubles the thesis's price of a tilt. Anything else is a wrapper. This one charges for restless rotors, which
-# spill coffee too.
+# The coefficients of the task's reward have names, and are arguments of the environment:
+# `task_kwargs={"tilt_cost": 0.004}` doubles the thesis's price of a tilt. Anything else is a
+# wrapper. This one charges for restless rotors, which spill coffee too.
 
 
 # %%
 class CalmActions(VecEnvWrapper):
-    """Takes ``cost`` times the mean squared change of the action from the reward of every control step."""
+    """Takes ``cost`` times the mean squared change of the action from the reward of every control
+    step.
+    """
 
     def __init__(self, venv, cost):
         super().__init__(venv)
@@ -166,14 +172,18 @@ class CalmActions(VecEnvWrapper):
 
 
 # %% [markdown]
-# `itm-imitation` comes with the package and has never heard of that price. `PPOBC` goes on from it: PPO, with a cloning
-# term that keeps the policy near an expert.
+# `itm-imitation` comes with the package and has never heard of that price. `PPOBC` goes on from it:
+# PPO, with a cloning term that keeps the policy near an expert.
 
 
 # %%
 def make_env(n_envs, seed):
-    """Flights to targets 10 m away, where tilts cost twice as much as in the thesis, and restless rotors something."""
-    env = QuadcopterVecEnv(n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed)
+    """Flights to targets 10 m away, where tilts cost twice as much as in the thesis, and restless
+    rotors something.
+    """
+    env = QuadcopterVecEnv(
+        n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed
+    )
     return CalmActions(env, cost=2.0)
 
 
@@ -199,7 +209,8 @@ calm.learn(REINFORCEMENT)
 calm.save("calm")
 
 # %% [markdown]
-# The new reward on fresh flights, before and after, and where it comes from: the squared change of the action over time.
+# The new reward on fresh flights, before and after, and where it comes from: the squared change of
+# the action over time.
 
 
 # %%
@@ -208,7 +219,9 @@ def mean_reward(controller):
     env = make_env(EPISODES, seed=1_000_000)
     observations, total = env.reset(), np.zeros(EPISODES)
     for _ in range(500):
-        observations, rewards, _, _ = env.step(controller.predict(observations, deterministic=True)[0])
+        observations, rewards, _, _ = env.step(
+            controller.predict(observations, deterministic=True)[0]
+        )
         total += rewards
     return total.mean()
 
@@ -218,18 +231,27 @@ before_and_after = {"before": load_pretrained("itm-imitation"), "after": calm}
 for (name, controller), colour in zip(before_and_after.items(), COLOURS, strict=False):
     flights = recorded(controller, n=EPISODES, seed=1_000_000)
     change = np.square(np.diff(flights["action"], axis=1)).mean(axis=(0, 2))
-    print(f"{name:6} mean reward {mean_reward(controller):6.2f}, mean squared change {np.nanmean(change):.6f}")
+    print(
+        f"{name:6} mean reward {mean_reward(controller):6.2f}, mean squared change {np.nanmean(change):.6f}"
+    )
     axes.semilogy(flights["time"][1:], change, color=colour, label=name)
-axes.set(xlabel="time (s)", ylabel="mean squared change", xlim=(0, 5), title="How restless the rotors are")
+axes.set(
+    xlabel="time (s)",
+    ylabel="mean squared change",
+    xlim=(0, 5),
+    title="How restless the rotors are",
+)
 axes.yaxis.set_major_formatter("{x:g}")
 axes.legend()
 plt.show()
 
 # %% [markdown]
-# The price is one of squares: the large changes on the way fell, the small ones at the target matter little and rose.
+# The price is one of squares: the large changes on the way fell, the small ones at the target
+# matter little and rose.
 #
 # ## Further
 #
-# In a module of yours, `my_module.py`, the expert also works in every command: `sb3-quad train --algo dagger --expert
-# my_module:UnhurriedExpert`, `sb3-quad evaluate pid my_module:UnhurriedExpert`. A coefficient of the reward can be
-# given there too: `--env-kwargs "task_kwargs:dict(tilt_cost=0.004)"`.
+# In a module of yours, `my_module.py`, the expert also works in every command: `sb3-quad train
+# --algo dagger --expert my_module:UnhurriedExpert`, `sb3-quad evaluate pid
+# my_module:UnhurriedExpert`. A coefficient of the reward can be given there too: `--env-kwargs
+# "task_kwargs:dict(tilt_cost=0.004)"`.

@@ -1,4 +1,6 @@
-"""Cameras, and where to put them so that everything is in the picture. The world frame has z up; lengths are in m."""
+"""Cameras, and where to put them so that everything is in the picture. The world frame has z up;
+lengths are in m.
+"""
 
 import math
 from typing import NamedTuple
@@ -38,7 +40,9 @@ class Camera(NamedTuple):
     lens: Lens
 
     def project(self, points: FloatArray) -> FloatArray:
-        """Column, row (pixels from the top left corner) and depth (m) at which points, (n, 3), are seen; (n, 3)."""
+        """Column, row (pixels from the top left corner) and depth (m) at which points, (n, 3), are
+        seen; (n, 3).
+        """
         width, height, slope = self.lens
         forward, right, up = self.axes @ (points - self.eye).T
         scale = height / 2.0 / (np.maximum(forward, 1e-6) * slope)
@@ -46,13 +50,17 @@ class Camera(NamedTuple):
 
 
 def direction(course: float, elevation: float) -> FloatArray:
-    """The unit vector, (3,), at an angle ``course`` about z and an angle ``elevation`` above the horizon, rad."""
+    """The unit vector, (3,), at an angle ``course`` about z and an angle ``elevation`` above the
+    horizon, rad.
+    """
     level = math.cos(elevation)
     return np.array([level * math.cos(course), level * math.sin(course), math.sin(elevation)])
 
 
 def broadside(points: FloatArray) -> FloatArray:
-    """The direction, (3,), in which a camera sees the spread of ``points``, (n, 3), best; a little downwards."""
+    """The direction, (3,), in which a camera sees the spread of ``points``, (n, 3), best; a little
+    downwards.
+    """
     spread = np.cov(points[:, :2].T) if len(points) > 2 else np.eye(2)
     x, y = np.linalg.eigh(spread)[1][:, 0]
     return direction(math.atan2(y, x) if (y, x) > (0.0, 0.0) else math.atan2(-y, -x), -DOWN)
@@ -67,14 +75,18 @@ def framing_camera(points: FloatArray, margin: float, forward: FloatArray, lens:
     axes, slopes = _axes(forward), lens.slopes
     local = points @ axes.T
     across, room = local[:, 1:], margin - slopes * local[:, :1]
-    # How far it must see, in the plane through the origin, to the left and down, and to the right and up.
+    # How far it must see, in the plane through the origin, to the left and down, and to the right
+    # and up.
     before, after = (room - across).max(axis=0), (room + across).max(axis=0)
     distance = float((0.5 * (before + after) / slopes).max())
-    return Camera(np.maximum(np.array([-distance, *(0.5 * (after - before))]) @ axes, LOWEST), axes, lens)
+    return Camera(
+        np.maximum(np.array([-distance, *(0.5 * (after - before))]) @ axes, LOWEST), axes, lens
+    )
 
 
 class ChaseCamera:
-    """A camera behind the vehicle as seen from its target and a little aside, which has both in its picture.
+    """A camera behind the vehicle as seen from its target and a little aside, which has both in its
+    picture.
 
     :param scale: the vehicle's size, in that of the default one.
     :param width: of its pictures, pixels; ``height`` likewise.
@@ -85,14 +97,20 @@ class ChaseCamera:
         self.course, self.elevation = ASIDE, -ASIDE
 
     def follow(self, state: FloatArray, share: float) -> Camera:
-        """The camera for ``state``, (STATE_SIZE,), turned towards the target by a share of the angle."""
+        """The camera for ``state``, (STATE_SIZE,), turned towards the target by a share of the
+        angle.
+        """
         x, y, z = state[TARGET] - state[POSITION]
         if math.hypot(x, y, z) > self.scale:  # nearer targets would turn it to and fro
-            self.course += share * math.remainder(math.atan2(y, x) + ASIDE - self.course, 2.0 * math.pi)
+            self.course += share * math.remainder(
+                math.atan2(y, x) + ASIDE - self.course, 2.0 * math.pi
+            )
             elevation = float(np.clip(math.atan2(z, math.hypot(x, y)) - ASIDE, -STEEPEST, STEEPEST))
             self.elevation += share * (elevation - self.elevation)
         both = np.stack([state[POSITION], state[TARGET]])
-        return framing_camera(both, CHASE_MARGIN * self.scale, direction(self.course, self.elevation), self.lens)
+        return framing_camera(
+            both, CHASE_MARGIN * self.scale, direction(self.course, self.elevation), self.lens
+        )
 
 
 def _axes(forward: FloatArray) -> FloatArray:

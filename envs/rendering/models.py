@@ -1,4 +1,6 @@
-"""The shapes that vehicles, targets and arrows are drawn with, as PyBullet bodies without mass that touch nothing; m."""
+"""The shapes that vehicles, targets and arrows are drawn with, as PyBullet bodies without mass that
+touch nothing; m.
+"""
 
 import itertools
 import math
@@ -18,13 +20,21 @@ DARK: Colour = (0.13, 0.14, 0.17, 1.0)
 GREY: Colour = (0.55, 0.58, 0.62, 1.0)
 FRONT: Colour = (0.93, 0.32, 0.10, 1.0)
 WHITE: Colour = (0.92, 0.93, 0.95, 1.0)
-SLOWED = 12.0  # the drawn rotors turn that much slower than real ones, which would seem to stand or turn backwards in a film
-HEAD = (0.75, 2.4), (0.85, 1.6), (0.95, 0.8)  # of an arrow: height of a step, of the length, and its width
+# The drawn rotors turn that much slower than real ones, which would seem to stand or turn
+# backwards in a film
+SLOWED = 12.0
+HEAD = (
+    (0.75, 2.4),
+    (0.85, 1.6),
+    (0.95, 0.8),
+)  # of an arrow: height of a step, of the length, and its width
 NOWHERE: Vector = (0.0, 0.0, -1000.0)
 
 
 class Part(NamedTuple):
-    """A part of a body: a box (its sides), a cylinder along z, or a ball; angles in rad, roll before yaw."""
+    """A part of a body: a box (its sides), a cylinder along z, or a ball; angles in rad, roll
+    before yaw.
+    """
 
     shape: int
     at: Vector = (0.0, 0.0, 0.0)
@@ -44,20 +54,29 @@ def add_body(parts: Sequence[Part], colour: Colour, client: int) -> int:
         lengths=[part.length for part in parts],
         rgbaColors=[colour for _ in parts],
         visualFramePositions=[part.at for part in parts],
-        visualFrameOrientations=[p.getQuaternionFromEuler((part.roll, 0.0, part.yaw)) for part in parts],
+        visualFrameOrientations=[
+            p.getQuaternionFromEuler((part.roll, 0.0, part.yaw)) for part in parts
+        ],
         physicsClientId=client,
     )
     return int(p.createMultiBody(0.0, -1, shape, NOWHERE, physicsClientId=client))
 
 
-def move_body(client: int, body: int, position: Sequence[float], quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> None:
+def move_body(
+    client: int,
+    body: int,
+    position: Sequence[float],
+    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
+) -> None:
     """Move a body; the quaternion is (x, y, z, w), as PyBullet's are."""
     p.resetBasePositionAndOrientation(body, position, quaternion, physicsClientId=client)
 
 
 def rotor_radius(vehicle: Vehicle) -> float:
     """Radius at which neighbouring rotors are drawn just clear of each other, m."""
-    return 0.44 * min(math.dist(one, other) for one, other in itertools.combinations(vehicle.rotor_positions, 2))
+    return 0.44 * min(
+        math.dist(one, other) for one, other in itertools.combinations(vehicle.rotor_positions, 2)
+    )
 
 
 def span(vehicle: Vehicle) -> float:
@@ -77,13 +96,19 @@ def frame(arm: float, centres: FloatArray) -> dict[Colour, list[Part]]:
     """
     parts = {
         DARK: [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.02 * arm), radius=0.30 * arm, length=0.14 * arm)],
-        GREY: [Part(p.GEOM_BOX, (-0.02 * arm, 0.0, -0.10 * arm), (0.34 * arm, 0.20 * arm, 0.12 * arm))],
+        GREY: [
+            Part(p.GEOM_BOX, (-0.02 * arm, 0.0, -0.10 * arm), (0.34 * arm, 0.20 * arm, 0.12 * arm))
+        ],
         FRONT: [],
     }
     for x, y, z in centres.tolist():
         beam = math.hypot(x, y), 0.09 * arm, 0.06 * arm
-        parts[FRONT if x > 0 else DARK].append(Part(p.GEOM_BOX, (x / 2, y / 2, 0.02 * arm), beam, yaw=math.atan2(y, x)))
-        parts[GREY].append(Part(p.GEOM_CYLINDER, (x, y, 0.45 * z), radius=0.09 * arm, length=0.9 * z))
+        parts[FRONT if x > 0 else DARK].append(
+            Part(p.GEOM_BOX, (x / 2, y / 2, 0.02 * arm), beam, yaw=math.atan2(y, x))
+        )
+        parts[GREY].append(
+            Part(p.GEOM_CYLINDER, (x, y, 0.45 * z), radius=0.09 * arm, length=0.9 * z)
+        )
     return parts
 
 
@@ -91,14 +116,23 @@ def rotor(radius: float, pitch: float) -> list[Part]:
     """A hub and two blades in the plane z = 0, pitched by an angle, rad."""
     length = 0.94 * radius
     blade = length, 0.15 * radius, 0.02 * radius
-    ends = [Part(p.GEOM_BOX, (side * length / 2, 0.0, 0.0), blade, roll=side * pitch) for side in (1.0, -1.0)]
+    ends = [
+        Part(p.GEOM_BOX, (side * length / 2, 0.0, 0.0), blade, roll=side * pitch)
+        for side in (1.0, -1.0)
+    ]
     return [Part(p.GEOM_CYLINDER, radius=0.09 * radius, length=0.16 * radius), *ends]
 
 
 def arrow(length: float, radius: float) -> list[Part]:
     """An arrow along +z from the origin; its head has three steps."""
-    head = [Part(p.GEOM_CYLINDER, (0.0, 0.0, z * length), radius=k * radius, length=0.1 * length) for z, k in HEAD]
-    return [Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.35 * length), radius=radius, length=0.7 * length), *head]
+    head = [
+        Part(p.GEOM_CYLINDER, (0.0, 0.0, z * length), radius=k * radius, length=0.1 * length)
+        for z, k in HEAD
+    ]
+    return [
+        Part(p.GEOM_CYLINDER, (0.0, 0.0, 0.35 * length), radius=radius, length=0.7 * length),
+        *head,
+    ]
 
 
 def hoop(radius: float, thickness: float, yaw: float) -> list[Part]:
@@ -108,5 +142,7 @@ def hoop(radius: float, thickness: float, yaw: float) -> list[Part]:
     for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
         level, height = radius * math.cos(angle), radius * math.sin(angle)
         at = -level * math.sin(yaw), level * math.cos(yaw), height
-        parts.append(Part(p.GEOM_CYLINDER, at, radius=thickness, length=length, roll=angle, yaw=yaw))
+        parts.append(
+            Part(p.GEOM_CYLINDER, at, radius=thickness, length=length, roll=angle, yaw=yaw)
+        )
     return parts

@@ -1,6 +1,7 @@
 """What PyBullet does not draw: sky and ground behind its bodies, and trails.
 
-Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its top.
+Points are in the world frame, m; colours are red, green, blue in [0, 1]; row 0 of a picture is its
+top.
 """
 
 from collections.abc import Sequence
@@ -50,27 +51,43 @@ def backdrop(camera: Camera, shadows: FloatArray) -> Float32Array:
     # So far away where there is no ground that haze hides it.
     distance = np.maximum(eye[2], 0.0) / np.maximum(-rays[..., 2], 1e-6)
     east, north = (eye[:2] + distance[..., None] * rays[..., :2]).transpose(2, 0, 1)
-    # What a pixel covers of the ground, in squares; finer squares blur into their mean instead of flickering.
+    # What a pixel covers of the ground, in squares; finer squares blur into their mean instead of
+    # flickering.
     footprint = distance * distance * np.float32(2.0 * slope / height / max(eye[2], 0.1) / SQUARE)
-    wave = np.sin(np.pi / SQUARE * east) * np.sin(np.pi / SQUARE * north) / np.maximum(2.0 * footprint, 0.02)
+    wave = (
+        np.sin(np.pi / SQUARE * east)
+        * np.sin(np.pi / SQUARE * north)
+        / np.maximum(2.0 * footprint, 0.02)
+    )
     dark = 0.5 + 0.5 * np.clip(wave, -1.0, 1.0) * np.clip(2.0 - 2.0 * footprint, 0.0, 1.0)
     ground = GROUND_LIGHT + dark[..., None] * (GROUND_DARK - GROUND_LIGHT)
     for centre_x, centre_y, radius in shadows.tolist():
         away = np.hypot(east - centre_x, north - centre_y) / radius
         ground *= 1.0 - SHADOW * np.clip(1.8 - 1.6 * away, 0.0, 1.0)[..., None]
-    return np.asarray(sky + np.exp(distance / -VISIBILITY)[..., None] * (ground - sky), dtype=np.float32)
+    return np.asarray(
+        sky + np.exp(distance / -VISIBILITY)[..., None] * (ground - sky), dtype=np.float32
+    )
 
 
-def draw_trails(picture: Pillow.Image, trails: Sequence[Trail], camera: Camera, depth: Float32Array) -> None:
-    """Draw trails into a picture where nothing of less ``depth``, (height, width), m, is before them."""
+def draw_trails(
+    picture: Pillow.Image, trails: Sequence[Trail], camera: Camera, depth: Float32Array
+) -> None:
+    """Draw trails into a picture where nothing of less ``depth``, (height, width), m, is before
+    them.
+    """
     high, wide = depth.shape
     larger = camera._replace(lens=Lens(wide, high, camera.lens.slope))
     draw = ImageDraw.Draw(picture)
     for trail in trails:
         column, row, away = larger.project(trail.points).T
-        widths = np.maximum(trail.width * high / (2.0 * camera.lens.slope * np.maximum(away, NEAR)), THINNEST * SUPERSAMPLING)
+        widths = np.maximum(
+            trail.width * high / (2.0 * camera.lens.slope * np.maximum(away, NEAR)),
+            THINNEST * SUPERSAMPLING,
+        )
         before = depth[row.clip(0, high - 1).astype(int), column.clip(0, wide - 1).astype(int)]
         seen = (away > NEAR) & (away < before)
         colour = tuple(round(255 * part) for part in to_rgb(trail.colour))
         for k in np.flatnonzero(seen[:-1] & seen[1:]).tolist():
-            draw.line((column[k], row[k], column[k + 1], row[k + 1]), fill=colour, width=round(widths[k]))
+            draw.line(
+                (column[k], row[k], column[k + 1], row[k + 1]), fill=colour, width=round(widths[k])
+            )

@@ -25,15 +25,19 @@ RING = 0.42  # radius of the rings around a target, m, for a vehicle of the defa
 
 
 class Pose(NamedTuple):
-    """A vehicle as it is to be drawn: its state, the wrench that acts on it, and the angles of its rotors."""
+    """A vehicle as it is to be drawn: its state, the wrench that acts on it, and the angles of its
+    rotors.
+    """
 
     state: FloatArray  # (STATE_SIZE,)
-    wrench: FloatArray  # (12,): force in the world frame, force in the body frame, N; torques likewise, N m
+    # (12,): force in the world frame, force in the body frame, N; torques likewise, N m
+    wrench: FloatArray
     rotor_angles: FloatArray  # (4,), rad
 
 
 class Scene:
-    """Vehicles of one kind, targets, and arrows of wrenches. What it adds to a client has no mass and touches nothing.
+    """Vehicles of one kind, targets, and arrows of wrenches. What it adds to a client has no mass
+    and touches nothing.
 
     :param vehicle: that is drawn.
     :param client: to draw in; None: one without a display, until :meth:`close`.
@@ -42,18 +46,35 @@ class Scene:
     """
 
     def __init__(
-        self, vehicle: Vehicle, client: int | None = None, n_vehicles: int = 1, n_targets: int = 1, size: float = 1.0
+        self,
+        vehicle: Vehicle,
+        client: int | None = None,
+        n_vehicles: int = 1,
+        n_targets: int = 1,
+        size: float = 1.0,
     ) -> None:
         self.client = int(p.connect(p.DIRECT)) if client is None else client
-        if client is None:  # also given back when the object is forgotten without close(): PyBullet's clients are limited
+        if (
+            client is None
+            # Also given back when the object is forgotten without close(): PyBullet's clients are
+            # limited
+        ):
             self._close = weakref.finalize(self, p.disconnect, self.client)
-        self.scale = size * vehicle.arm_length / REFERENCE_ARM  # distances in pictures are multiples of it
+        self.scale = (
+            size * vehicle.arm_length / REFERENCE_ARM
+        )  # distances in pictures are multiples of it
         self.span = size * models.span(vehicle)
-        self._vehicles = [_VehicleBodies(vehicle, self.client, size, self.scale) for _ in range(n_vehicles)]
+        self._vehicles = [
+            _VehicleBodies(vehicle, self.client, size, self.scale) for _ in range(n_vehicles)
+        ]
         ball = [models.Part(p.GEOM_SPHERE, radius=0.14)]
-        hoops = [models.hoop(RING * self.scale, 0.014 * self.scale, yaw) for yaw in (0.0, math.pi / 2)]
+        hoops = [
+            models.hoop(RING * self.scale, 0.014 * self.scale, yaw) for yaw in (0.0, math.pi / 2)
+        ]
         self._balls = [add_body(ball, MARKER, self.client) for _ in range(n_targets)]
-        self._hoops = [[add_body(parts, MARKER, self.client) for parts in hoops] for _ in range(n_targets)]
+        self._hoops = [
+            [add_body(parts, MARKER, self.client) for parts in hoops] for _ in range(n_targets)
+        ]
         self._shadows = np.zeros((0, 3))
 
     def place(self, poses: Sequence[Pose], targets: FloatArray) -> None:
@@ -62,7 +83,9 @@ class Scene:
         for pose, vehicle in zip(poses, self._vehicles, strict=True):
             vehicle.place(pose)
         for target, ball, hoops in zip(targets, self._balls, self._hoops, strict=True):
-            hidden = (np.linalg.norm(positions - target, axis=1) < 0.7 * self.scale).any()  # where it would hide a vehicle
+            hidden = (
+                np.linalg.norm(positions - target, axis=1) < 0.7 * self.scale
+            ).any()  # where it would hide a vehicle
             move_body(self.client, ball, NOWHERE if hidden else target.tolist())
             for hoop in hoops:
                 move_body(self.client, hoop, target.tolist())
@@ -77,7 +100,9 @@ class Scene:
             wide,
             high,
             p.computeViewMatrix(camera.eye.tolist(), (camera.eye + forward).tolist(), up.tolist()),
-            p.computeProjectionMatrixFOV(2.0 * math.degrees(math.atan(camera.lens.slope)), wide / high, NEAR, FAR),
+            p.computeProjectionMatrixFOV(
+                2.0 * math.degrees(math.atan(camera.lens.slope)), wide / high, NEAR, FAR
+            ),
             lightDirection=(np.array([1.2, 0.6, 6.0]) - 3.0 * forward).tolist(),
             shadow=0,
             lightAmbientCoeff=0.62,
@@ -89,12 +114,18 @@ class Scene:
         # Without numpy at PyBullet's build time these are flat tuples.
         bodies = np.asarray(pixels, dtype=np.uint8).reshape(high, wide, 4).copy()
         bodies[..., 3] = 255 * (np.asarray(names).reshape(high, wide) >= 0)
-        depth = FAR * NEAR / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
+        depth = (
+            FAR
+            * NEAR
+            / (FAR - (FAR - NEAR) * np.asarray(buffer, dtype=np.float32).reshape(high, wide))
+        )
         drawn = Pillow.fromarray(bodies)
         draw_trails(drawn, trails, camera, depth)
         small = np.asarray(drawn.reduce(SUPERSAMPLING), dtype=np.float32)
         behind = 255.0 * backdrop(camera, self._shadows)
-        return np.asarray(behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8)
+        return np.asarray(
+            behind + small[..., 3:] / 255.0 * (small[..., :3] - behind) + 0.5, dtype=np.uint8
+        )
 
     def close(self) -> None:
         """Give a client of its own back; calling it twice is fine."""
@@ -107,12 +138,19 @@ class _VehicleBodies:
     def __init__(self, vehicle: Vehicle, client: int, size: float, scale: float) -> None:
         self.client = client
         arm, radius = size * vehicle.arm_length, size * models.rotor_radius(vehicle)
-        self.centres = np.array([(size * x, size * y, 0.17 * arm) for x, y in vehicle.rotor_positions])
+        self.centres = np.array(
+            [(size * x, size * y, 0.17 * arm) for x, y in vehicle.rotor_positions]
+        )
         colours = [FRONT if x > 0 else WHITE for x, _ in vehicle.rotor_positions]
-        self.frame = [add_body(parts, colour, client) for colour, parts in models.frame(arm, self.centres).items()]
+        self.frame = [
+            add_body(parts, colour, client)
+            for colour, parts in models.frame(arm, self.centres).items()
+        ]
         # A rotor's drag on the body is opposed to its sense of turning.
         rotors = [models.rotor(radius, -0.25 * sense) for sense in vehicle.rotor_directions]
-        self.rotors = [add_body(parts, colour, client) for parts, colour in zip(rotors, colours, strict=True)]
+        self.rotors = [
+            add_body(parts, colour, client) for parts, colour in zip(rotors, colours, strict=True)
+        ]
         self.force = add_body(models.arrow(0.5 * scale, 0.012 * scale), FORCE, client)
         self.torque = add_body(models.arrow(0.4 * scale, 0.012 * scale), TORQUE, client)
 
@@ -122,11 +160,17 @@ class _VehicleBodies:
         rotation = QuadcopterState(pose.state[:, None]).rotation[0]
         for body in self.frame:
             move_body(self.client, body, position, (x, y, z, w))
-        for body, centre, angle in zip(self.rotors, self.centres.tolist(), pose.rotor_angles.tolist(), strict=True):
+        for body, centre, angle in zip(
+            self.rotors, self.centres.tolist(), pose.rotor_angles.tolist(), strict=True
+        ):
             turned = p.getQuaternionFromEuler((0.0, 0.0, angle))
             at, attitude = p.multiplyTransforms(position, (x, y, z, w), centre, turned)
             move_body(self.client, body, at, attitude)
-        for body, (in_world, in_body) in zip((self.force, self.torque), pose.wrench.reshape(2, 2, 3), strict=True):
+        for body, (in_world, in_body) in zip(
+            (self.force, self.torque), pose.wrench.reshape(2, 2, 3), strict=True
+        ):
             x, y, z = (in_world + rotation @ in_body).tolist()
-            along = p.getQuaternionFromEuler((0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x)))
+            along = p.getQuaternionFromEuler(
+                (0.0, math.atan2(math.hypot(x, y), z), math.atan2(y, x))
+            )
             move_body(self.client, body, position if any((x, y, z)) else NOWHERE, along)

@@ -18,7 +18,8 @@ def has_display() -> bool:
 
 
 def open_window(width: int, height: int) -> int:
-    """Open PyBullet's window, with a ground and without controls; it draws nothing until :func:`start_drawing`.
+    """Open PyBullet's window, with a ground and without controls; it draws nothing until
+    :func:`start_drawing`.
 
     :return: its client.
     :raises ConfigError: there is one already in this process, or it cannot be opened.
@@ -27,10 +28,19 @@ def open_window(width: int, height: int) -> int:
     try:
         client = int(p.connect(p.GUI, options=f"--width={width} --height={height} {sky}"))
     except p.error:
-        raise ConfigError("render_mode 'human': PyBullet opens one window per process, and one is open already") from None
+        raise ConfigError(
+            "render_mode 'human': PyBullet opens one window per process, and one is open already"
+        ) from None
     if client < 0:
-        raise ConfigError("render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'")
-    for option in (p.COV_ENABLE_RENDERING, p.COV_ENABLE_GUI, p.COV_ENABLE_MOUSE_PICKING, p.COV_ENABLE_KEYBOARD_SHORTCUTS):
+        raise ConfigError(
+            "render_mode 'human': PyBullet could not open its window; use render_mode='rgb_array'"
+        )
+    for option in (
+        p.COV_ENABLE_RENDERING,
+        p.COV_ENABLE_GUI,
+        p.COV_ENABLE_MOUSE_PICKING,
+        p.COV_ENABLE_KEYBOARD_SHORTCUTS,
+    ):
         p.configureDebugVisualizer(option, 0, physicsClientId=client)
     import pybullet_data
 
@@ -47,7 +57,9 @@ def start_drawing(client: int) -> None:
 
 
 def point_window(client: int, camera: Camera, towards: FloatArray) -> None:
-    """Look through a window from where ``camera`` is, and draw it; ``towards``: what it looks at, (3,)."""
+    """Look through a window from where ``camera`` is, and draw it; ``towards``: what it looks at,
+    (3,).
+    """
     forward = camera.axes[0]
     distance = float(np.linalg.norm(towards - camera.eye))
     p.resetDebugVisualizerCamera(

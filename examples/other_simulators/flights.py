@@ -1,7 +1,9 @@
-"""What the simulators of others have in common here: starts, observations, policies, the check of rotors, metrics, the table.
+"""What the simulators of others have in common here: starts, observations, policies, the check of
+rotors, metrics, the table.
 
-Nothing here needs ``sb3_quad``: a policy is flown as a user of the exported file would fly it. The conventions are those of
-docs/export.md: world frame with z up; body frame with x forward, y left, z up; SI units; a control step of 10 ms.
+Nothing here needs ``sb3_quad``: a policy is flown as a user of the exported file would fly it. The
+conventions are those of docs/export.md: world frame with z up; body frame with x forward, y left, z
+up; SI units; a control step of 10 ms.
 """
 
 import argparse
@@ -16,13 +18,18 @@ import numpy.typing as npt
 
 Array = npt.NDArray[Any]
 CONTROL_STEP, STEPS = 0.01, 1500  # s; control steps of a flight
-TASKS = {"targets": (0.1, np.pi), "recoveries": (0.25, np.radians(10.0))}  # success: final error (m) and tilt (rad)
+TASKS = {
+    "targets": (0.1, np.pi),
+    "recoveries": (0.25, np.radians(10.0)),
+}  # success: final error (m) and tilt (rad)
 MAX_DISTANCE, ARRIVED = 30.0, 0.1  # m: farther from the target is lost; within this it has arrived
 
 
 @dataclass
 class State:
-    """Of n vehicles: position, velocity (n, 3), world frame; quaternion (n, 4), w first, body to world; body rates (n, 3)."""
+    """Of n vehicles: position, velocity (n, 3), world frame; quaternion (n, 4), w first, body to
+    world; body rates (n, 3).
+    """
 
     position: Array
     quaternion: Array
@@ -45,7 +52,8 @@ class Simulator(Protocol):
     """n vehicles of one kind in the simulator of others."""
 
     n: int
-    rotors: Array  # (4, 3): x, y (m) and the sign of the yaw moment of each rotor, in the simulator's order
+    # (4, 3): x, y (m) and the sign of the yaw moment of each rotor, in the simulator's order
+    rotors: Array
     hover: float  # thrust of a rotor in hover, N
     ground: float  # m: height of the centre of mass when it stands on the ground
 
@@ -59,11 +67,15 @@ class Simulator(Protocol):
         """The true state."""
 
     def thrusts(self, speeds: Array) -> Array:
-        """Thrusts (N) at rotor speeds given as shares, 0 to 1, of the way from the least to the greatest."""
+        """Thrusts (N) at rotor speeds given as shares, 0 to 1, of the way from the least to the
+        greatest.
+        """
 
 
 class Policy(Protocol):
-    """Thrusts (n, 4), N, of observations (n, 18); experts look at the true state and the targets (n, 3)."""
+    """Thrusts (n, 4), N, of observations (n, 18); experts look at the true state and the targets
+    (n, 3).
+    """
 
     def reset(self, n: int) -> None:
         """Begin n flights."""
@@ -73,19 +85,25 @@ class Policy(Protocol):
 
 
 class ExportedAgent:
-    """A file of ``sb3-quad export --format onnx``, which must have been written for a vehicle with the simulator's rotors."""
+    """A file of ``sb3-quad export --format onnx``, which must have been written for a vehicle with
+    the simulator's rotors.
+    """
 
     def __init__(self, file: str, simulator: Simulator) -> None:
         import onnxruntime
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1
-        self._session = onnxruntime.InferenceSession(file, options, providers=["CPUExecutionProvider"])
+        self._session = onnxruntime.InferenceSession(
+            file, options, providers=["CPUExecutionProvider"]
+        )
         rotors = self._session.get_modelmeta().custom_metadata_map["rotors"]
         found = re.findall(r"x (\S+) m, y (\S+) m, yaw moment ([+-])", rotors)
         signs = [[np.sign(float(x)), np.sign(float(y)), float(yaw + "1")] for x, y, yaw in found]
         if not np.array_equal(signs, np.sign(simulator.rotors)):
-            raise SystemExit(f"{file}: its rotors, {rotors}, are not where the simulator has them; export for that --vehicle")
+            raise SystemExit(
+                f"{file}: its rotors, {rotors}, are not where the simulator has them; export for that --vehicle"
+            )
 
     def reset(self, n: int) -> None:
         inputs = self._session.get_inputs()
@@ -95,7 +113,9 @@ class ExportedAgent:
         if self._state is None:
             (thrusts,) = self._session.run(None, {"observation": observation})
         else:
-            thrusts, self._state = self._session.run(None, {"observation": observation, "state": self._state})
+            thrusts, self._state = self._session.run(
+                None, {"observation": observation, "state": self._state}
+            )
         return np.asarray(thrusts, np.float64)
 
 
@@ -108,7 +128,10 @@ class Raptor:
         import foundation_policy
 
         self._policy, self._thrusts = foundation_policy.Raptor(), simulator.thrusts
-        self._order = [self.MOTORS.index(tuple(signs)) for signs in np.sign(simulator.rotors).astype(int).tolist()]
+        self._order = [
+            self.MOTORS.index(tuple(signs))
+            for signs in np.sign(simulator.rotors).astype(int).tolist()
+        ]
 
     def reset(self, n: int) -> None:
         self._policy.reset()
@@ -124,11 +147,19 @@ class Raptor:
 
 
 def sample_starts(task: str, n: int, seed: int) -> tuple[State, Array]:
-    """Starts and targets (n, 3), 15 m above the ground, sampled as the tasks target_tracking and state_recovery do."""
+    """Starts and targets (n, 3), 15 m above the ground, sampled as the tasks target_tracking and
+    state_recovery do.
+    """
     rng = np.random.default_rng(seed)
-    position, zeros, level = np.tile([0.0, 0.0, 15.0], (n, 1)), np.zeros((n, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    position, zeros, level = (
+        np.tile([0.0, 0.0, 15.0], (n, 1)),
+        np.zeros((n, 3)),
+        np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+    )
     if task == "targets":
-        return State(position, level, zeros, zeros), position + 10.0 * _unit(rng.standard_normal((n, 3)))
+        return State(position, level, zeros, zeros), position + 10.0 * _unit(
+            rng.standard_normal((n, 3))
+        )
     quaternion, (v, w) = _unit(rng.standard_normal((n, 4))), rng.standard_normal((2, n, 3))
     return State(position, quaternion, 2.0 * v, 4.0 * w), position.copy()
 
@@ -145,7 +176,8 @@ def observe(state: State, target: Array) -> Array:
 
 
 def check_rotors(make: Callable[[int], Simulator]) -> None:
-    """Speed up one rotor at a time in hover: the body must turn as the rotor's place and direction say, beside what wind does.
+    """Speed up one rotor at a time in hover: the body must turn as the rotor's place and direction
+    say, beside what wind does.
 
     :raises SystemExit: it does not.
     """
@@ -154,9 +186,13 @@ def check_rotors(make: Callable[[int], Simulator]) -> None:
     x, y, yaw = simulator.rotors.T
     rates, climb = state.body_rates - still.body_rates, (state.velocity - still.velocity)[:, 2]
     if not np.array_equal(np.sign(rates), np.sign(np.stack([y, -x, yaw], axis=1))):
-        raise SystemExit(f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {rates.tolist()} rad/s")
+        raise SystemExit(
+            f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {rates.tolist()} rad/s"
+        )
     if not (climb > 0.0).all():
-        raise SystemExit(f"{simulator}: 5 % more thrust than in hover, and it climbs by {climb.tolist()} m/s")
+        raise SystemExit(
+            f"{simulator}: 5 % more thrust than in hover, and it climbs by {climb.tolist()} m/s"
+        )
 
 
 def _after_hover(simulator: Simulator, share: float) -> State:
@@ -169,7 +205,9 @@ def _after_hover(simulator: Simulator, share: float) -> State:
 
 @dataclass
 class Flights:
-    """Of n flights: who survived and succeeded, final error (m), times (s) of first and lasting arrival; else inf."""
+    """Of n flights: who survived and succeeded, final error (m), times (s) of first and lasting
+    arrival; else inf.
+    """
 
     survived: Array
     succeeded: Array
@@ -178,7 +216,9 @@ class Flights:
     stayed: Array
 
 
-def fly(simulator: Simulator, policy: Policy, task: str, seed: int, noise: float, delay: int) -> Flights:
+def fly(
+    simulator: Simulator, policy: Policy, task: str, seed: int, noise: float, delay: int
+) -> Flights:
     """Fly a task; :param delay: control steps from a command to its effect."""
     start, target = sample_starts(task, simulator.n, seed)
     rng = np.random.default_rng([seed, 1])
@@ -188,7 +228,9 @@ def fly(simulator: Simulator, policy: Policy, task: str, seed: int, noise: float
     state, lost = start, np.zeros(simulator.n, np.bool_)
     errors = np.zeros((STEPS, simulator.n))
     for step in range(STEPS):
-        observation = observe(state, target) * (1.0 + noise * rng.standard_normal((simulator.n, 18)))
+        observation = observe(state, target) * (
+            1.0 + noise * rng.standard_normal((simulator.n, 18))
+        )
         observation[lost] = 0.0
         commands.append(policy(observation.astype(np.float32), state, target))
         simulator.step(np.where(lost[:, None], simulator.hover, commands.pop(0)))
@@ -211,10 +253,13 @@ HEADER = (
 
 
 def table_row(labels: Iterable[str], targets: Flights, recoveries: Flights) -> str:
-    """A line of the table. Times are medians over all flights (a lost one never arrives), errors are of who survived."""
+    """A line of the table. Times are medians over all flights (a lost one never arrives), errors
+    are of who survived.
+    """
     both = (targets, recoveries)
     rates = [
-        " / ".join(f"{100 * getattr(each, name).mean():.1f}" for each in both) + " %" for name in ("survived", "succeeded")
+        " / ".join(f"{100 * getattr(each, name).mean():.1f}" for each in both) + " %"
+        for name in ("survived", "succeeded")
     ]
     stayed = " / ".join(_seconds(each.stayed) for each in both)
     error = targets.error[targets.survived]
@@ -236,30 +281,70 @@ class Cell:
     make: Callable[[int], Simulator]  # of n vehicles
 
 
-def main(description: str, cells: Mapping[str, Cell], others: Mapping[str, Callable[[Any], Policy]]) -> None:
+def main(
+    description: str, cells: Mapping[str, Cell], others: Mapping[str, Callable[[Any], Policy]]
+) -> None:
     """The command of a script: check the rotors, fly, print the table.
 
     :param others: controllers to compare with, by name; each is made for a simulator.
     """
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     add = parser.add_argument
-    add("files", nargs="*", help="exported agents; NAME@VEHICLE.onnx flies the cells of that vehicle, NAME.onnx all")
-    add("--cells", nargs="+", choices=cells, default=[*cells], metavar="CELL", help=f"of {', '.join(cells)} (all)")
-    add("--others", nargs="*", choices=others, default=[*others], metavar="NAME", help=f"of {', '.join(others)} (all)")
-    add("--delay", nargs="+", type=int, default=[0], help="control steps from a command to its effect; several: each (0)")
+    add(
+        "files",
+        nargs="*",
+        help="exported agents; NAME@VEHICLE.onnx flies the cells of that vehicle, NAME.onnx all",
+    )
+    add(
+        "--cells",
+        nargs="+",
+        choices=cells,
+        default=[*cells],
+        metavar="CELL",
+        help=f"of {', '.join(cells)} (all)",
+    )
+    add(
+        "--others",
+        nargs="*",
+        choices=others,
+        default=[*others],
+        metavar="NAME",
+        help=f"of {', '.join(others)} (all)",
+    )
+    add(
+        "--delay",
+        nargs="+",
+        type=int,
+        default=[0],
+        help="control steps from a command to its effect; several: each (0)",
+    )
     add("-n", type=int, default=256, help="flights of each task in a cell (256)")
     add("--seed", type=int, default=1, help="of starts and noise (1)")
-    add("--noise", type=float, default=0.05, help="relative standard deviation of each observed number (0.05)")
+    add(
+        "--noise",
+        type=float,
+        default=0.05,
+        help="relative standard deviation of each observed number (0.05)",
+    )
     options = parser.parse_args()
     print(HEADER)
     for cell in (cells[name] for name in options.cells):
         check_rotors(cell.make)
         simulator = cell.make(options.n)
         agents = [(*Path(file).stem.partition("@"), file) for file in options.files]
-        policies = {name: ExportedAgent(file, simulator) for name, _, of, file in agents if of in ("", cell.vehicle)}
+        policies = {
+            name: ExportedAgent(file, simulator)
+            for name, _, of, file in agents
+            if of in ("", cell.vehicle)
+        }
         policies |= {name: others[name](simulator) for name in options.others}
         for delay in options.delay:
             conditions = cell.conditions + f", {10 * delay} ms delay" * (delay > 0)
             for name, policy in policies.items():
-                flights = [fly(simulator, policy, task, options.seed, options.noise, delay) for task in TASKS]
+                flights = [
+                    fly(simulator, policy, task, options.seed, options.noise, delay)
+                    for task in TASKS
+                ]
                 print(table_row([cell.vehicle, conditions, name], *flights), flush=True)

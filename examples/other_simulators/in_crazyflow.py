@@ -1,10 +1,12 @@
 """Fly exported agents in crazyflow (TU Munich), as they are, and RAPTOR's policy beside them.
 
     sb3-quad export any-quadcopter --format onnx --vehicle cf2x_L250 -o any-quadcopter@cf2x_L250.onnx
-    python examples/other_simulators/in_crazyflow.py any-quadcopter@cf2x_L250.onnx --cells cf2x_L250 --delay 0 1
+    python examples/other_simulators/in_crazyflow.py any-quadcopter@cf2x_L250.onnx --cells cf2x_L250
+    --delay 0 1
 
-crazyflow: rotors M1 to M4 as Bitcraze numbers them; quaternions x, y, z, w; commands are rotor speeds in rpm. Its first
-principles: rotors that spin up and down at different rates, drag, gyroscopic propellers; Runge-Kutta with a step of 2 ms.
+crazyflow: rotors M1 to M4 as Bitcraze numbers them; quaternions x, y, z, w; commands are rotor
+speeds in rpm. Its first principles: rotors that spin up and down at different rates, drag,
+gyroscopic propellers; Runge-Kutta with a step of 2 ms.
 """
 
 from functools import partial
@@ -29,12 +31,22 @@ class Crazyflow:
     def __init__(self, drone: str, n: int) -> None:
         self.n = n
         parameters = load_params(Dynamics.first_principles, drone)
-        self._curve = np.asarray(parameters["rpm2thrust"], np.float64).ravel()  # thrust (N), polynomial in rpm
+        self._curve = np.asarray(
+            parameters["rpm2thrust"], np.float64
+        ).ravel()  # thrust (N), polynomial in rpm
         self._limits = float(parameters["thrust_min"]), float(parameters["thrust_max"])
         self.hover = float(parameters["mass"]) * 9.81 / 4.0
-        roll, pitch, yaw = np.asarray(parameters["mixing_matrix"])  # signs of the moments that a rotor's thrust makes
-        self.rotors = np.stack([-pitch * (arm := float(np.ravel(parameters["L"])[0])), roll * arm, yaw], axis=1)
-        kind = {"dynamics": Dynamics.first_principles, "control": Control.rotor_vel, "integrator": Integrator.rk4}
+        roll, pitch, yaw = np.asarray(
+            parameters["mixing_matrix"]
+        )  # signs of the moments that a rotor's thrust makes
+        self.rotors = np.stack(
+            [-pitch * (arm := float(np.ravel(parameters["L"])[0])), roll * arm, yaw], axis=1
+        )
+        kind = {
+            "dynamics": Dynamics.first_principles,
+            "control": Control.rotor_vel,
+            "integrator": Integrator.rk4,
+        }
         self._sim = Sim(n_worlds=n, drone=drone, freq=FREQUENCY, **kind)
 
     def reset(self, start: State) -> None:
@@ -47,11 +59,15 @@ class Crazyflow:
             "ang_vel": start.body_rates,
             "rotor_vel": hover,
         }
-        arrays = {name: jnp.asarray(values[:, None], jnp.float32) for name, values in fields.items()}
+        arrays = {
+            name: jnp.asarray(values[:, None], jnp.float32) for name, values in fields.items()
+        }
         self._sim.data = self._sim.data.replace(states=self._sim.data.states.replace(**arrays))
 
     def step(self, thrusts: Array) -> None:
-        self._sim.rotor_vel_control(jnp.asarray(self._speeds(thrusts.clip(*self._limits))[:, None], jnp.float32))
+        self._sim.rotor_vel_control(
+            jnp.asarray(self._speeds(thrusts.clip(*self._limits))[:, None], jnp.float32)
+        )
         self._sim.step(round(FREQUENCY * CONTROL_STEP))
 
     def state(self) -> State:

@@ -1,10 +1,12 @@
-"""Fly exported agents in l2f (RAPTOR's and Learning to Fly's simulator), as they are, and RAPTOR's policy beside them.
+"""Fly exported agents in l2f (RAPTOR's and Learning to Fly's simulator), as they are, and RAPTOR's
+policy beside them.
 
     sb3-quad export any-quadcopter --format onnx --vehicle l2f_crazyflie -o any-quadcopter@l2f_crazyflie.onnx
     python examples/other_simulators/in_l2f.py any-quadcopter@l2f_crazyflie.onnx
 
-l2f: its Crazyflie of 30.6 g, whose rotors spin up with 18/s and down with 4/s, numbered as Bitcraze numbers them; quaternions
-w, x, y, z; an action is linear in a rotor's speed, -1 its least and 1 its greatest; its step is the control step.
+l2f: its Crazyflie of 30.6 g, whose rotors spin up with 18/s and down with 4/s, numbered as Bitcraze
+numbers them; quaternions w, x, y, z; an action is linear in a rotor's speed, -1 its least and 1 its
+greatest; its step is the control step.
 """
 
 import json
@@ -13,7 +15,12 @@ import l2f
 import numpy as np
 from flights import Array, Cell, Raptor, State, main
 
-FIELDS = {"position": "position", "quaternion": "orientation", "velocity": "linear_velocity", "body_rates": "angular_velocity"}
+FIELDS = {
+    "position": "position",
+    "quaternion": "orientation",
+    "velocity": "linear_velocity",
+    "body_rates": "angular_velocity",
+}
 
 
 class L2F:
@@ -23,7 +30,11 @@ class L2F:
 
     def __init__(self, n: int) -> None:
         self.n, self._vector = n, getattr(l2f, f"vector{n}")
-        self._device, self._environment, self._rng = l2f.Device(), self._vector.VectorEnvironment(), self._vector.VectorRng()
+        self._device, self._environment, self._rng = (
+            l2f.Device(),
+            self._vector.VectorEnvironment(),
+            self._vector.VectorRng(),
+        )
         self._parameters = self._vector.VectorParameters()
         self._now, self._next = self._vector.VectorState(), self._vector.VectorState()
         self._vector.initialize_rng(self._device, self._rng, 0)
@@ -32,10 +43,15 @@ class L2F:
         single, parameters = l2f.Environment(), self._parameters.parameters[0]
         l2f.initialize_environment(self._device, single)
         dynamics = json.loads(l2f.parameters_to_json(self._device, single, parameters))["dynamics"]
-        positions, torques = np.array(dynamics["rotor_positions"]), np.array(dynamics["rotor_torque_directions"])
+        positions, torques = (
+            np.array(dynamics["rotor_positions"]),
+            np.array(dynamics["rotor_torque_directions"]),
+        )
         self.rotors = np.column_stack([positions[:, :2], torques[:, 2]])
         self.hover = dynamics["mass"] * 9.81 / 4.0
-        self._curve = np.array(dynamics["rotor_thrust_coefficients"][0])  # thrust (N), polynomial in the share of the speed
+        self._curve = np.array(
+            dynamics["rotor_thrust_coefficients"][0]
+        )  # thrust (N), polynomial in the share of the speed
 
     def reset(self, start: State) -> None:
         hover = np.full(4, self._shares(np.array(self.hover)))
@@ -47,12 +63,23 @@ class L2F:
 
     def step(self, thrusts: Array) -> None:
         actions = (2.0 * self._shares(thrusts) - 1.0).astype(np.float32)
-        self._vector.step(self._device, self._environment, self._parameters, self._now, actions, self._next, self._rng)
+        self._vector.step(
+            self._device,
+            self._environment,
+            self._parameters,
+            self._now,
+            actions,
+            self._next,
+            self._rng,
+        )
         self._now.assign(self._next)
 
     def state(self) -> State:
         return State(
-            **{ours: np.array([getattr(each, theirs) for each in self._now.states]) for ours, theirs in FIELDS.items()}
+            **{
+                ours: np.array([getattr(each, theirs) for each in self._now.states])
+                for ours, theirs in FIELDS.items()
+            }
         )
 
     def thrusts(self, speeds: Array) -> Array:
@@ -60,7 +87,9 @@ class L2F:
 
     def _shares(self, thrusts: Array) -> Array:
         c, b, a = self._curve
-        return ((-b + np.sqrt(np.maximum(b * b - 4.0 * a * (c - thrusts), 0.0))) / (2.0 * a)).clip(0.0, 1.0)
+        return ((-b + np.sqrt(np.maximum(b * b - 4.0 * a * (c - thrusts), 0.0))) / (2.0 * a)).clip(
+            0.0, 1.0
+        )
 
 
 CELLS = {"l2f_crazyflie": Cell("l2f_crazyflie", "no drag", L2F)}

@@ -1,6 +1,8 @@
-"""Fly the same exported agents and RAPTOR's policy, on the same starts, in the simulator of this package.
+"""Fly the same exported agents and RAPTOR's policy, on the same starts, in the simulator of this
+package.
 
-    python examples/other_simulators/in_own.py any-quadcopter@cf2x_L250.onnx --cells cf2x_L250 --delay 0 1
+    python examples/other_simulators/in_own.py any-quadcopter@cf2x_L250.onnx --cells cf2x_L250
+    --delay 0 1
 
 A cell is a vehicle file of that name; the delay is given here and not by the file.
 """
@@ -25,7 +27,9 @@ class Own:
     def __init__(self, vehicle: str, wind: float, n: int) -> None:
         self.n, self._vehicle = n, load_vehicle(vehicle).model_copy(update={"delay": 0})
         self.hover, self.ground = self._vehicle.hover_thrust, self._vehicle.collision_radius
-        self.rotors = np.column_stack([self._vehicle.rotor_positions, self._vehicle.rotor_directions])
+        self.rotors = np.column_stack(
+            [self._vehicle.rotor_positions, self._vehicle.rotor_directions]
+        )
         randomize = {"wind": {"magnitude": wind, "direction": [1.0, 0.0, 0.0]}} if wind else None
         endless: dict[str, Any] = {"max_episode_steps": NEVER, "task_kwargs": {"max_distance": 1e6}}
         settings = FlightSettings(vehicle=self._vehicle, randomize=randomize, noise=0.0, **endless)

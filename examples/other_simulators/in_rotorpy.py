@@ -1,10 +1,13 @@
-"""Fly exported agents in RotorPy (University of Pennsylvania), as they are, with its SE3 controller and RAPTOR's policy.
+"""Fly exported agents in RotorPy (University of Pennsylvania), as they are, with its SE3 controller
+and RAPTOR's policy.
 
     sb3-quad export any-quadcopter --format onnx --vehicle rotorpy_crazyflie -o any-quadcopter@rotorpy_crazyflie.onnx
-    python examples/other_simulators/in_rotorpy.py any-quadcopter@rotorpy_crazyflie.onnx --cells crazyflie crazyflie_wind
+    python examples/other_simulators/in_rotorpy.py any-quadcopter@rotorpy_crazyflie.onnx --cells
+    crazyflie crazyflie_wind
 
-RotorPy: rotors front left, front right, back right, back left; quaternions x, y, z, w. Its drag of rotors and body and its
-translational lift are on. SE3 sees the true state, the others observations with noise.
+RotorPy: rotors front left, front right, back right, back left; quaternions x, y, z, w. Its drag of
+rotors and body and its translational lift are on. SE3 sees the true state, the others observations
+with noise.
 """
 
 import importlib
@@ -26,16 +29,22 @@ torch.set_num_threads(1)
 
 
 class Loaded(BatchedMultirotor):
-    """Vehicles with payloads: of a mass (kg) at an offset (m, body frame) from the centre of mass; mass and inertia stay."""
+    """Vehicles with payloads: of a mass (kg) at an offset (m, body frame) from the centre of mass;
+    mass and inertia stay.
+    """
 
     payload = torch.zeros(1), torch.zeros(1, 3)
 
-    def _s_dot_fn(self, t: float, s: torch.Tensor, speeds: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
+    def _s_dot_fn(
+        self, t: float, s: torch.Tensor, speeds: torch.Tensor, rows: torch.Tensor
+    ) -> torch.Tensor:
         mass, offset = self.payload
         weight = torch.zeros(len(rows), 3)
         weight[:, 2] = -9.81 * mass
         rotation = roma.unitquat_to_rotmat(s[:, 6:10])
-        torque = torch.linalg.cross(offset.expand_as(weight), (weight.unsqueeze(1) @ rotation).squeeze(1))
+        torque = torch.linalg.cross(
+            offset.expand_as(weight), (weight.unsqueeze(1) @ rotation).squeeze(1)
+        )
         dot = super()._s_dot_fn(t, s, speeds, rows)
         dot[:, 3:6] += weight / self.params.mass
         dot[:, 10:13] += (self.params.inv_inertia @ torque.unsqueeze(-1)).squeeze(-1)
@@ -47,22 +56,42 @@ class RotorPy:
 
     :param wind: of the number of vehicles, one of its wind profiles.
     :param payload: the greatest mass of AdaptiveQuadBench's payload, by that of the vehicle.
-    :param weakness: the greatest that the thrust of each rotor may be off, either way, in shares of it.
+    :param weakness: the greatest that the thrust of each rotor may be off, either way, in shares of
+        it.
     """
 
-    def __init__(self, vehicle: str, wind: Callable[[int], Any], n: int, payload: float = 0.0, weakness: float = 0.0) -> None:
+    def __init__(
+        self,
+        vehicle: str,
+        wind: Callable[[int], Any],
+        n: int,
+        payload: float = 0.0,
+        weakness: float = 0.0,
+    ) -> None:
         parameters = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params").quad_params
-        self._substeps = max(2, round(2 * CONTROL_STEP / parameters["tau_m"]))  # Runge-Kutta steps in a control step
-        self.n, self._rows, self._wind, self._k_eta = n, torch.arange(n), wind(n), parameters["k_eta"]
+        self._substeps = max(
+            2, round(2 * CONTROL_STEP / parameters["tau_m"])
+        )  # Runge-Kutta steps in a control step
+        self.n, self._rows, self._wind, self._k_eta = (
+            n,
+            torch.arange(n),
+            wind(n),
+            parameters["k_eta"],
+        )
         self._speeds = parameters["rotor_speed_min"], parameters["rotor_speed_max"]
         self.hover = parameters["mass"] * 9.81 / 4.0
-        self.ground = {"crazyflie": 0.0145, "hummingbird": 0.06}[vehicle]  # m, as in our vehicle files
+        self.ground = {"crazyflie": 0.0145, "hummingbird": 0.06}[
+            vehicle
+        ]  # m, as in our vehicle files
         positions = np.stack([*parameters["rotor_pos"].values()])
         self.rotors = np.column_stack([positions[:, :2], parameters["rotor_directions"]])
         self.parameters = BatchedMultirotorParams([parameters] * n, n, DEVICE)
         rng, arm = np.random.default_rng(0), np.linalg.norm(positions[0])
         efficiency = torch.tensor(1.0 + weakness * rng.uniform(-1.0, 1.0, (n, 4)))
-        self.parameters.k_eta, self.parameters.k_m = self.parameters.k_eta * efficiency, self.parameters.k_m * efficiency
+        self.parameters.k_eta, self.parameters.k_m = (
+            self.parameters.k_eta * efficiency,
+            self.parameters.k_m * efficiency,
+        )
         mass = payload * parameters["mass"] * rng.uniform(0.0, 1.0, n)
         self._payload = torch.tensor(mass), torch.tensor(0.2 * arm * rng.uniform(-1.0, 1.0, (n, 3)))
 
@@ -70,7 +99,13 @@ class RotorPy:
         self._time = 0.0
         speeds = np.full((self.n, 4), np.sqrt(self.hover / self._k_eta))
         quaternions = np.roll(start.quaternion, -1, axis=1)
-        fields = {"x": start.position, "v": start.velocity, "q": quaternions, "w": start.body_rates, "rotor_speeds": speeds}
+        fields = {
+            "x": start.position,
+            "v": start.velocity,
+            "q": quaternions,
+            "w": start.body_rates,
+            "rotor_speeds": speeds,
+        }
         self.fields = {name: torch.tensor(values) for name, values in fields.items()}
         self.fields["wind"] = torch.zeros(self.n, 3)
         self._vehicles = Loaded(self.parameters, self.n, self.fields, DEVICE, integrator="rk4")
@@ -85,7 +120,9 @@ class RotorPy:
             self._time += duration
 
     def state(self) -> State:
-        position, quaternion, velocity, rates = (self.fields[name].numpy() for name in ("x", "q", "v", "w"))
+        position, quaternion, velocity, rates = (
+            self.fields[name].numpy() for name in ("x", "q", "v", "w")
+        )
         return State(position, np.roll(quaternion, 1, axis=1), velocity, rates)
 
     def thrusts(self, speeds: Array) -> Array:
@@ -94,7 +131,9 @@ class RotorPy:
 
 
 class SE3:
-    """RotorPy's own geometric controller, with the gains of its vehicle file; it sees the true state."""
+    """RotorPy's own geometric controller, with the gains of its vehicle file; it sees the true
+    state.
+    """
 
     def __init__(self, simulator: RotorPy) -> None:
         self._simulator = simulator
@@ -107,7 +146,9 @@ class SE3:
 
     def __call__(self, observation: Array, state: State, target: Array) -> Array:
         wanted = {"x": torch.tensor(target), **self._rest}
-        return np.asarray(self._control.update(0.0, self._simulator.fields, wanted)["cmd_motor_thrusts"].numpy())
+        return np.asarray(
+            self._control.update(0.0, self._simulator.fields, wanted)["cmd_motor_thrusts"].numpy()
+        )
 
 
 def gusts(n: int) -> BatchedSinusoidWind:
@@ -121,16 +162,22 @@ WINDS = {
     "_wind": ("drag, wind 4 m/s", partial(BatchedConstantWind, wx=4.0, wy=0.0, wz=0.0)),
     "_gusts": ("drag, sine gusts 2 m/s", gusts),
 }
-BENCH: dict[str, tuple[str, dict[str, float]]] = {  # the ranges of AdaptiveQuadBench's config/randomization_config.py
+BENCH: dict[
+    str, tuple[str, dict[str, float]]
+] = {  # the ranges of AdaptiveQuadBench's config/randomization_config.py
     "_payload": ("drag, payload up to 0.5 m off centre", {"payload": 0.5}),
     "_rotors": ("drag, each rotor off by up to 30 %", {"weakness": 0.3}),
 }
 CELLS = {}
 for vehicle in ("crazyflie", "hummingbird"):
     for suffix, (conditions, wind) in WINDS.items():
-        CELLS[vehicle + suffix] = Cell(f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, wind))
+        CELLS[vehicle + suffix] = Cell(
+            f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, wind)
+        )
     for suffix, (conditions, scenario) in BENCH.items():
-        CELLS[vehicle + suffix] = Cell(f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, BatchedNoWind, **scenario))
+        CELLS[vehicle + suffix] = Cell(
+            f"rotorpy_{vehicle}", conditions, partial(RotorPy, vehicle, BatchedNoWind, **scenario)
+        )
 
 if __name__ == "__main__":
     main(__doc__ or "", CELLS, {"RAPTOR": Raptor, "SE3 (true state)": SE3})

@@ -1,4 +1,6 @@
-"""``make test-transfer``: each simulator turns as its rotors say, and the shipped agents, exported, fly in it."""
+"""``make test-transfer``: each simulator turns as its rotors say, and the shipped agents, exported,
+fly in it.
+"""
 
 import os
 from pathlib import Path
@@ -11,8 +13,13 @@ from in_l2f import CELLS as L2F
 from in_rotorpy import CELLS as ROTORPY
 
 FILES = Path(os.environ["TRANSFER_FILES"])
-MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {"l2f": L2F["l2f_crazyflie"].make}
-MAKERS |= {f"rotorpy {name}": ROTORPY[name].make for name in ("crazyflie", "crazyflie_gusts", "hummingbird")}
+MAKERS = {f"crazyflow {name}": cell.make for name, cell in CRAZYFLOW.items()} | {
+    "l2f": L2F["l2f_crazyflie"].make
+}
+MAKERS |= {
+    f"rotorpy {name}": ROTORPY[name].make
+    for name in ("crazyflie", "crazyflie_gusts", "hummingbird")
+}
 
 
 @pytest.mark.parametrize("name", MAKERS)
@@ -34,7 +41,9 @@ def test_rotors_in_a_wrong_order_are_noticed(name, order):
 
 def test_a_file_for_other_rotors_is_refused():
     with pytest.raises(SystemExit, match="export for that --vehicle"):
-        ExportedAgent(str(FILES / "any-quadcopter@rotorpy_crazyflie.onnx"), CRAZYFLOW["cf21B_500"].make(4))
+        ExportedAgent(
+            str(FILES / "any-quadcopter@rotorpy_crazyflie.onnx"), CRAZYFLOW["cf21B_500"].make(4)
+        )
 
 
 @pytest.mark.parametrize(
@@ -50,6 +59,13 @@ def test_a_file_for_other_rotors_is_refused():
 @pytest.mark.parametrize("task", ["targets", "recoveries"])
 def test_exported_agents_fly(task, make, file, targets, recoveries):
     simulator = make(32)
-    flights = fly(simulator, ExportedAgent(str(FILES / f"{file}.onnx"), simulator), task, seed=3, noise=0.05, delay=0)
+    flights = fly(
+        simulator,
+        ExportedAgent(str(FILES / f"{file}.onnx"), simulator),
+        task,
+        seed=3,
+        noise=0.05,
+        delay=0,
+    )
     assert flights.succeeded.mean() >= {"targets": targets, "recoveries": recoveries}[task]
     assert np.median(flights.error[flights.survived]) < 0.03

@@ -1,6 +1,8 @@
-"""rl_zoo3's ``ExperimentManager`` with our settings files: experts, the batched environment, settings of evaluations.
+"""rl_zoo3's ``ExperimentManager`` with our settings files: experts, the batched environment,
+settings of evaluations.
 
-What differs holds for our algorithms and for any algorithm on our environments; everything else is as it was.
+What differs holds for our algorithms and for any algorithm on our environments; everything else is
+as it was.
 """
 
 import argparse
@@ -31,21 +33,25 @@ VEC_ENVS = get_args(VecEnvKind)
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     """Sets up trainings of ours in rl_zoo3.
 
-    ==========================  ===================================================================================
-    key or flag                 what becomes of it
-    ==========================  ===================================================================================
+    ==========================
+    =================================================================================== key or flag
+    what becomes of it ==========================
+    ===================================================================================
     ``--conf-file``             also a file of this package by name; by default its ``<algo>.yml``
-    ``expert``                  resolved as ``sb3-quad train`` does, for the vehicle of ``env_kwargs``
-    ``vec_env``                 ``batch`` (default), ``dummy`` or ``subproc``; the flag ``--vec-env``, where given, over it
-    ``--env-kwargs``            put over those of the file, key by key
-    ``eval_env_kwargs``         put over ``env_kwargs`` in evaluations, ``--eval-env-kwargs`` over both
-    ``eval_tasks``              left out: rl_zoo3 evaluates on one environment; a line says so
-    ``learning_rate: lin_x``    SB3's own schedule, so that the zip loads where rl_zoo3 is not installed
-    ``-i`` / --trained-agent    for our algorithms: policy and critic of any on-policy zip, with a new optimiser
-    ``-optimize``, --trial-id   for our algorithms: refused; ``sb3-quad tune`` searches, and writes settings for ``-conf``
-    ==========================  ===================================================================================
+    ``expert``                  resolved as ``sb3-quad train`` does, for the vehicle of
+    ``env_kwargs`` ``vec_env``                 ``batch`` (default), ``dummy`` or ``subproc``; the
+    flag ``--vec-env``, where given, over it ``--env-kwargs``            put over those of the file,
+    key by key ``eval_env_kwargs``         put over ``env_kwargs`` in evaluations,
+    ``--eval-env-kwargs`` over both ``eval_tasks``              left out: rl_zoo3 evaluates on one
+    environment; a line says so ``learning_rate: lin_x``    SB3's own schedule, so that the zip
+    loads where rl_zoo3 is not installed ``-i`` / --trained-agent    for our algorithms: policy and
+    critic of any on-policy zip, with a new optimiser ``-optimize``, --trial-id   for our
+    algorithms: refused; ``sb3-quad tune`` searches, and writes settings for ``-conf``
+    ==========================
+    ===================================================================================
 
-    Its ``args.yml`` gives as ``env_kwargs`` what evaluations are flown with, which is what ``enjoy`` is to show.
+    Its ``args.yml`` gives as ``env_kwargs`` what evaluations are flown with, which is what
+    ``enjoy`` is to show.
     """
 
     config: str
@@ -61,7 +67,9 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         if self._ours:
             self.config = _find_config(self.config, self.algo)
         if self._own_algorithm and (self.optimize_hyperparameters or self.trial_id):
-            raise ConfigError(f"{self.algo}: search for its hyperparameters with sb3-quad tune --algo {self.algo}")
+            raise ConfigError(
+                f"{self.algo}: search for its hyperparameters with sb3-quad tune --algo {self.algo}"
+            )
         if self._env_id in ENVIRONMENTS:
             self.monitor_kwargs = {"info_keywords": ("is_success",)}  # for plot_train -y success
 
@@ -72,42 +80,63 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         given, self.env_kwargs = self.env_kwargs, {}
         settings, saved = super().read_hyperparameters()
         for each in (settings, saved):
-            each["env_kwargs"] = {**parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"), **given}
+            each["env_kwargs"] = {
+                **parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"),
+                **given,
+            }
         return settings, saved
 
     def _preprocess_hyperparams(self, hyperparams: Settings) -> Any:
         if not self._ours:
             return super()._preprocess_hyperparams(hyperparams)
         self._choose_vec_env(hyperparams.pop("vec_env", None))
-        evaluation = parse_mapping(hyperparams.pop("eval_env_kwargs", None), f"{self.config}: eval_env_kwargs")
+        evaluation = parse_mapping(
+            hyperparams.pop("eval_env_kwargs", None), f"{self.config}: eval_env_kwargs"
+        )
         if hyperparams.pop("eval_tasks", None):
             print("eval_tasks: left out, rl_zoo3 evaluates on the environment's own task")
         expert = hyperparams.pop("expert", None)
         if self._own_algorithm:
-            hyperparams["expert"] = resolve_expert(expert or DEFAULT_EXPERT, hyperparams["env_kwargs"].get("vehicle", "itm"))
+            hyperparams["expert"] = resolve_expert(
+                expert or DEFAULT_EXPERT, hyperparams["env_kwargs"].get("vehicle", "itm")
+            )
         for name, parameter in constructor_parameters(ALGOS[self.algo]).items():
             if name in hyperparams:
                 hyperparams[name] = convert(hyperparams[name], parameter, f"{self.config}: {name}")
         if isinstance(hyperparams.get("policy_kwargs"), dict):
-            hyperparams["policy_kwargs"] = parse_mapping(hyperparams["policy_kwargs"], f"{self.config}: policy_kwargs")
+            hyperparams["policy_kwargs"] = parse_mapping(
+                hyperparams["policy_kwargs"], f"{self.config}: policy_kwargs"
+            )
         processed = super()._preprocess_hyperparams(hyperparams)
-        self.eval_env_kwargs = {**self.env_kwargs, **evaluation, **(self._eval_env_kwargs_args or {})}
+        self.eval_env_kwargs = {
+            **self.env_kwargs,
+            **evaluation,
+            **(self._eval_env_kwargs_args or {}),
+        }
         if self._batched and processed[1] is not None:
-            raise ConfigError("env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy")
+            raise ConfigError(
+                "env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy"
+            )
         return processed
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:
-        return hyperparams if self._ours else super()._preprocess_schedules(hyperparams)  # ours are made above
+        return (
+            hyperparams if self._ours else super()._preprocess_schedules(hyperparams)
+        )  # ours are made above
 
     def _choose_vec_env(self, setting: str | None) -> None:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--vec-env")
-        flag = parser.parse_known_args()[0].vec_env  # rl_zoo3's own default hides whether it was given
+        flag = parser.parse_known_args()[
+            0
+        ].vec_env  # rl_zoo3's own default hides whether it was given
         kind = flag or setting or ("batch" if self._env_id in ENVIRONMENTS else "dummy")
         if kind not in VEC_ENVS:
             raise ConfigError(f"{self.config}: {unknown('vec_env', kind, VEC_ENVS)}")
         if kind == "batch" and self._env_id not in ENVIRONMENTS:
-            raise ConfigError(f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; use dummy or subproc")
+            raise ConfigError(
+                f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; use dummy or subproc"
+            )
         self._batched = kind == "batch"
         if kind != "batch":
             self.vec_env_class = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[kind]
@@ -115,14 +144,21 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
         """The environments of a training or an evaluation, with their wrappers."""
         if self._batched:
-            kwargs = {"task": ENVIRONMENTS[self._env_id], **(self.eval_env_kwargs if eval_env else self.env_kwargs)}
-            file = None if eval_env or no_log else str(Path(self.save_path) / "0")  # with .monitor.csv after it
+            kwargs = {
+                "task": ENVIRONMENTS[self._env_id],
+                **(self.eval_env_kwargs if eval_env else self.env_kwargs),
+            }
+            file = (
+                None if eval_env or no_log else str(Path(self.save_path) / "0")
+            )  # with .monitor.csv after it
 
             def make(makers: list[Callable[[], Any]]) -> VecEnv:
                 """As many rows as SB3's ``make_vec_env`` would make environments."""
                 env = QuadcopterVecEnv(len(makers), staggered=not eval_env, **kwargs)
                 with warnings.catch_warnings():
-                    warnings.filterwarnings("ignore", "The environment is already wrapped with a `Monitor`")
+                    warnings.filterwarnings(
+                        "ignore", "The environment is already wrapped with a `Monitor`"
+                    )
                     return VecMonitor(env, file, ("is_success",))  # writes the file
 
             self.vec_env_class = make
@@ -131,7 +167,9 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
     def _load_pretrained_agent(self, hyperparams: Settings, env: VecEnv) -> Any:
         if not self._own_algorithm:
             return super()._load_pretrained_agent(hyperparams, env)
-        given = {name: getattr(self, name) for name in ("tensorboard_log", "seed", "verbose", "device")}
+        given = {
+            name: getattr(self, name) for name in ("tensorboard_log", "seed", "verbose", "device")
+        }
         model = ALGOS[self.algo](env=env, **given, **hyperparams)
         transfer_policy(self.trained_agent, model)
         return model
@@ -145,9 +183,12 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 def _find_config(given: str, algo: str) -> str:
     """The path of a settings file: one on disk, or one of this package.
 
-    :param given: as in rl_zoo3: what ``--conf-file`` says, or the path of rl_zoo3's own file if it says nothing.
+    :param given: as in rl_zoo3: what ``--conf-file`` says, or the path of rl_zoo3's own file if it
+        says nothing.
     """
-    nothing_said = Path(given) == Path(rl_zoo3.exp_manager.__file__).parent / "hyperparams" / f"{algo}.yml"
+    nothing_said = (
+        Path(given) == Path(rl_zoo3.exp_manager.__file__).parent / "hyperparams" / f"{algo}.yml"
+    )
     name = f"{algo}.yml" if nothing_said else given
     if name in SETTINGS.names() and (nothing_said or not Path(name).is_file()):
         return str(resources.files("sb3_quad.zoo_configs").joinpath(name))

@@ -1,4 +1,6 @@
-"""What algorithms learn from: SB3's rollout and replay buffers with the expert's actions, and DAgger's dataset."""
+"""What algorithms learn from: SB3's rollout and replay buffers with the expert's actions, and
+DAgger's dataset.
+"""
 
 from collections.abc import Generator
 from typing import Any, NamedTuple
@@ -6,7 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 import torch as th
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer, RolloutBuffer
+from stable_baselines3.common.buffers import (
+    DictReplayBuffer,
+    NStepReplayBuffer,
+    ReplayBuffer,
+    RolloutBuffer,
+)
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_quad.algorithms.networks.gradients import Batch
@@ -16,37 +23,54 @@ from sb3_quad.base.arrays import Arrays, Float32Array, IntArray
 class ExpertRolloutBuffer(RolloutBuffer):
     """SB3's rollout buffer with a row of expert actions beside each row of actions.
 
-    ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills; the algorithm writes row
-    ``pos`` before it calls :meth:`add` for the same step. ``labelled`` says whether it does so in this rollout.
+    ``expert_actions`` has shape (buffer_size, n_envs, action_dim) while the buffer fills; the
+    algorithm writes row ``pos`` before it calls :meth:`add` for the same step. ``labelled`` says
+    whether it does so in this rollout.
     """
 
     expert_actions: Float32Array
     labelled = False
 
     def reset(self) -> None:
-        self.expert_actions = np.zeros((self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32)
+        self.expert_actions = np.zeros(
+            (self.buffer_size, self.n_envs, self.action_dim), dtype=np.float32
+        )
         self._targets: tuple[Float32Array, Float32Array] | None = None
         super().reset()
 
-    def get(self, batch_size: int | None = None, shuffle: bool = True) -> Generator[tuple[Batch, Batch], None, None]:  # type: ignore[override]
-        """Mini-batches of the actor and of the critic, the same rows; without ``shuffle``, consecutive in time."""
-        in_time, first = np.arange(self.buffer_size * self.n_envs).reshape(self.n_envs, -1).T.reshape(-1), 0
+    def get(
+        self, batch_size: int | None = None, shuffle: bool = True
+    ) -> Generator[tuple[Batch, Batch], None, None]:  # type: ignore[override]
+        """Mini-batches of the actor and of the critic, the same rows; without ``shuffle``,
+        consecutive in time.
+        """
+        in_time, first = (
+            np.arange(self.buffer_size * self.n_envs).reshape(self.n_envs, -1).T.reshape(-1),
+            0,
+        )
         sampled: Any = super().get(batch_size)
         for rows in sampled:
             if self._targets is None:
                 labels = [self.swap_and_flatten(self.expert_actions)] if self.labelled else []
-                for_actor = np.hstack([*labels, self.actions, self.log_probs, self.advantages], dtype=np.float32)
+                for_actor = np.hstack(
+                    [*labels, self.actions, self.log_probs, self.advantages], dtype=np.float32
+                )
                 self._targets = for_actor, np.hstack([self.values, self.returns])
             chosen = rows if shuffle else in_time[first : first + len(rows)]
             first += len(rows)
-            yield Batch(chosen, self.observations, self._targets[0]), Batch(chosen, self.observations, self._targets[1])
+            yield (
+                Batch(chosen, self.observations, self._targets[0]),
+                Batch(chosen, self.observations, self._targets[1]),
+            )
 
     def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> IntArray:  # type: ignore[override]
         return batch_inds
 
 
 class ExpertReplaySamples(NamedTuple):
-    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions; Dict observations by key."""
+    """SB3's ``ReplayBufferSamples``, (b, ...) each, with the expert's scaled actions; Dict
+    observations by key.
+    """
 
     observations: th.Tensor | dict[str, th.Tensor]
     actions: th.Tensor
@@ -71,12 +95,17 @@ class ExpertReplayBuffer(ReplayBuffer):
         """Set the expert's actions (n_envs, action_dim) for the row that is added next."""
         self.expert_actions[self.pos] = actions
 
-    def _get_samples(self, batch_inds: IntArray, env: VecNormalize | None = None) -> ExpertReplaySamples:  # type: ignore[override]
-        # SB3 samples each row's environment itself and keeps it to itself: the same numbers are sampled twice.
+    def _get_samples(
+        self, batch_inds: IntArray, env: VecNormalize | None = None
+    ) -> ExpertReplaySamples:  # type: ignore[override]
+        # SB3 samples each row's environment itself and keeps it to itself: the same numbers are
+        # sampled twice.
         before = np.random.get_state()  # noqa: NPY002
         at = batch_inds, np.random.randint(0, high=self.n_envs, size=batch_inds.shape)  # noqa: NPY002
         np.random.set_state(before)  # noqa: NPY002
-        return ExpertReplaySamples(*super()._get_samples(batch_inds, env), self.to_torch(self.expert_actions[at]))
+        return ExpertReplaySamples(
+            *super()._get_samples(batch_inds, env), self.to_torch(self.expert_actions[at])
+        )
 
 
 class ExpertNStepReplayBuffer(ExpertReplayBuffer, NStepReplayBuffer):  # type: ignore[misc]
@@ -97,10 +126,15 @@ class AggregatedDataset:
     """
 
     def __init__(
-        self, capacity: int, observation_shape: tuple[int, ...], action_dim: int, dtype: npt.DTypeLike = np.float32
+        self,
+        capacity: int,
+        observation_shape: tuple[int, ...],
+        action_dim: int,
+        dtype: npt.DTypeLike = np.float32,
     ) -> None:
         self.capacity = capacity
-        # np.empty takes no memory before it is written to, so a large capacity costs what is in use.
+        # np.empty takes no memory before it is written to, so a large capacity costs what is in
+        # use.
         self._arrays = {
             "observations": np.empty((capacity, *observation_shape), dtype),
             "actions": np.empty((capacity, action_dim), np.float32),
@@ -115,7 +149,9 @@ class AggregatedDataset:
         self.added = 0
 
     def add(self, observations: npt.NDArray[Any], actions: Float32Array) -> None:
-        """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than ``capacity``, the last."""
+        """Add observations (n, ...) and actions (n, action_dim), oldest first; of more than
+        ``capacity``, the last.
+        """
         n = min(len(actions), self.capacity)
         places = (self.added + np.arange(n)) % self.capacity
         for array, new in zip(self._arrays.values(), (observations, actions), strict=True):
@@ -129,8 +165,13 @@ class AggregatedDataset:
 
     @property
     def pairs(self) -> Arrays:
-        """Copies of observations (n, ...) and expert actions (n, action_dim), by name, oldest first, as for :meth:`add`."""
-        return {name: array[self.batch(np.arange(len(self))).rows] for name, array in self._arrays.items()}
+        """Copies of observations (n, ...) and expert actions (n, action_dim), by name, oldest
+        first, as for :meth:`add`.
+        """
+        return {
+            name: array[self.batch(np.arange(len(self))).rows]
+            for name, array in self._arrays.items()
+        }
 
     @property
     def filled(self) -> Arrays:
@@ -138,8 +179,12 @@ class AggregatedDataset:
         return {name: array[: len(self)] for name, array in self._arrays.items()}
 
 
-def sample_rows(n_rows: int, count: int, rng: np.random.Generator, shuffle: bool = True) -> IntArray:
-    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at random; or all in order."""
+def sample_rows(
+    n_rows: int, count: int, rng: np.random.Generator, shuffle: bool = True
+) -> IntArray:
+    """``count`` row numbers below ``n_rows``: whole passes in random order, then a remainder at
+    random; or all in order.
+    """
     if not shuffle:
         return np.arange(count, dtype=np.int64) % n_rows
     passes, rest = divmod(count, n_rows)

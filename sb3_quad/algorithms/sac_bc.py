@@ -35,35 +35,43 @@ BC_FILTERS = ("none", "q", "agreement")
 class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
     """Soft Actor-Critic with a cloning term in the actor's loss (SAC+BC).
 
-    All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the additions at their defaults it is
-    SAC, bit for bit. A saved model loads with ``SAC.load``, even where this package is not installed. For any environment with
-    a Box action space.
+    All arguments of :class:`stable_baselines3.SAC` keep their meaning and defaults. With the
+    additions at their defaults it is SAC, bit for bit. A saved model loads with ``SAC.load``, even
+    where this package is not installed. For any environment with a Box action space.
 
     What is added, with its source:
 
-    =====================  ============================================================================================
+    =====================
+    ============================================================================================
     ``critic_layer_norm``  layer-normalised critics, which overestimate unseen actions less: RLPD,
                            https://arxiv.org/abs/2302.02948
-    ``bc_coef``            a cloning term in the actor's loss: Nair et al., https://arxiv.org/abs/1709.10089; weighed by
-                           the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The expert labels every
-                           state that is visited, as in DAgger, not its own flights alone
-    ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair et al.
-    =====================  ============================================================================================
+    ``bc_coef``            a cloning term in the actor's loss: Nair et al.,
+    https://arxiv.org/abs/1709.10089; weighed by
+                           the mean absolute Q as in TD3+BC, https://arxiv.org/abs/2106.06860. The
+                           expert labels every state that is visited, as in DAgger, not its own
+                           flights alone
+    ``bc_filter="q"``      only where the critic prefers the expert's action: the Q filter of Nair
+    et al. =====================
+    ============================================================================================
 
-    :param expert: who labels: an object with ``actions(state)`` on the true state of our environments, an SB3 model, or a
-        function from observations to actions; or a name as YAML takes it, such as ``"pid"``. It is never saved. Needed when
-        learning starts with cloning.
-    :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a schedule of the remaining
-        progress.
-    :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear beyond 0.05;
-        ``"huber_mse"``, that and three times the squared error. Actions are those of the policy, within -1 and 1.
-    :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's action is greater than Q of the
-        policy's mean action; ``"agreement"``, where both differ by less than 0.3, as of :class:`PPOBC`.
-    :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that comes from imitation is
-        not moved by a critic that has learnt nothing yet.
-    :param critic_layer_norm: whether the critics normalise the inputs of their activations, without parameters: in stock
-        ``SAC`` the zip loads and its actor is the same, but its critics do not normalise.
-    :raises ConfigError: a value out of range, a name that is not known, or a space that is not supported, when built.
+    :param expert: who labels: an object with ``actions(state)`` on the true state of our
+        environments, an SB3 model, or a function from observations to actions; or a name as YAML
+        takes it, such as ``"pid"``. It is never saved. Needed when learning starts with cloning.
+    :param bc_coef: weight of the cloning term in units of the mean absolute Q: a float, or a
+        schedule of the remaining progress.
+    :param bc_loss: error of the policy's mean action: ``"mse"``, squared; ``"huber"``, linear
+        beyond 0.05; ``"huber_mse"``, that and three times the squared error. Actions are those of
+        the policy, within -1 and 1.
+    :param bc_filter: where to clone: ``"none"``, everywhere; ``"q"``, where Q of the expert's
+        action is greater than Q of the policy's mean action; ``"agreement"``, where both differ by
+        less than 0.3, as of :class:`PPOBC`.
+    :param critic_warmup: for this many gradient steps only the critic learns, so that an actor that
+        comes from imitation is not moved by a critic that has learnt nothing yet.
+    :param critic_layer_norm: whether the critics normalise the inputs of their activations, without
+        parameters: in stock ``SAC`` the zip loads and its actor is the same, but its critics do not
+        normalise.
+    :raises ConfigError: a value out of range, a name that is not known, or a space that is not
+        supported, when built.
     :raises ExpertError: when learning starts: no expert, or one whose labels do not fit.
     :raises TrainingError: a loss that is not finite.
     """
@@ -106,7 +114,10 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         _init_setup_model: bool = True,
     ):
         super().__init__(**arguments_of(SAC, locals()), _init_setup_model=False)
-        for name, value, valid in (("bc_loss", bc_loss, BC_LOSSES), ("bc_filter", bc_filter, BC_FILTERS)):
+        for name, value, valid in (
+            ("bc_loss", bc_loss, BC_LOSSES),
+            ("bc_filter", bc_filter, BC_FILTERS),
+        ):
             if value not in valid:
                 raise ConfigError(unknown(name, value, valid))
         self.expert = expert
@@ -116,8 +127,12 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         self.critic_warmup = critic_warmup
         self.critic_layer_norm = critic_layer_norm
         self._clones = False
-        self._labels: Float32Array | None = None  # (n_envs, action_dim): its scaled actions for the present states
-        self._starts: BoolArray | None = None  # (n_envs,): which rows have just begun an episode; None: all
+        self._labels: Float32Array | None = (
+            None  # (n_envs, action_dim): its scaled actions for the present states
+        )
+        self._starts: BoolArray | None = (
+            None  # (n_envs,): which rows have just begun an episode; None: all
+        )
 
         if _init_setup_model:
             self._setup_model()
@@ -126,17 +141,28 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         self.bc_coef = FloatSchedule(self.bc_coef)
         self._clones = is_ever_nonzero(self.bc_coef)
         if isinstance(self.observation_space, spaces.Dict) and self.n_steps > 1:
-            raise ConfigError(f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict observations; give 1")
+            raise ConfigError(
+                f"n_steps {self.n_steps}: Stable-Baselines3 has no n-step returns of Dict observations; give 1"
+            )
         if self._clones:
-            if self.replay_buffer_class not in (None, ReplayBuffer, NStepReplayBuffer, DictReplayBuffer):
-                raise ConfigError(f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's actions")
+            if self.replay_buffer_class not in (
+                None,
+                ReplayBuffer,
+                NStepReplayBuffer,
+                DictReplayBuffer,
+            ):
+                raise ConfigError(
+                    f"replay_buffer_class {self.replay_buffer_class}: has no room for the expert's actions"
+                )
             kind = ExpertReplayBuffer if self.n_steps == 1 else ExpertNStepReplayBuffer
             if isinstance(self.observation_space, spaces.Dict):
                 kind = ExpertDictReplayBuffer
             returns = {} if self.n_steps == 1 else {"n_steps": self.n_steps, "gamma": self.gamma}
             both = self.observation_space, self.action_space
             memory = self.device, self.n_envs, self.optimize_memory_usage
-            self.replay_buffer = kind(self.buffer_size, *both, *memory, **self.replay_buffer_kwargs, **returns)
+            self.replay_buffer = kind(
+                self.buffer_size, *both, *memory, **self.replay_buffer_kwargs, **returns
+            )
         super()._setup_model()
         if self.critic_layer_norm:
             _normalise_layers(self.critic)
@@ -144,7 +170,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
     @property
     def policy_is_idle(self) -> bool:
-        """Whether the policy is still the one that it began with, since only the critic has learnt (``critic_warmup``)."""
+        """Whether the policy is still the one that it began with, since only the critic has learnt
+        (``critic_warmup``).
+        """
         return 0 < self.critic_warmup >= self._n_updates
 
     def will_clone(self) -> bool:
@@ -154,7 +182,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-        if self._clones:  # before the step: an expert that sees the true state labels the present one
+        if (
+            self._clones
+        ):  # before the step: an expert that sees the true state labels the present one
             assert self.env is not None and self._last_obs is not None
             self._labeller = Controller.for_env(self.expert, self.env, self._labeller)
             labels = self._labeller.labels(self._last_obs, self._starts)  # type: ignore[arg-type]
@@ -197,7 +227,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
                 monitored.setdefault(name, []).append(value.item())
 
         for gradient_step in range(gradient_steps):
-            data: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # + with the expert's actions
+            data: Any = self.replay_buffer.sample(
+                batch_size, env=self._vec_normalize_env
+            )  # + with the expert's actions
             discounts = data.discounts if data.discounts is not None else self.gamma
             if self.use_sde:
                 self.actor.reset_noise()
@@ -211,7 +243,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
                 # The coefficient of this step is that from before its update.
                 ent_coef = th.exp(self.log_ent_coef.detach())
                 assert isinstance(self.target_entropy, float)
-                ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                ent_coef_loss = -(
+                    self.log_ent_coef * (log_prob + self.target_entropy).detach()
+                ).mean()
                 monitor(ent_coef_loss=ent_coef_loss)
                 if not warming_up:
                     self.ent_coef_optimizer.zero_grad()
@@ -231,8 +265,12 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
             critic_loss: Any = 0.5 * sum(F.mse_loss(q, targets) for q in current)
             monitor(critic_loss=critic_loss)
             if not np.isfinite(monitored["critic_loss"][-1]):  # +
-                advice = "lower learning_rate, or look for rewards and observations that are not finite"
-                raise TrainingError(f"the critic's loss is not finite after {self.num_timesteps} timesteps: {advice}")
+                advice = (
+                    "lower learning_rate, or look for rewards and observations that are not finite"
+                )
+                raise TrainingError(
+                    f"the critic's loss is not finite after {self.num_timesteps} timesteps: {advice}"
+                )
             self.critic.optimizer.zero_grad()
             critic_loss.backward()
             self.critic.optimizer.step()
@@ -261,16 +299,23 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
         if self._clones:  # +
             self.logger.record("train/bc_coef", bc_coef)
 
-    def _bc_loss(self, observations: Any, mean: th.Tensor, labels: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """The cloning term over the mini-batch, and the share of its rows that are cloned; the others count as zero.
+    def _bc_loss(
+        self, observations: Any, mean: th.Tensor, labels: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        """The cloning term over the mini-batch, and the share of its rows that are cloned; the
+        others count as zero.
 
         :param mean: the policy's mean actions, (b, dim), as ``labels`` the expert's.
         """
-        errors = cloning_errors(self.bc_loss, mean, mean, labels)  # no kind of error here needs log_std
+        errors = cloning_errors(
+            self.bc_loss, mean, mean, labels
+        )  # no kind of error here needs log_std
         kept = th.ones_like(errors, dtype=th.bool)
         with th.no_grad():
             if self.bc_filter == "q":
-                theirs, own = (self._least_q(self.critic, observations, each) for each in (labels, mean))
+                theirs, own = (
+                    self._least_q(self.critic, observations, each) for each in (labels, mean)
+                )
                 kept = (theirs > own).flatten()
             elif self.bc_filter == "agreement":
                 kept = agree(mean, labels)
@@ -278,7 +323,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
     def _prepare_to_learn(self, anew: bool) -> None:
         if self.will_clone() and self.expert is None:
-            raise ExpertError("SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)")
+            raise ExpertError(
+                "SACBC needs an expert: SACBC(..., expert='geometric') or model.set_expert(...)"
+            )
         if anew or self._last_obs is None:  # the environments begin anew
             self._starts = self._labeller = None
 
@@ -287,7 +334,9 @@ class SACBC(ExpertMixin, SAC):  # type: ignore[misc]
 
 
 def _normalise_layers(critic: ContinuousCritic) -> None:
-    """Normalise what goes into each activation over its layer; nothing is learnt there, so a zip's names stay those of SAC."""
+    """Normalise what goes into each activation over its layer; nothing is learnt there, so a zip's
+    names stay those of SAC.
+    """
     networks: list[Any] = critic.q_networks
     for network in networks:
         for i, layer in enumerate([*network][:-1]):

@@ -1,6 +1,8 @@
-"""PyBullet, imported without the line about its build that it prints: ``from sb3_quad.base.bullet import p``.
+"""PyBullet, imported without the line about its build that it prints: ``from sb3_quad.base.bullet
+import p``.
 
-It comes with the package where it has a wheel, up to Python 3.11; elsewhere this import says how to get it.
+It comes with the package where it has a wheel, up to Python 3.11; elsewhere this import says how to
+get it.
 """
 
 import os

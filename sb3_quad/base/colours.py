@@ -2,8 +2,8 @@
 
 from collections.abc import Sequence
 
-# Okabe and Ito's palette for the colour-blind, without its black and yellow, which are hard to see on dark or light paper,
-# and without its green, which is the targets'; a few are shifted.
+# Okabe and Ito's palette for the colour-blind, without its black and yellow, which are hard to see
+# on dark or light paper, and without its green, which is the targets'; a few are shifted.
 COLOURS = ("#1B7EC2", "#D55E00", "#B8548A", "#C49A00", "#56B4E9", "#7A5BC0", "#8A5A3B", "#7F7F7F")
 
 

@@ -13,5 +13,7 @@ def use_cpus(count: int) -> None:
 
 def available_cpus() -> int:
     """CPUs that this process may use."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     return count if _most_cpus is None else min(count, _most_cpus)

@@ -1,6 +1,7 @@
 """The exceptions this package raises on bad input.
 
-Each message is one line that names the thing and the way out; the command line prints it and leaves with code 2.
+Each message is one line that names the thing and the way out; the command line prints it and leaves
+with code 2.
 """
 
 import re
@@ -24,7 +25,9 @@ class CannotHover(ConfigError):
 
 
 class ExpertError(SB3QuadError, ValueError):
-    """An expert that cannot label this environment, or whose labels are not finite actions of the right shape."""
+    """An expert that cannot label this environment, or whose labels are not finite actions of the
+    right shape.
+    """
 
 
 class TrainingError(SB3QuadError, RuntimeError):
@@ -47,14 +50,16 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
     """The message for an unknown ``name``: what it may be a slip of, and the whole list.
 
     >>> unknown("task", "state_recovry", ["target_tracking", "state_recovery"])
-    "unknown task 'state_recovry': did you mean 'state_recovery'? (valid: state_recovery, target_tracking)"
+    "unknown task 'state_recovry': did you mean 'state_recovery'? (valid: state_recovery,
+    target_tracking)"
     """
     names = sorted(str(option) for option in valid)
     return f"unknown {kind} {str(name)!r}: {did_you_mean(name, names)}(valid: {', '.join(names)})"
 
 
 def did_you_mean(name: object, valid: Iterable[str]) -> str:
-    """The valid name that ``name`` misspells, or those few that it is a part of, as a question; empty if there is none.
+    """The valid name that ``name`` misspells, or those few that it is a part of, as a question;
+    empty if there is none.
 
     >>> did_you_mean("tracking", ["far_tracking", "state_recovery", "target_tracking"])
     "did you mean 'far_tracking' or 'target_tracking'? "
@@ -62,7 +67,11 @@ def did_you_mean(name: object, valid: Iterable[str]) -> str:
     text, names = str(name).lower(), sorted(valid)
     letters = sum(map(str.isalnum, text))
     most = min(max(1, letters // 4), letters - 1)  # slips
-    near = {each: _edit_distance(text, each.lower()) for each in names if abs(len(each) - len(text)) <= most}
+    near = {
+        each: _edit_distance(text, each.lower())
+        for each in names
+        if abs(len(each) - len(text)) <= most
+    }
     found = [each for each in sorted(near, key=near.__getitem__)[:1] if near[each] <= most]
     if not found and (parts := _parts(text)):
         found = [each for each in names if parts <= _parts(each.lower())]

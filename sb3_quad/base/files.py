@@ -17,12 +17,16 @@ from sb3_quad.base.errors import ConfigError
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """A stream to a file beside ``path`` that is moved there when it is finished, so that a reader never meets half of it.
+    """A stream to a file beside ``path`` that is moved there when it is finished, so that a reader
+    never meets half of it.
 
-    :raises ConfigError: no name of a file, a folder that cannot be written, a full disk; what ``path`` held is still there.
+    :raises ConfigError: no name of a file, a folder that cannot be written, a full disk; what
+        ``path`` held is still there.
     """
     file = Path(path)
-    if not file.name or (file.exists() and not file.is_file()):  # a device, as /dev/null, would be replaced, too
+    if not file.name or (
+        file.exists() and not file.is_file()
+    ):  # a device, as /dev/null, would be replaced, too
         raise ConfigError(f"{str(path)!r}: names no file that can be written")
     beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
@@ -49,7 +53,8 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def locked(folder: Path, what: str) -> Iterator[None]:
     """Keep a folder to this process, and remove what a killed one has left half-written in it.
 
-    The lock ends with the process, however that ends, and leaves no file. A file system without locks grants every one.
+    The lock ends with the process, however that ends, and leaves no file. A file system without
+    locks grants every one.
 
     :param what: the folder in an error message.
     :raises ConfigError: another process has it.
@@ -59,7 +64,9 @@ def locked(folder: Path, what: str) -> Iterator[None]:
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise ConfigError(f"{what} {folder}: another process is writing to it; wait until that ends") from None
+            raise ConfigError(
+                f"{what} {folder}: another process is writing to it; wait until that ends"
+            ) from None
         except OSError:  # no locks here
             pass
         for half in folder.rglob(".*.tmp"):
@@ -75,7 +82,9 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def write_csv(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """As :func:`write_bytes`, of a table: empty where a row has no such key, without what no column is called."""
+    """As :func:`write_bytes`, of a table: empty where a row has no such key, without what no column
+    is called.
+    """
     text = io.StringIO()
     writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -90,7 +99,8 @@ def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> N
 
 
 def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
-    """The arrays of an ``.npz`` file whose names begin with ``prefix``; the others are not even read.
+    """The arrays of an ``.npz`` file whose names begin with ``prefix``; the others are not even
+    read.
 
     :raises ConfigError: a missing or damaged file.
     """
@@ -136,7 +146,9 @@ def make_folder(path: str | Path, what: str, flag: str) -> None:
         TemporaryFile(dir=path).close()
     except (OSError, ValueError) as error:  # ValueError: no path
         reason = getattr(error, "strerror", None) or error
-        raise ConfigError(f"{what} {path}: cannot be written ({reason}); give another with {flag}") from None
+        raise ConfigError(
+            f"{what} {path}: cannot be written ({reason}); give another with {flag}"
+        ) from None
 
 
 def model_bytes(model: Any) -> bytes:

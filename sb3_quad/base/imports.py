@@ -11,7 +11,9 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, MissingExtra
 
 
-def lazy_names(package: str, modules: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def lazy_names(
+    package: str, modules: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """``__getattr__`` and ``__dir__`` of a package whose names are imported on first use (PEP 562).
 
     :param package: its ``__name__``.
@@ -36,7 +38,9 @@ def import_name(text: str) -> Any:
 
 
 def search_present_folder(module: str) -> None:
-    """Let a module that is not installed be imported from the present folder, where installed commands do not look."""
+    """Let a module that is not installed be imported from the present folder, where installed
+    commands do not look.
+    """
     here = os.getcwd()
     if here not in sys.path and importlib.util.find_spec(module.partition(".")[0]) is None:
         sys.path.append(here)
@@ -53,7 +57,9 @@ def import_packages(packages: Iterable[str], where: str) -> None:
             search_present_folder(package)
             importlib.import_module(package)
         except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-            raise ConfigError(f"{where} {package}: cannot be imported ({type(error).__name__}: {error})") from None
+            raise ConfigError(
+                f"{where} {package}: cannot be imported ({type(error).__name__}: {error})"
+            ) from None
 
 
 def require(module: str, extra: str, what: str) -> Any:

@@ -9,7 +9,20 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
 
-_ACTIVATIONS = ("ELU", "GELU", "Hardtanh", "LeakyReLU", "Mish", "ReLU", "ReLU6", "SELU", "Sigmoid", "SiLU", "Softplus", "Tanh")
+_ACTIVATIONS = (
+    "ELU",
+    "GELU",
+    "Hardtanh",
+    "LeakyReLU",
+    "Mish",
+    "ReLU",
+    "ReLU6",
+    "SELU",
+    "Sigmoid",
+    "SiLU",
+    "Softplus",
+    "Tanh",
+)
 _OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
 CLASSES = (*(f"nn.{name}" for name in _ACTIVATIONS), *(f"optim.{name}" for name in _OPTIMIZERS))
 _CLASS_NAME = re.compile(r"(?:torch\.|th\.)?((?:nn|optim)\..*)")
@@ -29,7 +42,8 @@ def parse_number(value: Any) -> Any:
 
 
 def parse_value(text: str, key: str = "") -> Any:
-    """The value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the string itself.
+    """The value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the string
+    itself.
 
     >>> parse_value("[64, 64]"), parse_value("dict(a=1)"), parse_value("mse"), parse_value("lin_1e-3")
     ([64, 64], {'a': 1}, 'mse', 'lin_1e-3')
@@ -40,14 +54,18 @@ def parse_value(text: str, key: str = "") -> Any:
         return ast.literal_eval(_AsLiterals().visit(ast.parse(text.strip(), mode="eval")))
     except (SyntaxError, TypeError, ValueError, RecursionError, MemoryError) as error:
         if key:
-            raise ConfigError(f"{key}: {text!r} cannot be read ({one_line(error)}); write dict(name=literal, …)") from None
+            raise ConfigError(
+                f"{key}: {text!r} cannot be read ({one_line(error)}); write dict(name=literal, …)"
+            ) from None
         return parse_number(text)
 
 
 def parse_mapping(value: Any, key: str) -> dict[str, Any]:
-    """A mapping given as one, as None, or as rl-zoo's string ``"dict(net_arch=[64, 64], activation_fn=nn.Tanh)"``.
+    """A mapping given as one, as None, or as rl-zoo's string ``"dict(net_arch=[64, 64],
+    activation_fn=nn.Tanh)"``.
 
-    :raises ConfigError: anything else; the message names ``key``. Names such as ``nn.Tanh`` become classes.
+    :raises ConfigError: anything else; the message names ``key``. Names such as ``nn.Tanh`` become
+        classes.
     """
     given = parse_value(value, key) if isinstance(value, str) else {} if value is None else value
     if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
@@ -94,7 +112,9 @@ class _AsLiterals(ast.NodeTransformer):
         names = [entry.arg for entry in node.keywords]
         if ast.unparse(node.func) != "dict" or node.args or None in names:
             return node
-        return ast.Dict([ast.Constant(name) for name in names], [entry.value for entry in node.keywords])
+        return ast.Dict(
+            [ast.Constant(name) for name in names], [entry.value for entry in node.keywords]
+        )
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         text = ast.unparse(node)

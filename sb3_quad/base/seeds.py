@@ -1,7 +1,9 @@
-"""Every stream of random numbers, by what it is for: what judges a training is never what it was trained on.
+"""Every stream of random numbers, by what it is for: what judges a training is never what it was
+trained on.
 
-Streams are told apart by :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row. No two share numbers: seeds
-0 and 1 of a training have as little in common as a training and its evaluation.
+Streams are told apart by :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row.
+No two share numbers: seeds 0 and 1 of a training have as little in common as a training and its
+evaluation.
 """
 
 import typing
@@ -23,18 +25,23 @@ Purpose = Literal[
 ]
 PURPOSES = typing.get_args(Purpose)
 _PURPOSE, _ROW = range(2)  # what a key tells apart
-SCENARIO_STREAM = 0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
+SCENARIO_STREAM = (
+    0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
+)
 LARGEST = 2**32  # NumPy's global generator, which SB3 seeds, takes no more
 Seed: TypeAlias = Annotated[int, Field(ge=0, lt=LARGEST)]
 
 
 def seed_for(purpose: Purpose, seed: int = 0) -> int:
-    """The seed of what a run with ``seed`` flies for some purpose; its rows fly by :func:`row_seeds` of it."""
+    """The seed of what a run with ``seed`` flies for some purpose; its rows fly by
+    :func:`row_seeds` of it.
+    """
     return _hash(seed, _PURPOSE, PURPOSES.index(purpose))
 
 
 def row_seeds(seed: int, n: int) -> list[int]:
-    """The seeds of n rows, each for ``reset(seed=…)`` of one environment; row i's does not depend on n.
+    """The seeds of n rows, each for ``reset(seed=…)`` of one environment; row i's does not depend
+    on n.
 
     They are below 2**53, which any file and any language keeps exactly.
     """
@@ -42,4 +49,6 @@ def row_seeds(seed: int, n: int) -> list[int]:
 
 
 def _hash(seed: int, *key: int) -> int:
-    return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0] >> np.uint64(11))
+    return int(
+        np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0] >> np.uint64(11)
+    )

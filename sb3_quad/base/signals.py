@@ -11,10 +11,12 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)  # the last when a term
 
 
 class StopSignals:
-    """Within its ``with`` block, the first signal is only noted, the second raises KeyboardInterrupt, more do nothing.
+    """Within its ``with`` block, the first signal is only noted, the second raises
+    KeyboardInterrupt, more do nothing.
 
-    Outside the main thread, where Python allows no handlers, signals act as ever. SIGHUP stays ignored under ``nohup``. Blocks
-    may be nested: the outer one learns of what the inner one received.
+    Outside the main thread, where Python allows no handlers, signals act as ever. SIGHUP stays
+    ignored under ``nohup``. Blocks may be nested: the outer one learns of what the inner one
+    received.
 
     :param patience: signals that are only noted; with 0 the first one raises KeyboardInterrupt.
     """
@@ -26,7 +28,9 @@ class StopSignals:
 
     @property
     def exit_code(self) -> int:
-        """What the shell expects of a program that a signal ended: such as 130 for SIGINT; 0 if none came."""
+        """What the shell expects of a program that a signal ended: such as 130 for SIGINT; 0 if
+        none came.
+        """
         return 128 + self.received if self.received else 0
 
     @property
@@ -61,7 +65,8 @@ class StopSignals:
 
 @contextmanager
 def interrupts_leave() -> Iterator[None]:
-    """Within the block, Ctrl-C kills the program at once, as the shell's exit code 130 says: for imports.
+    """Within the block, Ctrl-C kills the program at once, as the shell's exit code 130 says: for
+    imports.
 
     A KeyboardInterrupt there comes out of some compiled modules as an ImportError, or not at all.
     """
@@ -75,6 +80,8 @@ def interrupts_leave() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """In a worker process: leave the signals that a terminal sends to every process to the one that trains."""
+    """In a worker process: leave the signals that a terminal sends to every process to the one that
+    trains.
+    """
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)

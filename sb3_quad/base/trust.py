@@ -1,4 +1,6 @@
-"""Whether the user trusts the files that are read: by ``--trust``, or by an environment variable, which workers inherit."""
+"""Whether the user trusts the files that are read: by ``--trust``, or by an environment variable,
+which workers inherit.
+"""
 
 import os
 from collections.abc import Iterator

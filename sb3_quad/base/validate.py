@@ -24,16 +24,23 @@ class Frozen(BaseModel):
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
     """``data`` as a ``model``.
 
-    :param where: what the message calls the data, such as the name of its file; or gives that for a key.
-    :raises ConfigError: something does not fit; one line names each key, what is wrong, and the nearest valid key. Where all
-        that is wrong is an error of a kind of its own, such as :class:`CannotHover`, that kind is raised.
+    :param where: what the message calls the data, such as the name of its file; or gives that for a
+        key.
+    :raises ConfigError: something does not fit; one line names each key, what is wrong, and the
+        nearest valid key. Where all that is wrong is an error of a kind of its own, such as
+        :class:`CannotHover`, that kind is raised.
     """
     try:
         return model.model_validate(data)
     except ValidationError as error:
         kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
-        kind = next((each for each in kinds if len(kinds) == 1 and issubclass(each, ConfigError)), ConfigError)
-        place = where if isinstance(where, str) else where(str((error.errors()[0]["loc"] or ("",))[0]))
+        kind = next(
+            (each for each in kinds if len(kinds) == 1 and issubclass(each, ConfigError)),
+            ConfigError,
+        )
+        place = (
+            where if isinstance(where, str) else where(str((error.errors()[0]["loc"] or ("",))[0]))
+        )
         raise kind(f"{place}: {explain(error, model)}") from None
 
 
@@ -50,7 +57,9 @@ def read_record(path: Path, model: type[Model]) -> Model:
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """What is wrong, in one line: each key with what is wrong about it, what it means, and the nearest valid key."""
+    """What is wrong, in one line: each key with what is wrong about it, what it means, and the
+    nearest valid key.
+    """
     found: dict[str, str] = {}
     for item in error.errors():
         inside, names, meaning = _walk(model, item["loc"])
@@ -59,7 +68,9 @@ def explain(error: ValidationError, model: type[BaseModel]) -> str:
             text = unknown("key", item["loc"][-1], _fields(inside))
         else:
             text = _message(item) + (f" ({meaning})" if meaning else "")
-        found.setdefault(key, text if text.startswith(key) else f"{key}: {text}")  # of a union only the first alternative
+        found.setdefault(
+            key, text if text.startswith(key) else f"{key}: {text}"
+        )  # of a union only the first alternative
     return "; ".join(found.values())
 
 
@@ -72,8 +83,12 @@ def _message(item: Mapping[str, Any]) -> str:
     return str(item["msg"]).removeprefix("Value error, ")
 
 
-def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[type[BaseModel], list[str], str]:
-    """The innermost model a location leads to, its keys (names of a union's alternatives left out), the last one's meaning."""
+def _walk(
+    model: type[BaseModel], location: tuple[int | str, ...]
+) -> tuple[type[BaseModel], list[str], str]:
+    """The innermost model a location leads to, its keys (names of a union's alternatives left out),
+    the last one's meaning.
+    """
     names: list[str] = []
     meaning = ""
     for part in location:
@@ -89,10 +104,19 @@ def _walk(model: type[BaseModel], location: tuple[int | str, ...]) -> tuple[type
 
 def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
     """The fields of a model by the keys that its data have."""
-    return {str(field.validation_alias or name): field for name, field in model.model_fields.items()}
+    return {
+        str(field.validation_alias or name): field for name, field in model.model_fields.items()
+    }
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
     if typing.get_origin(annotation) is None:
-        return annotation if isinstance(annotation, type) and issubclass(annotation, BaseModel) else None
-    return next((found for entry in typing.get_args(annotation) if (found := _model_in(entry)) is not None), None)
+        return (
+            annotation
+            if isinstance(annotation, type) and issubclass(annotation, BaseModel)
+            else None
+        )
+    return next(
+        (found for entry in typing.get_args(annotation) if (found := _model_in(entry)) is not None),
+        None,
+    )

@@ -32,7 +32,9 @@ class Loader(yaml.SafeLoader):
             case ["object/apply", "collections.OrderedDict"]:
                 (pairs,) = self.construct_sequence(node, deep=True)
                 return dict(pairs)
-            case ["name", name] if name.startswith("torch."):  # torch.nn.modules.activation.Tanh: nn.Tanh
+            case ["name", name] if name.startswith(
+                "torch."
+            ):  # torch.nn.modules.activation.Tanh: nn.Tanh
                 return ".".join([name.split(".")[1], name.split(".")[-1]])
         raise ValueError(f"{tag}: no such value in settings")
 
@@ -68,7 +70,8 @@ class YamlFolder:
     :param kind: what messages call such a file.
     :param package: that holds the files.
     :param suffix: of the files.
-    :param folders: further ones inside the package. With them the suffix is part of a name, as in ``thesis/dagger.yml``.
+    :param folders: further ones inside the package. With them the suffix is part of a name, as in
+        ``thesis/dagger.yml``.
     """
 
     kind: str
@@ -98,8 +101,12 @@ class YamlFolder:
             return read_text(source), str(source)
         name, files = str(source), self._files()
         if name not in files:
-            raise ConfigError(f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file")
-        return files[name].read_text(encoding="utf-8"), f"{name.removesuffix(self.suffix)}{self.suffix}"
+            raise ConfigError(
+                f"{unknown(self.kind, name, files)}, or the path of a {self.suffix} file"
+            )
+        return files[name].read_text(
+            encoding="utf-8"
+        ), f"{name.removesuffix(self.suffix)}{self.suffix}"
 
     def read(self, source: str | Path) -> tuple[dict[Any, Any], str]:
         """The keys and values of a file by name or path, and what messages call it.
@@ -112,6 +119,13 @@ class YamlFolder:
     def _files(self) -> dict[str, Any]:
         package = resources.files(self.package)
         folders = {folder: package.joinpath(folder).iterdir() for folder in ("", *self.folders)}
-        paths = sorted(str(PurePosixPath(folder, file.name)) for folder, files in folders.items() for file in files)
+        paths = sorted(
+            str(PurePosixPath(folder, file.name))
+            for folder, files in folders.items()
+            for file in files
+        )
         found = [path for path in paths if path.endswith(self.suffix)]
-        return {path if self.folders else path.removesuffix(self.suffix): package.joinpath(path) for path in found}
+        return {
+            path if self.folders else path.removesuffix(self.suffix): package.joinpath(path)
+            for path in found
+        }

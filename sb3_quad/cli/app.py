@@ -37,7 +37,9 @@ COMMANDS = {
     module.name.replace("_", "-"): importlib.import_module(f"{commands.__name__}.{module.name}")
     for module in pkgutil.iter_modules(commands.__path__)
 }
-"""The module of each command by its name: ``--help`` as its docstring, ``add_arguments`` and ``run``."""
+"""The module of each command by its name: ``--help`` as its docstring, ``add_arguments`` and
+``run``.
+"""
 
 
 def make_parser() -> Parser:
@@ -62,7 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stdout.reconfigure(line_buffering=True)  # lines appear at once, also in a pipe
     try:
         parser = make_parser()
-        if any("\ud800" <= letter <= "\udfff" for letter in "".join(given)):  # how Python shows bytes that are no text
+        if any(
+            "\ud800" <= letter <= "\udfff" for letter in "".join(given)
+        ):  # how Python shows bytes that are no text
             raise ConfigError(f"arguments {' '.join(given)!r}: not valid UTF-8")
         if given and not given[0].startswith("-") and given[0] not in COMMANDS:
             raise ConfigError(unknown("command", given[0], COMMANDS))
@@ -74,8 +78,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             parser.print_help()
             return 0
         agent = getattr(options, "trained_agent", None)
-        if agent is not None and not any(Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")):  # SB3 adds it
-            raise ConfigError(f"-i {agent}: no such file")  # at once: what the command imports takes seconds
+        if agent is not None and not any(
+            Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")
+        ):  # SB3 adds it
+            raise ConfigError(
+                f"-i {agent}: no such file"
+            )  # at once: what the command imports takes seconds
         with interrupts_leave():  # torch and the like, which every command needs, take seconds
             importlib.import_module("sb3_quad.controllers.zips")
         with trusting(getattr(options, "trust", False)):
@@ -88,7 +96,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # as in `sb3-quad train --help | head`
         sys.stderr.close()
         return 0
-    except (Exception, SystemExit) as error:  # of a user's wrapper, environment or callback, a full disk, or a fault of ours
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # of a user's wrapper, environment or callback, a full disk, or a fault of ours
         if sys.flags.dev_mode:
             raise
         return _refuse(_unexpected(error))

@@ -1,4 +1,6 @@
-"""What a command prints at its end: agents and experts on the same fresh episodes, where everything is, what to type next."""
+"""What a command prints at its end: agents and experts on the same fresh episodes, where everything
+is, what to type next.
+"""
 
 import shlex
 from collections.abc import Iterable, Mapping
@@ -28,28 +30,44 @@ SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of 
 
 
 def task_table(
-    controllers: Mapping[str, Any], settings: FlightSettings, n: int, seed: int, beside: Iterable[str] = ()
+    controllers: Mapping[str, Any],
+    settings: FlightSettings,
+    n: int,
+    seed: int,
+    beside: Iterable[str] = (),
 ) -> Table:
     """The table of some controllers over the same episodes of a task.
 
     :param settings: how all of them fly.
     :param n: how many episodes.
-    :param beside: the columns of the thesis that stand beside them, if they fly the thesis's vehicle.
+    :param beside: the columns of the thesis that stand beside them, if they fly the thesis's
+        vehicle.
     """
     seeds = row_seeds(seed, n)
-    measured = [metric_cells(summarise(fly_settings(each, settings, seeds))) for each in controllers.values()]
+    measured = [
+        metric_cells(summarise(fly_settings(each, settings, seeds)))
+        for each in controllers.values()
+    ]
     task = in_words(settings.task)
-    scenario = load_suite("thesis").scenario(SCENARIOS.get(task, SCENARIOS["target_tracking"]))  # whose rows others have, too
+    scenario = load_suite("thesis").scenario(
+        SCENARIOS.get(task, SCENARIOS["target_tracking"])
+    )  # whose rows others have, too
     of_thesis = task in SCENARIOS and settings.vehicle == THESIS_VEHICLE
     shown = [name for name in beside if of_thesis and name in scenario.reference]
     columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
     rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
-    title = f"{task}: {n} fresh episodes, the same for all" + ("" if settings.noise else ", true state")
+    title = f"{task}: {n} fresh episodes, the same for all" + (
+        "" if settings.noise else ", true state"
+    )
     return Table(columns, rows, title=title, caption=CAPTION)
 
 
 def print_tables(
-    controllers: Mapping[str, Any], how: Mapping[str, Any], n: int, seed: int, beside: Iterable[str] = ()
+    controllers: Mapping[str, Any],
+    how: Mapping[str, Any],
+    n: int,
+    seed: int,
+    beside: Iterable[str] = (),
 ) -> None:
     """Print a table as of :func:`task_table` for each task.
 
@@ -60,20 +78,27 @@ def print_tables(
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
-    """The table of the agent of a job and of its expert over the same episodes, which no training has seen.
+    """The table of the agent of a job and of its expert over the same episodes, which no training
+    has seen.
 
     :param job: of an environment of this package.
     """
     settings = job.flight_settings
     controllers = {"agent": model, "expert": _expert(job)}
     agent = "IL-agent" if job.config.algo == "dagger" else "RL-agent"
-    return task_table(controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert"))
+    return task_table(
+        controllers, settings, FRESH_EPISODES, seed_for("table", job.seed), (agent, "expert")
+    )
 
 
 def _expert(job: TrainingJob) -> Any:
-    """The expert of a training, or the default one, for the vehicle that the agent flies and in its layout."""
+    """The expert of a training, or the default one, for the vehicle that the agent flies and in its
+    layout.
+    """
     flown = job.flight_settings
-    return resolve_expert(job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout)
+    return resolve_expert(
+        job.config.expert or DEFAULT_EXPERT, flown.vehicle, layout=flown.rotor_layout
+    )
 
 
 def close_run(result: TrainingResult) -> int:
@@ -84,13 +109,16 @@ def close_run(result: TrainingResult) -> int:
         console().print(agent_and_expert(result.job, result.model))
     if result.seconds:  # else a complete run that made no evaluations
         print(f"trained in {result.seconds:.1f} s")
-    print(f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}")
+    print(
+        f"saved in {result.run.path}: {', '.join(sorted(entry.name for entry in result.run.path.iterdir()))}"
+    )
     _print_next(result.run)
     return 0
 
 
 def close_pipeline(result: PipelineResult, seconds: float) -> int:
-    """Print both tasks' tables of all stages' agents and where everything is. Returns the exit code.
+    """Print both tasks' tables of all stages' agents and where everything is. Returns the exit
+    code.
 
     :param seconds: that the pipeline took.
     """
@@ -100,7 +128,13 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     controllers = {"expert": _expert(result.job)}
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
     beside = ("expert", "IL-agent", "RL-agent")
-    print_tables(controllers, flown.in_any_task(), PIPELINE_EPISODES, seed_for("table", result.job.seed), beside)
+    print_tables(
+        controllers,
+        flown.in_any_task(),
+        PIPELINE_EPISODES,
+        seed_for("table", result.job.seed),
+        beside,
+    )
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")
     print(f"saved in {result.folder}, {seconds:.0f} s in all")
@@ -109,11 +143,18 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
 
 
 def _print_next(run: RunFolder) -> None:
-    """Print the commands that show, measure and export a run's agent, if it flies an environment of this package."""
+    """Print the commands that show, measure and export a run's agent, if it flies an environment of
+    this package.
+    """
     if run.name not in ENVIRONMENTS:
         return
-    agent, label = shlex.quote(str(run.result)), shlex.quote(f"{run.path.parent.name}_{run.path.name}")
-    vehicle = " --vehicle itm" if agent_settings(run.result)[0].vehicles else ""  # else the one that it was trained on
+    agent, label = (
+        shlex.quote(str(run.result)),
+        shlex.quote(f"{run.path.parent.name}_{run.path.name}"),
+    )
+    vehicle = (
+        " --vehicle itm" if agent_settings(run.result)[0].vehicles else ""
+    )  # else the one that it was trained on
     print(f"next:\n  sb3-quad enjoy {agent} --env {run.name} -o {label}.png")
     print(f"  sb3-quad demo {agent} pid -o {label}.html")
     print(f"  sb3-quad evaluate {agent} --suite quick -o evaluations/{label}")

@@ -1,4 +1,6 @@
-"""Argument parsing with one-line errors, kinds of arguments, and the flags that several commands have."""
+"""Argument parsing with one-line errors, kinds of arguments, and the flags that several commands
+have.
+"""
 
 import argparse
 import math
@@ -12,7 +14,9 @@ from pydantic import BaseModel
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 
-ELSEWHERE = dict.fromkeys(("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that")
+ELSEWHERE = dict.fromkeys(
+    ("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that"
+)
 """Flags of rl_zoo3 that no command has, and what has their part."""
 
 
@@ -22,14 +26,21 @@ class Parser(argparse.ArgumentParser):
     siblings: Mapping[str, Container[str]] = {}  # by command: its options
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(**{"allow_abbrev": False, "formatter_class": argparse.RawDescriptionHelpFormatter, **kwargs})
+        super().__init__(
+            **{
+                "allow_abbrev": False,
+                "formatter_class": argparse.RawDescriptionHelpFormatter,
+                **kwargs,
+            }
+        )
 
     def error(self, message: str) -> NoReturn:
         """:raises ConfigError: always."""
         raise ConfigError(message)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """As argparse's, but an unknown option is an error here, where the options of the command are known.
+        """As argparse's, but an unknown option is an error here, where the options of the command
+        are known.
 
         :raises ConfigError: an unknown option, a missing or bad value.
         """
@@ -37,13 +48,17 @@ class Parser(argparse.ArgumentParser):
         if rest:
             option, _, value = rest[0].partition("=")
             kind = "option" if option.startswith("-") else "argument"
-            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option, value or [*rest, ''][1])}")
+            raise ConfigError(
+                f"unknown {kind} {option!r}: {self._advice(option, value or [*rest, ''][1])}"
+            )
         return options, rest
 
     def _advice(self, option: str, value: str) -> str:
         """What to give instead of an unknown option."""
         valid = self._option_string_actions
-        owners = [f"sb3-quad {name}" for name, options in self.siblings.items() if option in options]
+        owners = [
+            f"sb3-quad {name}" for name, options in self.siblings.items() if option in options
+        ]
         if option in ELSEWHERE:
             return ELSEWHERE[option]
         if hint := did_you_mean(option, valid):
@@ -59,7 +74,9 @@ class Parser(argparse.ArgumentParser):
 class Pairs(argparse.Action):
     """Keeps ``k:v`` entries as a mapping."""
 
-    def __call__(self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None) -> None:
+    def __call__(
+        self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None
+    ) -> None:
         """:raises ConfigError: an entry without a colon."""
         found = dict(getattr(namespace, self.dest) or {})
         for entry in values:
@@ -110,8 +127,14 @@ def above_zero(text: str) -> float:
     return number
 
 
-def add_fields(parser: argparse.ArgumentParser, model: type[BaseModel], *names: str, **changes: Mapping[str, Any]) -> None:
-    """Add a flag for each field of a model, made from its name, type, description and default; not given, it is None.
+def add_fields(
+    parser: argparse.ArgumentParser,
+    model: type[BaseModel],
+    *names: str,
+    **changes: Mapping[str, Any],
+) -> None:
+    """Add a flag for each field of a model, made from its name, type, description and default; not
+    given, it is None.
 
     :param model: with fields as of :func:`sb3_quad.training.options.option`.
     :param names: of the fields; all without any.
@@ -121,7 +144,10 @@ def add_fields(parser: argparse.ArgumentParser, model: type[BaseModel], *names: 
         field = model.model_fields[name]
         metadata: Any = field.json_schema_extra
         default = "" if field.default is None or field.default is False else f" ({field.default})"
-        own: dict[str, Any] = {"help": f"{field.description}{default}", "metavar": metadata["metavar"]}
+        own: dict[str, Any] = {
+            "help": f"{field.description}{default}",
+            "metavar": metadata["metavar"],
+        }
         kinds = {field.annotation, *typing.get_args(field.annotation)}
         if bool in kinds:
             del own["metavar"]
@@ -130,19 +156,34 @@ def add_fields(parser: argparse.ArgumentParser, model: type[BaseModel], *names: 
             own |= PAIRS
         elif str not in kinds:
             own["type"] = float if float in kinds else whole
-        parser.add_argument(*metadata["flags"], f"--{name.replace('_', '-')}", **{**own, **changes.get(name, {})})
+        parser.add_argument(
+            *metadata["flags"], f"--{name.replace('_', '-')}", **{**own, **changes.get(name, {})}
+        )
 
 
 def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
-    """Add flags that several commands have: ``executor`` (with ``--address``), ``trust``, ``overwrite`` and ``progress``."""
+    """Add flags that several commands have: ``executor`` (with ``--address``), ``trust``,
+    ``overwrite`` and ``progress``.
+    """
     add = parser.add_argument
     if "executor" in names:
         add(
-            "--executor", default="local", metavar="KIND", help="local (worker processes here, default) or ray: docs/sweeps.md"
+            "--executor",
+            default="local",
+            metavar="KIND",
+            help="local (worker processes here, default) or ray: docs/sweeps.md",
         )
-        add("--address", metavar="WHERE", help="Ray cluster: auto, host:port or ray://host:port (one is started without it)")
+        add(
+            "--address",
+            metavar="WHERE",
+            help="Ray cluster: auto, host:port or ray://host:port (one is started without it)",
+        )
     if "trust" in names:
-        add("--trust", action="store_true", help="let zips run whatever is pickled in them, see docs/security.md")
+        add(
+            "--trust",
+            action="store_true",
+            help="let zips run whatever is pickled in them, see docs/security.md",
+        )
     if "overwrite" in names:
         add("--overwrite", action="store_true", help="replace existing files")
     if "progress" in names:

@@ -29,13 +29,15 @@ def resolve_expert(
 ) -> Any:
     """The expert that ``spec`` names.
 
-    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name of a policy that comes
-        with the package (:func:`sb3_quad.pretrained`); ``"package.module:factory"``, where ``factory(vehicle)`` returns an
-        expert; or an expert itself, returned as it is.
+    :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name
+        of a policy that comes with the package (:func:`sb3_quad.pretrained`);
+        ``"package.module:factory"``, where ``factory(vehicle)`` returns an expert; or an expert
+        itself, returned as it is.
     :param vehicle: what a named expert is designed for; of several, the first.
     :param kind: what messages call it.
     :param layout: ``rotor_layout`` of the environments that it flies in.
-    :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be imported.
+    :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be
+        imported.
     :raises ExpertError: a factory that fails.
     """
     if not isinstance(spec, (str, Path)):
@@ -50,21 +52,28 @@ def resolve_expert(
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:
-        raise ExpertError(f"{kind} {text}: the factory failed with {type(error).__name__}: {error}") from error
+        raise ExpertError(
+            f"{kind} {text}: the factory failed with {type(error).__name__}: {error}"
+        ) from error
 
 
 def import_factory(text: str, kind: str = "expert") -> Any:
     """What makes the expert of a name, or is at ``package.module:factory``.
 
-    :raises ConfigError: an unknown name, or a factory that cannot be imported; :class:`MissingExtra` where it needs one.
+    :raises ConfigError: an unknown name, or a factory that cannot be imported;
+        :class:`MissingExtra` where it needs one.
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:
         valid = [*EXPERTS, *pretrained_names()]
-        raise ConfigError(unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory")
+        raise ConfigError(
+            unknown(kind, text, valid) + ", or path/to/model.zip, or package.module:factory"
+        )
     try:
         return import_name(location)
     except SB3QuadError:
         raise
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-        raise ConfigError(f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})") from error
+        raise ConfigError(
+            f"{kind} {text}: cannot be imported ({type(error).__name__}: {error})"
+        ) from error

@@ -1,7 +1,9 @@
-"""Reading the pickles in SB3's zips. Python's own reader calls any function that a pickle names (docs/security.md).
+"""Reading the pickles in SB3's zips. Python's own reader calls any function that a pickle names
+(docs/security.md).
 
-Here the opcodes are interpreted one by one. Names are looked up in the tables of this file alone; what is called is a function
-of this file, which checks its arguments; what is changed was made by the same pickle. So nothing outside the result changes.
+Here the opcodes are interpreted one by one. Names are looked up in the tables of this file alone;
+what is called is a function of this file, which checks its arguments; what is changed was made by
+the same pickle. So nothing outside the result changes.
 """
 
 import base64
@@ -39,7 +41,8 @@ def unpickle(text: str, where: str) -> Any:
 
     :param text: base64 of a pickle, as SB3 writes it.
     :param where: what messages call the entry.
-    :raises ConfigError: it names or does what SB3's own pickles do not; nothing of that has been imported or called.
+    :raises ConfigError: it names or does what SB3's own pickles do not; nothing of that has been
+        imported or called.
     """
     try:
         return _interpret(base64.b64decode(text))
@@ -50,7 +53,9 @@ def unpickle(text: str, where: str) -> Any:
     except Exception as error:  # what wrong types raise depends on the types
         # Not the message of any error: to show an object is to ask it.
         reason = str(error) if isinstance(error, _Refusal) else type(error).__name__
-        raise ConfigError(f"{where} is not what Stable-Baselines3 pickles ({reason}); {WAY_OUT}") from None
+        raise ConfigError(
+            f"{where} is not what Stable-Baselines3 pickles ({reason}); {WAY_OUT}"
+        ) from None
 
 
 class _UnknownName(Exception):
@@ -70,14 +75,22 @@ def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) ->
     """As ``numpy._core.numeric._frombuffer``."""
     _check(type(buffer) in (bytes, bytearray) and isinstance(dtype, np.dtype), "an array")
     array = np.frombuffer(buffer, dtype)
-    return array.reshape(shape, order=order) if axes is None else array.reshape(shape).transpose(axes)
+    return (
+        array.reshape(shape, order=order) if axes is None else array.reshape(shape).transpose(axes)
+    )
 
 
 def _fill_array(array: Any, state: Any) -> None:
     """As ``ndarray.__setstate__``."""
     _, shape, dtype, by_columns, content = state
-    _check(isinstance(dtype, np.dtype) and type(content) is bytes and type(by_columns) is bool, "an array")
-    _check(type(shape) is tuple and all(type(n) is int and n >= 0 for n in shape), "the shape of an array")
+    _check(
+        isinstance(dtype, np.dtype) and type(content) is bytes and type(by_columns) is bool,
+        "an array",
+    )
+    _check(
+        type(shape) is tuple and all(type(n) is int and n >= 0 for n in shape),
+        "the shape of an array",
+    )
     _check(len(content) == math.prod(shape) * dtype.itemsize, "the size of an array")
     array.__setstate__((1, shape, dtype, by_columns, content))
 
@@ -129,15 +142,53 @@ _WITH_ATTRIBUTES = _by_name(  # instances of these are made, and given attribute
     *(utils.ConstantSchedule, utils.FloatSchedule, utils.LinearSchedule),
 )
 _CLASSES = _WITH_ATTRIBUTES | _by_name(  # these are only named; TrainFreq is a tuple
-    *(policies.ActorCriticPolicy, policies.ActorCriticCnnPolicy, policies.MultiInputActorCriticPolicy),
-    *(sac.SACPolicy, sac.CnnPolicy, sac.MultiInputPolicy, td3.TD3Policy, td3.CnnPolicy, td3.MultiInputPolicy),
+    *(
+        policies.ActorCriticPolicy,
+        policies.ActorCriticCnnPolicy,
+        policies.MultiInputActorCriticPolicy,
+    ),
+    *(
+        sac.SACPolicy,
+        sac.CnnPolicy,
+        sac.MultiInputPolicy,
+        td3.TD3Policy,
+        td3.CnnPolicy,
+        td3.MultiInputPolicy,
+    ),
     *(dqn.DQNPolicy, dqn.CnnPolicy, dqn.MultiInputPolicy),
     *(torch_layers.FlattenExtractor, torch_layers.NatureCNN, torch_layers.CombinedExtractor),
-    *(buffers.RolloutBuffer, buffers.DictRolloutBuffer, buffers.ReplayBuffer, buffers.DictReplayBuffer),
+    *(
+        buffers.RolloutBuffer,
+        buffers.DictRolloutBuffer,
+        buffers.ReplayBuffer,
+        buffers.DictReplayBuffer,
+    ),
     *(buffers.NStepReplayBuffer, HerReplayBuffer, TrainFreq, np.float32, np.float64),
-    *(nn.CELU, nn.ELU, nn.GELU, nn.Hardswish, nn.Hardtanh, nn.LeakyReLU, nn.Mish, nn.ReLU, nn.ReLU6, nn.SELU, nn.Sigmoid),
+    *(
+        nn.CELU,
+        nn.ELU,
+        nn.GELU,
+        nn.Hardswish,
+        nn.Hardtanh,
+        nn.LeakyReLU,
+        nn.Mish,
+        nn.ReLU,
+        nn.ReLU6,
+        nn.SELU,
+        nn.Sigmoid,
+    ),
     *(nn.SiLU, nn.Softplus, nn.Softsign, nn.Tanh),
-    *(optim.Adagrad, optim.Adam, optim.Adamax, optim.AdamW, optim.NAdam, optim.RAdam, optim.RMSprop, optim.SGD, RMSpropTFLike),
+    *(
+        optim.Adagrad,
+        optim.Adam,
+        optim.Adamax,
+        optim.AdamW,
+        optim.NAdam,
+        optim.RAdam,
+        optim.RMSprop,
+        optim.SGD,
+        RMSpropTFLike,
+    ),
 )
 _NUMPY: Names = {  # in numpy.core, which is numpy._core in NumPy 2
     ("numeric", "_frombuffer"): _array,
@@ -145,16 +196,27 @@ _NUMPY: Names = {  # in numpy.core, which is numpy._core in NumPy 2
     ("multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[()],
 }
 _FUNCTIONS: Names = {  # what is called for a name; items and state follow
-    **{(f"numpy.{core}.{module}", name): each for core in ("core", "_core") for (module, name), each in _NUMPY.items()},
+    **{
+        (f"numpy.{core}.{module}", name): each
+        for core in ("core", "_core")
+        for (module, name), each in _NUMPY.items()
+    },
     ("numpy", "dtype"): _dtype,
-    ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(0),  # Gymnasium's spaces have no other kind
+    ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(
+        0
+    ),  # Gymnasium's spaces have no other kind
     ("numpy.random._pickle", "__generator_ctor"): _generator,
     ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"): lambda *_: SeedSequence(0),
     ("collections", "OrderedDict"): lambda: OrderedDict(),
     ("collections", "deque"): lambda _, length=None: deque(maxlen=length),
-    **{key: partial(_member, kind) for key, kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items()},
+    **{
+        key: partial(_member, kind)
+        for key, kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items()
+    },
 }
-_ARGUMENTS: Names = {key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)}  # of those functions, which know them
+_ARGUMENTS: Names = {
+    key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)
+}  # of those functions, which know them
 _CHANGES: dict[type, Callable[[Any, Any], None]] = {  # how what has been made is given its state
     np.ndarray: _fill_array,
     PCG64: _set_bit_generator,
@@ -171,14 +233,18 @@ def _find(module: Any, name: Any) -> Any:
         recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
         kinds = ("ActorCriticPolicy", "ActorCriticCnnPolicy", "MultiInputActorCriticPolicy")
         names |= _by_name(*(getattr(recurrent.policies, f"Recurrent{kind}") for kind in kinds))
-        names |= _by_name(recurrent.buffers.RecurrentRolloutBuffer, recurrent.buffers.RecurrentDictRolloutBuffer)
+        names |= _by_name(
+            recurrent.buffers.RecurrentRolloutBuffer, recurrent.buffers.RecurrentDictRolloutBuffer
+        )
     if (module, name) not in names:
         raise _UnknownName(f"{module}.{name}".encode("unicode_escape").decode()[:200])
     return names[module, name]
 
 
 def _call(function: Any, arguments: Any) -> Any:
-    _check(any(function is each for each in _FUNCTIONS.values()) and type(arguments) is tuple, "a call")
+    _check(
+        any(function is each for each in _FUNCTIONS.values()) and type(arguments) is tuple, "a call"
+    )
     return function(*arguments)
 
 
@@ -197,7 +263,9 @@ def _change(instance: Any, state: Any) -> Any:
         return instance
     _check(kind in _WITH_ATTRIBUTES.values() and type(state) is dict, "a state")
     _check(all(type(name) is str and not name.startswith("__") for name in state), "attributes")
-    getattr(kind, "__setstate__", lambda made, attributes: made.__dict__.update(attributes))(instance, state)
+    getattr(kind, "__setstate__", lambda made, attributes: made.__dict__.update(attributes))(
+        instance, state
+    )
     return instance
 
 
@@ -209,11 +277,33 @@ def _of_kind(value: Any, *kinds: type) -> Any:
 _CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
 _EMPTY = {"EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
 _LITERALS = {
-    *("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
+    *(
+        "BININT",
+        "BININT1",
+        "BININT2",
+        "LONG1",
+        "BINFLOAT",
+        "SHORT_BINUNICODE",
+        "BINUNICODE",
+        "BINUNICODE8",
+    ),
     *("SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"),
 }
-_OF_TWO: dict[str, Callable[[Any, Any], Any]] = {"STACK_GLOBAL": _find, "REDUCE": _call, "NEWOBJ": _new, "BUILD": _change}
-_SIZES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3, "APPEND": 1, "SETITEM": 2, "POP": 1, **dict.fromkeys(_OF_TWO, 2)}
+_OF_TWO: dict[str, Callable[[Any, Any], Any]] = {
+    "STACK_GLOBAL": _find,
+    "REDUCE": _call,
+    "NEWOBJ": _new,
+    "BUILD": _change,
+}
+_SIZES = {
+    "TUPLE1": 1,
+    "TUPLE2": 2,
+    "TUPLE3": 3,
+    "APPEND": 1,
+    "SETITEM": 2,
+    "POP": 1,
+    **dict.fromkeys(_OF_TWO, 2),
+}
 _FROM_MARK = {"TUPLE", "APPENDS", "SETITEMS", "ADDITEMS", "FROZENSET", "POP_MARK"}
 
 

@@ -1,4 +1,6 @@
-"""A suite for any number of controllers: scenario by scenario flown, summed up and written into a folder of its own."""
+"""A suite for any number of controllers: scenario by scenario flown, summed up and written into a
+folder of its own.
+"""
 
 import hashlib
 import importlib
@@ -73,16 +75,19 @@ def evaluate(
 ) -> Results:
     """Fly all scenarios of a suite by all controllers, on the same episodes.
 
-    A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the others fly on. An interrupted
-    call goes on when it is repeated, but for factories, whose code may have changed.
+    A controller that cannot be loaded, or fails in a scenario, becomes a :class:`Failure`; the
+    others fly on. An interrupted call goes on when it is repeated, but for factories, whose code
+    may have changed.
 
     :param folder: of the results; where no controller can be loaded, it is not made.
     :param workers: that fly side by side; with one, and no Ray, this process flies.
     :param overwrite: remove the results that the folder holds, instead of refusing it; begin anew.
-    :param report: gets a line for each agent that flies another vehicle than it was trained on, or does not say on which.
-    :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is ``address``.
-    :raises ConfigError: an unknown backend; a folder that holds results of another call, that cannot be written, or that
-        another process is writing to.
+    :param report: gets a line for each agent that flies another vehicle than it was trained on, or
+        does not say on which.
+    :param executor: of the workers, see :func:`~sb3_quad.executors.start_executor`, as is
+        ``address``.
+    :raises ConfigError: an unknown backend; a folder that holds results of another call, that
+        cannot be written, or that another process is writing to.
     """
     if backend not in FLEETS:
         raise ConfigError(unknown("backend", backend, FLEETS))
@@ -102,7 +107,11 @@ def evaluate(
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
     _report_vehicles(suite, list(records), report)
-    jobs = [Job(spec, record, each, backend) for each in suite.scenarios for spec, record in records.items()]
+    jobs = [
+        Job(spec, record, each, backend)
+        for each in suite.scenarios
+        for spec, record in records.items()
+    ]
     digest, done = _digest(jobs), dict[tuple[str, str], Entry]()
 
     def results(finished: bool = True) -> Results:
@@ -144,13 +153,19 @@ def evaluate(
 
 
 def fly_scenario(
-    controller: Any, scenario: Scenario, backend: str = "batch", recorded: int | None = 0, own: Mapping[str, Any] | None = None
+    controller: Any,
+    scenario: Scenario,
+    backend: str = "batch",
+    recorded: int | None = 0,
+    own: Mapping[str, Any] | None = None,
 ) -> tuple[Flights, Arrays]:
     """Fly a scenario's episodes; the same ones for every controller and either backend.
 
     :param controller: as of :func:`~sb3_quad.evaluation.flights.fly`.
-    :param recorded: flights to sample; None: all of a scenario that is the same each time, the first few of others.
-    :param own: changes to how it is flown that go with the controller: its ``FlightSettings.observed``.
+    :param recorded: flights to sample; None: all of a scenario that is the same each time, the
+        first few of others.
+    :param own: changes to how it is flown that go with the controller: its
+        ``FlightSettings.observed``.
     :return: the metrics, and the trajectories (``flightlog.py``) of the first ``recorded`` flights.
     :raises ConfigError: an unknown backend, or a controller that cannot be asked.
     :raises ControllerError: a controller that fails in flight.
@@ -164,17 +179,28 @@ def fly_scenario(
         part = slice(first, first + size)
         plan = sample_plan(scenario, seeds[part])
         hooks = [recorder] if recorded and first == 0 else []
-        parts.append(fly_settings(controller, settings, seeds[part], backend, scenario.tolerances, hooks, plan))
+        parts.append(
+            fly_settings(
+                controller, settings, seeds[part], backend, scenario.tolerances, hooks, plan
+            )
+        )
     return Flights.concatenate(parts), recorder.arrays() if recorded else {}
 
 
 def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
-    """Fly and sum up; the arrays are those of the flights (``flightlog.py``). Of a controller that fails, its Failure."""
+    """Fly and sum up; the arrays are those of the flights (``flightlog.py``). Of a controller that
+    fails, its Failure.
+    """
     start = time.perf_counter()
     try:
-        scenario, seen = job.scenario.flown_by(job.spec.own and job.spec.own.vehicle), job.spec.observed
+        scenario, seen = (
+            job.scenario.flown_by(job.spec.own and job.spec.own.vehicle),
+            job.spec.observed,
+        )
         controller = resolve_expert(job.spec.spec, scenario.nominal_vehicle(), "controller")
-        flights, trajectories = fly_scenario(controller, scenario, job.backend, recorded=None, own=seen)
+        flights, trajectories = fly_scenario(
+            controller, scenario, job.backend, recorded=None, own=seen
+        )
     except SB3QuadError as error:
         return _failure(job.record.label, job.scenario.name, error)
     entry = Entry(
@@ -192,9 +218,11 @@ def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
 
 
 def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tuple[Job, Any]]:
-    """Fly jobs, and hand out each as it is done: one after another here, or side by side in an executor's workers.
+    """Fly jobs, and hand out each as it is done: one after another here, or side by side in an
+    executor's workers.
 
-    A job whose worker process ends, as a crash or too little memory makes it, becomes a :class:`Failure`.
+    A job whose worker process ends, as a crash or too little memory makes it, becomes a
+    :class:`Failure`.
     """
     if executor is None:
         yield from ((job, fly_job(job)) for job in jobs)
@@ -214,8 +242,12 @@ def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
     return first_vehicle(own) if scenario.vehicle is None else scenario.nominal_vehicle()
 
 
-def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]) -> None:
-    """Say so if the controllers, or the reference beside them, fly different vehicles where a scenario names none."""
+def _report_vehicles(
+    suite: Suite, specs: Sequence[ControllerSpec], report: Callable[[str], None]
+) -> None:
+    """Say so if the controllers, or the reference beside them, fly different vehicles where a
+    scenario names none.
+    """
     unfixed = [each for each in suite.scenarios if each.vehicle is None]
     vehicles = {spec.label: _vehicle(spec, unfixed[0]).name for spec in specs} if unfixed else {}
     if any(each.reference for each in unfixed):
@@ -225,12 +257,17 @@ def _report_vehicles(suite: Suite, specs: Sequence[ControllerSpec], report: Call
         report(f"not all fly the same vehicle: {each_flies}; --vehicle gives all of them one")
 
 
-def _begin(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> dict[tuple[str, str], Entry]:
-    """What the same evaluation has flown before it was interrupted, but for factories, whose code may have changed.
+def _begin(
+    folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool
+) -> dict[tuple[str, str], Entry]:
+    """What the same evaluation has flown before it was interrupted, but for factories, whose code
+    may have changed.
 
-    One that was finished has flown all, so that its table can be shown again; with factories it is other results.
+    One that was finished has flown all, so that its table can be shown again; with factories it is
+    other results.
 
-    :raises ConfigError: the folder holds other results, and they are not to be overwritten; or damaged ones.
+    :raises ConfigError: the folder holds other results, and they are not to be overwritten; or
+        damaged ones.
     """
     if not (folder / RESULTS).is_file():
         for name in WRITTEN:
@@ -238,10 +275,16 @@ def _begin(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> d
         return {}
     before = load_results(folder)
     certain = {job.name for job in jobs if job.record.kind != "factory"}
-    if before.digest == digest and not overwrite and (len(certain) == len(jobs) or not before.finished):
+    if (
+        before.digest == digest
+        and not overwrite
+        and (len(certain) == len(jobs) or not before.finished)
+    ):
         return {entry.name: entry for entry in before.entries if entry.name in certain}
     if not overwrite:
-        raise ConfigError(f"{folder}: holds results already; give another folder with -o, or remove them with --overwrite")
+        raise ConfigError(
+            f"{folder}: holds results already; give another folder with -o, or remove them with --overwrite"
+        )
     for name in WRITTEN:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / FLIGHTS, ignore_errors=True)

@@ -1,4 +1,6 @@
-"""The same n episodes in either environment, side by side in one process, for :mod:`sb3_quad.evaluation.flights`."""
+"""The same n episodes in either environment, side by side in one process, for
+:mod:`sb3_quad.evaluation.flights`.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
@@ -10,8 +12,9 @@ from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import ENDLESS, FlightSettings
 from sb3_quad.simulation.state import STATE, QuadcopterState, row_slices
 
-# What a control step gives: observations, (n, 18) or what else the agent is to see; rewards, (n,); which rows are lost, on the
-# ground or out of range, and which on the ground; |r - r_T|, m; which would be a success if they ended now.
+# What a control step gives: observations, (n, 18) or what else the agent is to see; rewards, (n,);
+# which rows are lost, on the ground or out of range, and which on the ground; |r - r_T|, m; which
+# would be a success if they ended now.
 FleetStep: TypeAlias = tuple[Float32Array, FloatArray, BoolArray, BoolArray, FloatArray, BoolArray]
 
 
@@ -23,15 +26,20 @@ class BatchFleet:
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        self._batch = QuadcopterBatch(len(seeds), settings.with_changes(max_episode_steps=ENDLESS), autoreset=False)
+        self._batch = QuadcopterBatch(
+            len(seeds), settings.with_changes(max_episode_steps=ENDLESS), autoreset=False
+        )
         self._batch.seed(seeds)
-        self.vehicle, self.observation_size = self._batch.vehicle_list[0], self._batch.observation.size
+        self.vehicle, self.observation_size = (
+            self._batch.vehicle_list[0],
+            self._batch.observation.size,
+        )
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         """Begin; observations (n, observation_size).
 
-        :param start: what replaces the episodes' own sample: any of position, velocity, body_rates, target (n, 3) and
-            quaternion (n, 4).
+        :param start: what replaces the episodes' own sample: any of position, velocity, body_rates,
+            target (n, 3) and quaternion (n, 4).
         """
         self._batch.reset()
         for name, values in start.items():
@@ -39,7 +47,9 @@ class BatchFleet:
         return self._batch.observe()
 
     def step(self, actions: Float32Array, flying: BoolArray) -> FleetStep:
-        """One control step of the rows that are ``flying``; what comes back of the others has no meaning."""
+        """One control step of the rows that are ``flying``; what comes back of the others has no
+        meaning.
+        """
         observation, reward, _ = self._batch.step(actions)
         end = self._batch.outcome
         ends = ~end["truncated"], end["collision"], end["distance"], end["success"]
@@ -68,14 +78,21 @@ class BatchFleet:
 
 
 class PyBulletFleet:
-    """As :class:`BatchFleet`, with a PyBullet environment per row, in turn; the controller still sees them as one batch."""
+    """As :class:`BatchFleet`, with a PyBullet environment per row, in turn; the controller still
+    sees them as one batch.
+    """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
         from sb3_quad.envs.quadcopter_env import QuadcopterEnv  # PyBullet may be missing
 
         self._seeds = seeds
-        self._envs = [QuadcopterEnv(**dict(settings.with_changes(max_episode_steps=ENDLESS))) for _ in seeds]
-        self.vehicle, self.observation_size = self._envs[0].vehicle, self._envs[0].batch.observation.size
+        self._envs = [
+            QuadcopterEnv(**dict(settings.with_changes(max_episode_steps=ENDLESS))) for _ in seeds
+        ]
+        self.vehicle, self.observation_size = (
+            self._envs[0].vehicle,
+            self._envs[0].batch.observation.size,
+        )
 
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         for row, (env, seed) in enumerate(zip(self._envs, self._seeds, strict=True)):
@@ -90,8 +107,14 @@ class PyBulletFleet:
         reward, distance = np.zeros(n), np.zeros(n)
         lost, collided, arrived = np.zeros((3, n), np.bool_)
         for row in np.flatnonzero(flying):
-            self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(actions[row])
-            collided[row], distance[row], arrived[row] = info["collision"], info["distance"], info["is_success"]
+            self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(
+                actions[row]
+            )
+            collided[row], distance[row], arrived[row] = (
+                info["collision"],
+                info["distance"],
+                info["is_success"],
+            )
         return self._observation.copy(), reward, lost, collided, distance, arrived
 
     def set_targets(self, rows: IntArray, targets: FloatArray) -> Float32Array:

@@ -1,7 +1,8 @@
 """Flying a controller over fresh episodes, and what is measured on the true state along the way.
 
-Conventions, found by the expert's numbers in the thesis (4.3.1): the time to a tolerance is the end of the first control
-step after which |r - r_T| is within it; the path is that of the whole episode, 15 s, not of the way until arrival.
+Conventions, found by the expert's numbers in the thesis (4.3.1): the time to a tolerance is the end
+of the first control step after which |r - r_T| is within it; the path is that of the whole episode,
+15 s, not of the way until arrival.
 """
 
 import dataclasses
@@ -27,31 +28,46 @@ from sb3_quad.vehicles.vehicle import Vehicle
 TOLERANCES = (0.1, 0.2, 0.5, 1.0)  # m
 NEAR = 0.1  # m, of arrival, where it is among the tolerances; else the tightest is
 ACTIONS = quadcopter_spaces()[1]
-TILT, RATE, HOLD = np.radians(45.0), 2.0, 0.2  # stable: tilt (rad), roll and pitch rate (rad/s) below these, for so long (s)
+TILT, RATE, HOLD = (
+    np.radians(45.0),
+    2.0,
+    0.2,
+)  # stable: tilt (rad), roll and pitch rate (rad/s) below these, for so long (s)
 
 
 @dataclass(frozen=True, eq=False)
 class Flights:
     """The metrics of n episodes, one per row."""
 
-    success: BoolArray  #: (n,), survived, and ended at the (last) target: success_distance and success_tilt of the task
+    # : (n,), survived, and ended at the (last) target: success_distance and success_tilt of the
+    # task
+    success: BoolArray
     survival: BoolArray  #: (n,), neither collision nor out of range: the thesis's success
     collision: BoolArray  #: (n,), the ground was touched
     reward: FloatArray  #: (n,), sum of the rewards
     length: IntArray  #: (n,), control steps
     flown: FloatArray  #: (n,), s until lost or the end
-    #: By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a course, to the last waypoint.
+    # : By tolerance (m): s until |r - r_T| is first within it, (n,), NaN if it never was; of a
+    # course, to the last waypoint.
     time_to: Mapping[float, FloatArray]
-    #: By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or was lost.
+    # : By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or
+    # was lost.
     time_to_stay: Mapping[float, FloatArray]
-    overshoot: FloatArray  #: (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
+    # : (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
+    overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
     final_error: FloatArray  #: (n,), |r - r_T| at the end, m
-    final_offset: FloatArray  #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    final_offset: (
+        FloatArray  #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
+    )
     stabilised: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
-    sideways: FloatArray  #: (n,), largest distance from the straight way to the target, m; NaN where there is none
-    waypoint_times: FloatArray  #: (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
-    start: FloatArray  #: (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates (body); SI
+    # : (n,), largest distance from the straight way to the target, m; NaN where there is none
+    sideways: FloatArray
+    # : (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
+    waypoint_times: FloatArray
+    # : (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
+    # (body); SI
+    start: FloatArray
     target: FloatArray  #: (n, 3), the first target, m
 
     @property
@@ -66,7 +82,9 @@ class Flights:
         for name in (entry.name for entry in dataclasses.fields(Flights)):
             values: list[Any] = [getattr(part, name) for part in parts]
             if isinstance(values[0], Mapping):
-                columns[name] = {key: np.concatenate([value[key] for value in values]) for key in values[0]}
+                columns[name] = {
+                    key: np.concatenate([value[key] for value in values]) for key in values[0]
+                }
             else:
                 columns[name] = np.concatenate(values)
         return Flights(**columns)
@@ -84,11 +102,23 @@ class Hook:
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         """The state that the flights start in."""
 
-    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
-        """The state before a control step, its observations (n, 18), the wrench (n, WRENCH_SIZE) during it, who flies (n,)."""
+    def before_step(
+        self,
+        state: QuadcopterState,
+        observation: Float32Array,
+        wrench: FloatArray,
+        flying: BoolArray,
+    ) -> None:
+        """The state before a control step, its observations (n, 18), the wrench (n, WRENCH_SIZE)
+        during it, who flies (n,).
+        """
 
-    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
-        """The state after control step ``step``, the actions (n, 4) that led to it, and the flights (n,) that go on."""
+    def after_step(
+        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+    ) -> None:
+        """The state after control step ``step``, the actions (n, 4) that led to it, and the flights
+        (n,) that go on.
+        """
 
 
 def fly(
@@ -107,25 +137,35 @@ def fly(
     """Fly ``n_episodes`` episodes; number k is the first one of the environment reset with
     ``row_seeds(seed, n_episodes)[k]`` (:func:`~sb3_quad.base.seeds.row_seeds`).
 
-    :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model, asked by
-        ``predict(observation, deterministic=True)``; or a function from observations (n, 18) to actions (n, 4).
-    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``, ``noise`` and
-        ``environment``: ``task_kwargs``, ``observation_std`` and ``observation_mean``. A model that says on which vehicle it
-        was trained flies in that one's ``rotor_layout``, unless another is given here.
+    :param controller: an expert, asked by ``actions(state)`` for the true state; an SB3 model,
+        asked by ``predict(observation, deterministic=True)``; or a function from observations (n,
+        18) to actions (n, 4).
+    :param task: as :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv` takes it, as are ``vehicle``,
+        ``noise`` and ``environment``: ``task_kwargs``, ``observation_std`` and
+        ``observation_mean``. A model that says on which vehicle it was trained flies in that one's
+        ``rotor_layout``, unless another is given here.
     :param backend: ``batch``, or ``pybullet`` for the reference.
     :param max_steps: control steps of an episode that nothing ends before.
     :param tolerances: of arrival, |r - r_T|, m.
     :param hooks: are called along the way.
-    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller that is none of the three.
+    :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller that
+        is none of the three.
     :raises ControllerError: a controller that fails in flight.
     """
     if n_episodes < 1:
         raise ConfigError(f"n_episodes {n_episodes}: must be at least 1")
-    environment |= {"task": task, "vehicle": vehicle, "noise": noise, "max_episode_steps": max_steps}
+    environment |= {
+        "task": task,
+        "vehicle": vehicle,
+        "noise": noise,
+        "max_episode_steps": max_steps,
+    }
     if environment.get("rotor_layout") is None:
         environment["rotor_layout"] = known_layout(controller)
     settings = FlightSettings().with_changes(**environment)
-    return fly_settings(controller, settings, row_seeds(seed, n_episodes), backend, tolerances, hooks)
+    return fly_settings(
+        controller, settings, row_seeds(seed, n_episodes), backend, tolerances, hooks
+    )
 
 
 def fly_settings(
@@ -152,7 +192,12 @@ def fly_settings(
 
 
 def _fly_fleet(
-    fleet: Fleet, controller: Controller, plan: Plan, max_steps: int, tolerances: Sequence[float], hooks: Sequence[Hook]
+    fleet: Fleet,
+    controller: Controller,
+    plan: Plan,
+    max_steps: int,
+    tolerances: Sequence[float],
+    hooks: Sequence[Hook],
 ) -> Flights:
     observation = fleet.reset(plan.start)
     n, control_step, count = len(observation), fleet.vehicle.control_step, len(plan.waypoints)
@@ -163,7 +208,11 @@ def _fly_fleet(
     waypoint, on_last = np.zeros(n, dtype=np.int64), np.full(n, count <= 1)
     times = np.where((error <= limits) & on_last, 0.0, np.nan)
     stays = times.copy()
-    first = times[[*tolerances].index(arrival_tolerance(tolerances))] if len(limits) else np.full(n, np.nan)  # a view
+    first = (
+        times[[*tolerances].index(arrival_tolerance(tolerances))]
+        if len(limits)
+        else np.full(n, np.nan)
+    )  # a view
     flights = Flights(
         success=np.zeros(n, dtype=np.bool_),
         survival=np.ones(n, dtype=np.bool_),
@@ -233,10 +282,11 @@ def _fly_fleet(
 class Motion:
     """Watches n flights, step by step.
 
-    ``stabilised`` (n,): s until the tilt has come below 45° and the turning about the body's x and y axes below 2 rad/s, both
-    for 0.2 s at least, of which the beginning counts; NaN if that never was. The thesis reads such a time from Fig. 4.9.
-    ``sideways`` (n,): the largest distance from the straight line through start and target, m, on the way and beyond: the
-    oscillations of 4.3.1; NaN where both are one point.
+    ``stabilised`` (n,): s until the tilt has come below 45° and the turning about the body's x and
+    y axes below 2 rad/s, both for 0.2 s at least, of which the beginning counts; NaN if that never
+    was. The thesis reads such a time from Fig. 4.9. ``sideways`` (n,): the largest distance from
+    the straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1;
+    NaN where both are one point.
 
     :param state: at the start.
     :param control_step: s.
@@ -264,5 +314,7 @@ class Motion:
         new = held & np.isnan(self.stabilised)
         self.stabilised[new] = self._since[new]
         flown = state.position - self._start
-        beside = np.linalg.norm(flown - (flown * self._direction).sum(axis=1, keepdims=True) * self._direction, axis=1)
+        beside = np.linalg.norm(
+            flown - (flown * self._direction).sum(axis=1, keepdims=True) * self._direction, axis=1
+        )
         self.sideways[flying] = np.maximum(self.sideways, beside)[flying]

@@ -15,13 +15,26 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 # The rows, without their cells:
 SUCCESS, SURVIVAL = Row("success", "%"), Row("survival", "%")
 REWARD, FLOWN = Row("mean reward"), Row("time flown", "s")
-PATH, MEDIAN, QUANTILE = Row("mean path", "m"), Row("final error, median", "m"), Row("final error, 95 %", "m")
+PATH, MEDIAN, QUANTILE = (
+    Row("mean path", "m"),
+    Row("final error, median", "m"),
+    Row("final error, 95 %", "m"),
+)
 STABLE, SIDEWAYS = Row("mean time until stable", "s"), Row("beside the straight way", "m")
-REACHED, COMPLETED, COURSE_TIME = Row("waypoints reached"), Row("courses completed", "%"), Row("time of the course", "s")
+REACHED, COMPLETED, COURSE_TIME = (
+    Row("waypoints reached"),
+    Row("courses completed", "%"),
+    Row("time of the course", "s"),
+)
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
 LIMIT = Row("physical limit of that time", "s")
 LEAVES, OVERSHOOT = Row("leave it again", "%"), Row("overshoot, median", "m")
-ALWAYS_COMPARABLE = {SUCCESS, SURVIVAL, REACHED, COMPLETED}  # also where flights are lost, which end early
+ALWAYS_COMPARABLE = {
+    SUCCESS,
+    SURVIVAL,
+    REACHED,
+    COMPLETED,
+}  # also where flights are lost, which end early
 HIGHER_IS_BETTER = ALWAYS_COMPARABLE | {REWARD}
 MOST_TOLERANCES, MAIN_TOLERANCES = 6, (0.1, 0.2, 0.5, 1.0)  # m
 CAPTION = "in brackets: 95 % intervals; bold: best of its row, intervals apart"
@@ -60,29 +73,52 @@ def metric_cells(metrics: Metrics) -> Cells:
     if metrics.sideways is not None:
         cells[SIDEWAYS] = _mean(metrics.sideways)
     if metrics.course is not None:
-        cells[REACHED], cells[COMPLETED] = _mean(metrics.course.reached), _share(metrics.course.completed)
+        cells[REACHED], cells[COMPLETED] = (
+            _mean(metrics.course.reached),
+            _share(metrics.course.completed),
+        )
         cells[COURSE_TIME] = _mean(metrics.course.time, "never")
     return cells
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
-    """As :func:`metric_cells`, of the controller with that label, beside what its vehicle could do; None if it failed."""
+    """As :func:`metric_cells`, of the controller with that label, beside what its vehicle could do;
+    None if it failed.
+    """
     entry = results.entry(controller, scenario.name)
-    return None if entry is None else {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
+    return (
+        None
+        if entry is None
+        else {**metric_cells(entry.metrics), LIMIT: Cell(entry.physical_limit)}
+    )
 
 
 def reference_cells(reference: Reference) -> Cells:
     """Others' metrics."""
-    values = {REWARD: reference.reward, PATH: reference.path, MEDIAN: reference.final_error, FLOWN: reference.flown}
+    values = {
+        REWARD: reference.reward,
+        PATH: reference.path,
+        MEDIAN: reference.final_error,
+        FLOWN: reference.flown,
+    }
     values |= {STABLE: reference.stabilised}
     cells = {row: _printed(value) for row, value in values.items() if value is not None}
     shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
-    cells |= {row: replace(_printed(share, 100.0), note=reference.note) for row, share in shares.items() if share is not None}
-    return cells | {time_row(tolerance): _printed(time) for tolerance, time in reference.time_to.items()}
+    cells |= {
+        row: replace(_printed(share, 100.0), note=reference.note)
+        for row, share in shares.items()
+        if share is not None
+    }
+    return cells | {
+        time_row(tolerance): _printed(time) for tolerance, time in reference.time_to.items()
+    }
 
 
-def metric_rows(scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = ()) -> list[Row]:
-    """The rows of a scenario, the best of each marked: first the cells of the controllers, then those from elsewhere.
+def metric_rows(
+    scenario: Scenario, measured: Sequence[Cells | None], references: Iterable[Reference] = ()
+) -> list[Row]:
+    """The rows of a scenario, the best of each marked: first the cells of the controllers, then
+    those from elsewhere.
 
     :param measured: of each controller; None: it failed.
     """
@@ -109,13 +145,18 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
     marked = []
     for cell in cells:
         others = [other for other in measured if other is not cell]
-        best = cell.value is not None and bool(others) and all(_beats(cell, other, higher) for other in others)
+        best = (
+            cell.value is not None
+            and bool(others)
+            and all(_beats(cell, other, higher) for other in others)
+        )
         marked.append(replace(cell, best=best))
     return marked
 
 
 def overview(results: Results, controllers: Sequence[str]) -> Table:
-    """All scenarios in one table: a section each, a column per controller, reference metrics in the last column.
+    """All scenarios in one table: a section each, a column per controller, reference metrics in the
+    last column.
 
     :param controllers: labels, in the order of their columns.
     """
@@ -128,11 +169,15 @@ def overview(results: Results, controllers: Sequence[str]) -> Table:
         for scenario in scenarios:
             measured = [measured_cells(results, label, scenario) for label in controllers]
             found = metric_rows(scenario, measured, scenario.reference.values())
-            varied = ", ".join(f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items())
+            varied = ", ".join(
+                f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()
+            )
             for row in found:
                 name = f"{varied}, {row.name}" if varied and len(found) > 1 else varied or row.name
                 others = zip(scenario.reference, row.cells[len(controllers) :], strict=True)
-                beside = "; ".join(f"{who} {replace(cell, note='').text}" for who, cell in others if cell != Cell())
+                beside = "; ".join(
+                    f"{who} {replace(cell, note='').text}" for who, cell in others if cell != Cell()
+                )
                 cells = [*row.cells[: len(controllers)], Cell(words=beside)]
                 rows.append(Row(f"  {name}", row.unit, cells[: len(columns)]))
     return Table(columns, rows, title=results.suite, caption=CAPTION)
@@ -143,30 +188,54 @@ def scenario_groups(results: Results) -> list[tuple[str, list[Scenario]]]:
     groups = []
     for _, members in groupby(results.scenarios, lambda scenario: scenario.group or scenario.name):
         scenarios = list(members)
-        heading = scenarios[0].heading.rsplit(":", 1)[0] if scenarios[0].group else scenarios[0].heading
+        heading = (
+            scenarios[0].heading.rsplit(":", 1)[0] if scenarios[0].group else scenarios[0].heading
+        )
         groups.append((heading[:1].upper() + heading[1:], scenarios))
     return groups
 
 
 def _rows_of(scenario: Scenario) -> list[Row]:
-    """The rows that mean something in a scenario; only the main ones of many tolerances, a plot shows the others."""
+    """The rows that mean something in a scenario; only the main ones of many tolerances, a plot
+    shows the others.
+    """
     if scenario.target.waypoints is not None:
         return [SUCCESS, SURVIVAL, REACHED, COMPLETED, COURSE_TIME]
     if scenario.group is not None:
         return [SUCCESS, SURVIVAL, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
     tolerances = scenario.tolerances
     if len(tolerances) > MOST_TOLERANCES:
-        referenced = {float(key) for reference in scenario.reference.values() for key in reference.time_to}
+        referenced = {
+            float(key) for reference in scenario.reference.values() for key in reference.time_to
+        }
         kept = {tolerances[0], *MAIN_TOLERANCES, *referenced}
         tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
-    if scenario.target.distance == 0.0:  # where an episode starts at its target there is no way to it
-        return [SUCCESS, SURVIVAL, *([FLOWN] if scenario.is_fixed else []), REWARD, STABLE, MEDIAN, QUANTILE]
-    times = [stay_row(arrival_tolerance(tolerances)), LIMIT, LEAVES, OVERSHOOT, *map(time_row, tolerances)]
+    if (
+        scenario.target.distance == 0.0
+    ):  # where an episode starts at its target there is no way to it
+        return [
+            SUCCESS,
+            SURVIVAL,
+            *([FLOWN] if scenario.is_fixed else []),
+            REWARD,
+            STABLE,
+            MEDIAN,
+            QUANTILE,
+        ]
+    times = [
+        stay_row(arrival_tolerance(tolerances)),
+        LIMIT,
+        LEAVES,
+        OVERSHOOT,
+        *map(time_row, tolerances),
+    ]
     return [SUCCESS, SURVIVAL, REWARD, *times, PATH, SIDEWAYS, MEDIAN, QUANTILE]
 
 
 def _beats(cell: Cell, other: Cell, higher: bool) -> bool:
-    (low, high), (other_low, other_high) = (each.ends or (each.value or 0.0,) * 2 for each in (cell, other))
+    (low, high), (other_low, other_high) = (
+        each.ends or (each.value or 0.0,) * 2 for each in (cell, other)
+    )
     return low > other_high if higher else high < other_low
 
 
@@ -177,12 +246,18 @@ def _share(estimate: Estimate) -> Cell:
 
 
 def _mean(estimate: Estimate | None, none: str = "–") -> Cell:
-    return Cell(words=none) if estimate is None else Cell(estimate.value, (estimate.low, estimate.high))
+    return (
+        Cell(words=none)
+        if estimate is None
+        else Cell(estimate.value, (estimate.low, estimate.high))
+    )
 
 
 def _moment(moment: Moment, verb: str = "arrive") -> Cell:
     some = moment.time is not None and moment.share.value < 1.0
-    return replace(_mean(moment.time, "never"), note=f"{100 * moment.share.value:.3g} % {verb}" if some else "")
+    return replace(
+        _mean(moment.time, "never"), note=f"{100 * moment.share.value:.3g} % {verb}" if some else ""
+    )
 
 
 def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:

@@ -16,15 +16,21 @@ class Moment(Frozen):
     """Something that a flight comes to, or never does."""
 
     share: Estimate = Field(description="of the flights that came to it")
-    time: Estimate | None = Field(description="mean time until then of those flights, s; None: no flight did")
+    time: Estimate | None = Field(
+        description="mean time until then of those flights, s; None: no flight did"
+    )
 
 
 class Arrival(Moment):
-    """Arrival within one tolerance: when it is first touched, and after which time it is not left again."""
+    """Arrival within one tolerance: when it is first touched, and after which time it is not left
+    again.
+    """
 
     tolerance: float = Field(description="m")
     stays: Moment = Field(description="flights that end within it, and after which time they stay")
-    leaves: Estimate | None = Field(description="share that leaves it again, of the flights that came to it")
+    leaves: Estimate | None = Field(
+        description="share that leaves it again, of the flights that came to it"
+    )
 
 
 class Course(Frozen):
@@ -32,15 +38,21 @@ class Course(Frozen):
 
     reached: Estimate = Field(description="mean number of waypoints reached")
     completed: Estimate = Field(description="share of the flights that reached all")
-    time: Estimate | None = Field(description="mean time until the last waypoint of those flights, s")
+    time: Estimate | None = Field(
+        description="mean time until the last waypoint of those flights, s"
+    )
 
 
 class Metrics(Frozen):
-    """What one controller reached in one scenario; path and errors are of the flights that were not lost."""
+    """What one controller reached in one scenario; path and errors are of the flights that were not
+    lost.
+    """
 
     n: int = Field(description="flights")
     success: Estimate = Field(description="share that survived and ended at the target")
-    survival: Estimate = Field(description="share that neither touched the ground nor left the range")
+    survival: Estimate = Field(
+        description="share that neither touched the ground nor left the range"
+    )
     collisions: int = Field(description="flights that touched the ground")
     out_of_range: int = Field(description="flights that left the range")
     reward: Estimate = Field(description="mean sum of rewards (Eqs. 4.5-4.9)")
@@ -54,7 +66,9 @@ class Metrics(Frozen):
     final_error_max: float | None = Field(description="m")
     final_offset: Vector | None = Field(description="mean r - r_T at the end, world frame, m")
     stabilised: Moment = Field(description="which flights got stable again, and when")
-    sideways: Estimate | None = Field(description="mean largest distance from the straight way, m; None: there is none")
+    sideways: Estimate | None = Field(
+        description="mean largest distance from the straight way, m; None: there is none"
+    )
     course: Course | None = Field(description="of scenarios with waypoints")
 
 
@@ -65,7 +79,10 @@ def summarise(flights: Flights) -> Metrics:
     some, reached = bool(done.any()), np.isfinite(flights.waypoint_times)
     course = None
     if reached.shape[1]:
-        count, time = bootstrap(reached.sum(axis=1, dtype=np.float64)), mean(flights.waypoint_times[:, -1])
+        count, time = (
+            bootstrap(reached.sum(axis=1, dtype=np.float64)),
+            mean(flights.waypoint_times[:, -1]),
+        )
         course = Course(reached=count, completed=share(reached.all(axis=1)), time=time)
     return Metrics(
         n=flights.n,
@@ -75,12 +92,19 @@ def summarise(flights: Flights) -> Metrics:
         out_of_range=int((~done & ~flights.collision).sum()),
         reward=bootstrap(flights.reward),
         flown=bootstrap(flights.flown),
-        arrivals=[_arrival(each, times, flights.time_to_stay[each]) for each, times in sorted(flights.time_to.items())],
-        overshoot=float(np.nanmedian(flights.overshoot)) if np.isfinite(flights.overshoot).any() else None,
+        arrivals=[
+            _arrival(each, times, flights.time_to_stay[each])
+            for each, times in sorted(flights.time_to.items())
+        ],
+        overshoot=float(np.nanmedian(flights.overshoot))
+        if np.isfinite(flights.overshoot).any()
+        else None,
         path=mean(flights.path_length[done]),
         final_error=mean(error),
         final_error_median=float(np.median(error)) if some else None,
-        final_error_95=bootstrap(error, lambda values, axis: np.quantile(values, 0.95, axis=axis)) if some else None,
+        final_error_95=bootstrap(error, lambda values, axis: np.quantile(values, 0.95, axis=axis))
+        if some
+        else None,
         final_error_max=float(error.max()) if some else None,
         final_offset=tuple(offset.mean(axis=0).tolist()) if some else None,
         stabilised=Moment(**_moment(flights.stabilised)),
@@ -92,7 +116,9 @@ def summarise(flights: Flights) -> Metrics:
 def _arrival(tolerance: float, times: FloatArray, stays: FloatArray) -> Arrival:
     arrived = np.isfinite(times)
     leaves = share((stays != times)[arrived]) if arrived.any() else None
-    return Arrival(tolerance=tolerance, stays=Moment(**_moment(stays)), leaves=leaves, **_moment(times))
+    return Arrival(
+        tolerance=tolerance, stays=Moment(**_moment(stays)), leaves=leaves, **_moment(times)
+    )
 
 
 def _moment(times: FloatArray) -> dict[str, Any]:

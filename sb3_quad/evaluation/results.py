@@ -1,7 +1,8 @@
 """What an evaluation leaves behind in its folder; every file appears whole or not at all.
 
 - ``results.json``, a :class:`Results`: scenarios, controllers, metrics with their intervals;
-- ``flights/<controller>/<scenario>.npz``, the flights as arrays, with sampled trajectories (``flightlog.py``);
+- ``flights/<controller>/<scenario>.npz``, the flights as arrays, with sampled trajectories
+  (``flightlog.py``);
 - ``episodes.csv``, at the end, one line per flight: seed, start, outcome, times, path, final error.
 
 A number that does not exist is None, never NaN.
@@ -22,10 +23,18 @@ from sb3_quad.evaluation.metrics import Metrics
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 RESULTS, EPISODES, FLIGHTS = "results.json", "episodes.csv", "flights"
-WRITTEN = RESULTS, EPISODES, "report.html", "report.md"  # what does not outlast the results; the last two by a report
+WRITTEN = (
+    RESULTS,
+    EPISODES,
+    "report.html",
+    "report.md",
+)  # what does not outlast the results; the last two by a report
 _AXES = {
     "target": ("x", "y", "z"),
-    "start": (*("x", "y", "z", "qw", "qx", "qy", "qz"), *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z")),
+    "start": (
+        *("x", "y", "z", "qw", "qx", "qy", "qz"),
+        *("vx", "vy", "vz", "rate_x", "rate_y", "rate_z"),
+    ),
 }
 
 
@@ -33,7 +42,9 @@ class ControllerRecord(Frozen):
     """Who flew."""
 
     label: str = Field(description="column title; unique in a folder")
-    spec: str = Field(description="as given: pid, geometric, the file name of a zip, package.module:factory")
+    spec: str = Field(
+        description="as given: pid, geometric, the file name of a zip, package.module:factory"
+    )
     kind: Literal["expert", "model", "factory"]
     algorithm: str | None = Field(default=None, description="SB3 class that loaded a zip")
     content: str | None = Field(default=None, description="SHA-256 of the zip")
@@ -49,7 +60,9 @@ class Entry(Frozen):
     seconds: float = Field(description="wall-clock time it took")
     date: str = Field(description="day on which it was flown, UTC, year-month-day")
     metrics: Metrics
-    physical_limit: float | None = Field(default=None, description="Scenario.physical_limit, beside the time to stay, s")
+    physical_limit: float | None = Field(
+        default=None, description="Scenario.physical_limit, beside the time to stay, s"
+    )
     flights: str = Field(description="path of the .npz, relative to the folder")
 
     @property
@@ -72,13 +85,18 @@ class Results(Frozen):
     schema_version: Literal[4] = 4
     suite: str
     description: str
-    source: str = Field(default="reference", description="where the scenarios' reference comes from")
+    source: str = Field(
+        default="reference", description="where the scenarios' reference comes from"
+    )
     package_version: str
     controllers: list[ControllerRecord]
     scenarios: list[Scenario]
     entries: list[Entry]
     failures: list[Failure] = Field(default_factory=list)
-    digest: str = Field(default="", description="SHA-256 of all that the evaluation depends on: only the same one goes on")
+    digest: str = Field(
+        default="",
+        description="SHA-256 of all that the evaluation depends on: only the same one goes on",
+    )
     finished: bool = Field(default=True, description="whether it has come to its end")
 
     def entry(self, controller: str, scenario: str) -> Entry | None:
@@ -112,25 +130,42 @@ def write_episodes(folder: Path, entries: Iterable[Entry]) -> None:
 
     :raises ConfigError: a folder that cannot be written, a full disk, flights that cannot be read.
     """
-    rows = [row for entry in entries for row in _rows(entry, read_arrays(folder / entry.flights, "episode_"))]
+    rows = [
+        row
+        for entry in entries
+        for row in _rows(entry, read_arrays(folder / entry.flights, "episode_"))
+    ]
     write_csv(folder / EPISODES, dict.fromkeys(name for row in rows for name in row), rows)
 
 
 def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
     """A line of the table for each flight."""
-    columns = {name: arrays[f"episode_{name}"] for name in ("seed", "outcome", "flown", "reward", "path", "final_error")}
+    columns = {
+        name: arrays[f"episode_{name}"]
+        for name in ("seed", "outcome", "flown", "reward", "path", "final_error")
+    }
     columns["waypoints_reached"] = np.isfinite(arrays["episode_waypoints"]).sum(axis=1)
     for name, axes in _AXES.items():
-        columns |= {f"{name}_{axis}": values for axis, values in zip(axes, arrays[f"episode_{name}"].T, strict=True)}
+        columns |= {
+            f"{name}_{axis}": values
+            for axis, values in zip(axes, arrays[f"episode_{name}"].T, strict=True)
+        }
     for name in ("time_to", "time_to_stay"):
         times = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
         columns |= {f"{name}_{tolerance:g}": values for tolerance, values in times}
     columns["overshoot"] = arrays["episode_overshoot"]
-    columns |= {f"waypoint_{number}": values for number, values in enumerate(arrays["episode_waypoints"].T, 1)}
+    columns |= {
+        f"waypoint_{number}": values
+        for number, values in enumerate(arrays["episode_waypoints"].T, 1)
+    }
     return [
         {"controller": entry.controller, "scenario": entry.scenario, "episode": episode}
         | {
-            name: str(value) if not isinstance(value, np.floating) else f"{value:.9g}" if np.isfinite(value) else ""
+            name: str(value)
+            if not isinstance(value, np.floating)
+            else f"{value:.9g}"
+            if np.isfinite(value)
+            else ""
             for name, value in zip(columns, row, strict=True)
         }
         for episode, row in enumerate(zip(*columns.values(), strict=True))

@@ -1,4 +1,6 @@
-"""Shares, means and quantiles with their 95 % intervals: Wilson's for shares, the percentile bootstrap for the others."""
+"""Shares, means and quantiles with their 95 % intervals: Wilson's for shares, the percentile
+bootstrap for the others.
+"""
 
 import math
 from collections.abc import Callable
@@ -34,7 +36,9 @@ def share(hits: npt.ArrayLike) -> Estimate:
     p = float(array.mean())
     centre, half = p + Z * Z / (2 * n), Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
     scale = 1 + Z * Z / n
-    return Estimate(value=p, low=min(p, (centre - half) / scale), high=max(p, (centre + half) / scale), n=n)
+    return Estimate(
+        value=p, low=min(p, (centre - half) / scale), high=max(p, (centre + half) / scale), n=n
+    )
 
 
 def mean(values: npt.ArrayLike) -> Estimate | None:

@@ -1,4 +1,6 @@
-"""One table for terminals (``rich``), Markdown and the page of a report: metrics with their intervals, or words."""
+"""One table for terminals (``rich``), Markdown and the page of a report: metrics with their
+intervals, or words.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -42,11 +44,16 @@ class Cell:
     @property
     def text(self) -> str:
         """The number or the words, the interval in brackets, the note."""
-        interval, note = (f" ({self.interval})" if self.interval else ""), (f", {self.note}" if self.note else "")
+        interval, note = (
+            (f" ({self.interval})" if self.interval else ""),
+            (f", {self.note}" if self.note else ""),
+        )
         return (self.number or self.words) + interval + note
 
     def _rounded(self, value: float) -> str:
-        return f"{round(value, self.decimals) + 0.0:.{self.decimals}f}".replace("-", "−")  # + 0.0: zero without a sign
+        return f"{round(value, self.decimals) + 0.0:.{self.decimals}f}".replace(
+            "-", "−"
+        )  # + 0.0: zero without a sign
 
 
 @dataclass(frozen=True)
@@ -98,14 +105,27 @@ class Table:
 
     def markdown(self) -> str:
         """The lines of the table; the best of a row is bold. Names of any characters make no HTML."""
-        lines = [[self.corner, *(column.heading for column in self.columns)], ["---"] * (1 + len(self.columns))]
+        lines = [
+            [self.corner, *(column.heading for column in self.columns)],
+            ["---"] * (1 + len(self.columns)),
+        ]
         for row in self.rows:
-            lines.append([row.heading, *(f"**{cell.text}**" if cell.best else cell.text for cell in row.cells)])
-        return "\n".join(f"| {' | '.join(escape_html(cell.replace('|', '/'), False) for cell in line)} |" for line in lines)
+            lines.append(
+                [
+                    row.heading,
+                    *(f"**{cell.text}**" if cell.best else cell.text for cell in row.cells),
+                ]
+            )
+        return "\n".join(
+            f"| {' | '.join(escape_html(cell.replace('|', '/'), False) for cell in line)} |"
+            for line in lines
+        )
 
     def __rich__(self) -> rich.table.Table:
         """The table as ``rich`` prints it; the best of a row is bold."""
-        table = rich.table.Table(title=escape(self.title) or None, caption=escape(self.caption) or None)
+        table = rich.table.Table(
+            title=escape(self.title) or None, caption=escape(self.caption) or None
+        )
         table.title_justify = table.caption_justify = "left"
         table.show_header = any([self.corner, *(column.heading for column in self.columns)])
         table.add_column(Text(self.corner), no_wrap=True)
@@ -120,7 +140,10 @@ class Table:
 
 
 def text_table(
-    title: str, heads: Sequence[str], rows: Iterable[Sequence[str]], align: Literal["left", "right"] = "right"
+    title: str,
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    align: Literal["left", "right"] = "right",
 ) -> Table:
     """A table of words.
 

@@ -20,8 +20,9 @@ from sb3_quad.base.signals import ignore_interrupts
 class LocalExecutor:
     """Up to ``workers`` processes, each started when it is first needed.
 
-    A thread of this process waits for each of them. Each is a pool of its own, so that one that dies takes no other's call
-    along. They end with the process that started them, also where that is killed. Ctrl-C in a terminal is left to it.
+    A thread of this process waits for each of them. Each is a pool of its own, so that one that
+    dies takes no other's call along. They end with the process that started them, also where that
+    is killed. Ctrl-C in a terminal is left to it.
     """
 
     def __init__(self, workers: int) -> None:
@@ -35,7 +36,9 @@ class LocalExecutor:
         return self._threads.submit(self._call, function, *arguments)
 
     def stop(self) -> None:
-        """Cancel the calls that have not begun; SIGTERM to those under way, by which a training saves and ends."""
+        """Cancel the calls that have not begun; SIGTERM to those under way, by which a training
+        saves and ends.
+        """
         self._end(signal.SIGTERM)
 
     def __enter__(self) -> "LocalExecutor":
@@ -70,7 +73,9 @@ class LocalExecutor:
 
 
 def _context() -> Any:
-    """How workers start: forked from a process that has imported what takes seconds and does nothing else; else anew."""
+    """How workers start: forked from a process that has imported what takes seconds and does
+    nothing else; else anew.
+    """
     if sys.platform != "linux":
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")

@@ -21,27 +21,44 @@ RETRIES = 3  # of a call whose node or worker process dies
 
 
 class RayExecutor:
-    """Calls on a cluster at an address, or on one that is started here for as long as this executor lives.
+    """Calls on a cluster at an address, or on one that is started here for as long as this executor
+    lives.
 
-    A call whose worker or node dies is begun again on another, by Ray, up to ``RETRIES`` times. Workers of a cluster at an
-    address get this package from here (``runtime_env``); what it depends on is installed there. They work in this process's
-    folder, so all machines need a disk that they share.
+    A call whose worker or node dies is begun again on another, by Ray, up to ``RETRIES`` times.
+    Workers of a cluster at an address get this package from here (``runtime_env``); what it depends
+    on is installed there. They work in this process's folder, so all machines need a disk that they
+    share.
 
     :raises ConfigError: an address at which no cluster answers.
     """
 
-    def __init__(self, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0) -> None:
+    def __init__(
+        self, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
+    ) -> None:
         ray = self._ray = require("ray", "ray", "--executor ray")
         self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references = list[Any]()
-        variables = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)), **({VARIABLE: "1"} if trusted() else {})}
+        variables = {
+            "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
+            **({VARIABLE: "1"} if trusted() else {}),
+        }
         environment: dict[str, Any] = {"env_vars": variables}
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": "ERROR", "runtime_env": environment}
+        options: dict[str, Any] = {
+            "log_to_driver": False,
+            "logging_level": "ERROR",
+            "runtime_env": environment,
+        }
         try:
             if address is None:
-                os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")  # Ray's warning about it is none of ours
-                os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's 15 leaves them nothing beside other work
-                ray.init(address="local", num_cpus=workers * num_cpus, include_dashboard=False, **options)
+                os.environ.setdefault(
+                    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0"
+                )  # Ray's warning about it is none of ours
+                os.environ.setdefault(
+                    "RAY_worker_niceness", "0"
+                )  # Ray's 15 leaves them nothing beside other work
+                ray.init(
+                    address="local", num_cpus=workers * num_cpus, include_dashboard=False, **options
+                )
             else:
                 _check_address(address)
                 with tempfile.TemporaryDirectory() as folder:  # which Ray uploads
@@ -52,18 +69,24 @@ class RayExecutor:
             raise
         except Exception as error:  # Ray raises what it likes
             reason = " ".join(str(error).split())[:200]
-            raise ConfigError(f"Ray cluster {address or 'on this machine'}: cannot be used ({reason})") from None
+            raise ConfigError(
+                f"Ray cluster {address or 'on this machine'}: cannot be used ({reason})"
+            ) from None
         self.workers = max(1, int(total.get("CPU", 0) // num_cpus) if num_cpus else workers)
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        call = self._ray.remote(_call).options(name=getattr(function, "__name__", "call"), **self._needs)
+        call = self._ray.remote(_call).options(
+            name=getattr(function, "__name__", "call"), **self._needs
+        )
         reference, future = call.remote(sys.argv, os.getcwd(), function, *arguments), Future[Any]()
         self._references.append(reference)
         reference.future().add_done_callback(lambda done: self._hand_over(done, future))
         return future
 
     def stop(self) -> None:
-        """Cancel all calls; those under way are interrupted as by Ctrl-C, by which a training saves and ends."""
+        """Cancel all calls; those under way are interrupted as by Ctrl-C, by which a training saves
+        and ends.
+        """
         for reference in self._references:
             self._ray.cancel(reference)
 
@@ -85,11 +108,17 @@ class RayExecutor:
             future.set_exception(error.cause)
         else:
             reason = " ".join(str(error).split())[:120]
-            future.set_exception(WorkerDied(f"its worker on the cluster ended, and {RETRIES} more after it ({reason})"))
+            future.set_exception(
+                WorkerDied(
+                    f"its worker on the cluster ended, and {RETRIES} more after it ({reason})"
+                )
+            )
 
 
 def _check_address(address: str) -> None:
-    """See that somebody answers at an address, since Ray itself would wait for minutes, and then end the process."""
+    """See that somebody answers at an address, since Ray itself would wait for minutes, and then
+    end the process.
+    """
     if address == "auto":  # Ray looks for one on this machine, and says at once that there is none
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
@@ -101,7 +130,9 @@ def _check_address(address: str) -> None:
 
 
 def _copy_package(folder: Path) -> Path:
-    """This package as a wheel lays it out, so that nodes find a checkout's ``envs/`` and its like inside of it."""
+    """This package as a wheel lays it out, so that nodes find a checkout's ``envs/`` and its like
+    inside of it.
+    """
     package, target = Path(__file__).resolve().parents[1], folder / "sb3_quad"
     ignored = shutil.ignore_patterns("*.pyc")
     shutil.copytree(package, target, ignore=ignored)
@@ -112,9 +143,13 @@ def _copy_package(folder: Path) -> Path:
 
 
 def _call(argv: list[str], folder: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """On a worker: as in the process that asks, in its folder and with its command line, which runs note."""
+    """On a worker: as in the process that asks, in its folder and with its command line, which runs
+    note.
+    """
     if not Path(folder).is_dir():
-        raise ConfigError(f"{folder}: not seen by {platform.node()}; a Ray cluster needs a disk that all share")
+        raise ConfigError(
+            f"{folder}: not seen by {platform.node()}; a Ray cluster needs a disk that all share"
+        )
     os.chdir(folder)
     sys.argv = argv
     torch.set_num_threads(1)

@@ -1,4 +1,6 @@
-"""A geometric controller for large angles: it recovers from nearly every attitude, spin and fall, and flies to targets."""
+"""A geometric controller for large angles: it recovers from nearly every attitude, spin and fall,
+and flies to targets.
+"""
 
 import math
 
@@ -25,36 +27,59 @@ from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
-_ROWS = [row_slices(STATE)[name] for name in ("position", "quaternion", "velocity", "body_rates", "target")]
+_ROWS = [
+    row_slices(STATE)[name]
+    for name in ("position", "quaternion", "velocity", "body_rates", "target")
+]
 _NO_WRENCH = np.zeros((WRENCH_SIZE, 1))
 _DRAG_LEFT = 0.5  # of the drag of its own motion, uncompensated: it damps
-_SLOWER = dict.fromkeys(("position", "velocity", "height_position", "height_velocity", "attitude"), 0.85)
-_LATE = {**_SLOWER, "descent": 0.5, "body_rates": 1.25}  # what told_derived multiplies where commands act late
+_SLOWER = dict.fromkeys(
+    ("position", "velocity", "height_position", "height_velocity", "attitude"), 0.85
+)
+_LATE = {
+    **_SLOWER,
+    "descent": 0.5,
+    "body_rates": 1.25,
+}  # what told_derived multiplies where commands act late
 _LATE_FROM, _LATE_TO = 0.085, 0.125  # s of command lag: not yet, fully
-_TOLD_YAW = 4.0  # times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
+# Times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
+_TOLD_YAW = 4.0
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
     """Gains for a vehicle whose YAML has none, in proportion to its control authority, by search.
 
-    Found together for ITM, Crazyflie, Hummingbird, one with slow motors, and vehicles of the distribution ``raptor``, told.
-    The scales are the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest angular acceleration a_φ
-    about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1),
-    sideways at constant height, g √(c² - 1), and downwards, g (1 - l), with thrust limits l and c in hover thrusts.
+    Found together for ITM, Crazyflie, Hummingbird, one with slow motors, and vehicles of the
+    distribution ``raptor``, told. The scales are the lag τ from a command to its thrust
+    (``Vehicle.command_lag``); the greatest angular acceleration a_φ about the weaker of roll and
+    pitch; the time to turn, τ + 1/√a_φ; and the greatest accelerations: upwards, g (c - 1),
+    sideways at constant height, g √(c² - 1), and downwards, g (1 - l), with thrust limits l and c
+    in hover thrusts.
     """
     derived = _derived_gains(vehicle.parameters()[:, None], vehicle.control_step)
     return GeometricGains.model_validate({name: float(value[0]) for name, value in derived.items()})
 
 
 def _command_lag(v: FloatArray, control_step: float) -> FloatArray:
-    return np.asarray((v[P.delay] + 0.5) * control_step + 0.5 / v[P.motor_gain_up] + 0.5 / v[P.motor_gain_down])
+    return np.asarray(
+        (v[P.delay] + 0.5) * control_step + 0.5 / v[P.motor_gain_up] + 0.5 / v[P.motor_gain_down]
+    )
 
 
 def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:
     """The gains of :func:`derived_gains` by name, (n,) each, for the parameters of n vehicles."""
-    moments = np.abs(v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)).sum(axis=1) * v[P.thrust_half_range]
-    turn, lag, gravity = (moments / v[[P.ixx, P.iyy]]).min(axis=0), _command_lag(v, control_step), v[P.gravity]
-    least, most = ((v[P.thrust_middle] + sign * v[P.thrust_half_range]) / v[P.hover_thrust] for sign in (-1.0, 1.0))
+    moments = (
+        np.abs(v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)).sum(axis=1) * v[P.thrust_half_range]
+    )
+    turn, lag, gravity = (
+        (moments / v[[P.ixx, P.iyy]]).min(axis=0),
+        _command_lag(v, control_step),
+        v[P.gravity],
+    )
+    least, most = (
+        (v[P.thrust_middle] + sign * v[P.thrust_half_range]) / v[P.hover_thrust]
+        for sign in (-1.0, 1.0)
+    )
     rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
     sideways = np.sqrt(np.maximum(most, 1.01) ** 2 - 1.0)  # a tired vehicle may not even hover
     upwards = gravity * (np.maximum(most, 1.01) - 1.0)
@@ -76,7 +101,9 @@ def _derived_gains(v: FloatArray, control_step: float) -> dict[str, FloatArray]:
 
 
 class _TrueConstants:
-    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that have changed."""
+    """The law's constants for n vehicles of known parameters, computed anew only for vehicles that
+    have changed.
+    """
 
     def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float]) -> None:
         self._control_step, self._seen = vehicle.control_step, np.empty(0)
@@ -92,38 +119,56 @@ class _TrueConstants:
         if self._seen.shape != vehicles.shape:
             self._seen = np.full_like(vehicles, np.nan)
             n = vehicles.shape[1]
-            self._all = np.empty((len(self._scale), n)), np.empty((6, n)), np.empty((n, 4, 4)), np.empty((2, n))
+            self._all = (
+                np.empty((len(self._scale), n)),
+                np.empty((6, n)),
+                np.empty((n, 4, 4)),
+                np.empty((2, n)),
+            )
         new = np.flatnonzero((self._seen != vehicles).any(axis=0))
         if new.size:
             v = self._seen[:, new] = vehicles[:, new]
             gains, body, inverses, ranges = self._all
-            body[:, new] = *v[[P.mass, P.gravity, P.ixx, P.iyy, P.izz]], _command_lag(v, self._control_step)
+            body[:, new] = (
+                *v[[P.mass, P.gravity, P.ixx, P.iyy, P.izz]],
+                _command_lag(v, self._control_step),
+            )
             late = np.clip((body[-1, new] - _LATE_FROM) / (_LATE_TO - _LATE_FROM), 0.0, 1.0)
             gains[:, new] = self._scale * self._gains(v) * (1.0 + (self._late - 1.0) * late)
             arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
-            inverses[new] = np.linalg.inv(np.concatenate([np.ones((1, *arms.shape[1:])), arms]).transpose(2, 0, 1))
-            ranges[:, new] = v[P.thrust_middle] - v[P.thrust_half_range], v[P.thrust_middle] + v[P.thrust_half_range]
+            inverses[new] = np.linalg.inv(
+                np.concatenate([np.ones((1, *arms.shape[1:])), arms]).transpose(2, 0, 1)
+            )
+            ranges[:, new] = (
+                v[P.thrust_middle] - v[P.thrust_half_range],
+                v[P.thrust_middle] + v[P.thrust_half_range],
+            )
         return self._all
 
 
 class GeometricExpert(Expert):
-    """Position and attitude control on S² for large angles; docs/research/experts.md has its law in formulas.
+    """Position and attitude control on S² for large angles; docs/research/experts.md has its law in
+    formulas.
 
-    After Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (CDC 2010), with reduced
-    attitude (Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control", IEEE Control Systems 31(3), 2011): the
-    thrust direction only, before the yaw, as in Brescianini and D'Andrea, "Tilt-prioritized quadrocopter attitude control"
-    (IEEE Trans. Control Systems Technology 28(2), 2020), since no task here asks for a heading. What it adds to them:
-    velocities and body rates that the vehicle can brake from, the attitude as it will be when the command acts, the long
-    way round where the spin makes that quicker, and rotor thrusts that give up yaw before thrust and thrust before tilt.
-    Its actions are a function of what the 18 observed features hold; it has no state.
+    After Lee, Leok and McClamroch, "Geometric tracking control of a quadrotor UAV on SE(3)" (CDC
+    2010), with reduced attitude (Chaturvedi, Sanyal and McClamroch, "Rigid-body attitude control",
+    IEEE Control Systems 31(3), 2011): the thrust direction only, before the yaw, as in Brescianini
+    and D'Andrea, "Tilt-prioritized quadrocopter attitude control" (IEEE Trans. Control Systems
+    Technology 28(2), 2020), since no task here asks for a heading. What it adds to them: velocities
+    and body rates that the vehicle can brake from, the attitude as it will be when the command
+    acts, the long way round where the spin makes that quicker, and rotor thrusts that give up yaw
+    before thrust and thrust before tilt. Its actions are a function of what the 18 observed
+    features hold; it has no state.
 
     :param vehicle: name, YAML path or Vehicle it is designed for.
-    :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML (``geometric_gains``), or
-        :func:`derived_gains` where it has none.
-    :param told: whether it uses each vehicle's true parameters and compensates the external wrench, as far as a state holds
-        them (``state.vehicles``, ``state.wrench``). Its gains then scale with the vehicle as :func:`derived_gains` do.
+    :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML
+        (``geometric_gains``), or :func:`derived_gains` where it has none.
+    :param told: whether it uses each vehicle's true parameters and compensates the external wrench,
+        as far as a state holds them (``state.vehicles``, ``state.wrench``). Its gains then scale
+        with the vehicle as :func:`derived_gains` do.
     :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent.
-    :param late: times the gains of that name, the more the later commands act: fully from a command lag of 0.125 s on.
+    :param late: times the gains of that name, the more the later commands act: fully from a command
+        lag of 0.125 s on.
     :raises ConfigError: a negative reserve, an unknown gain, or either parameter without ``told``.
     """
 
@@ -141,12 +186,19 @@ class GeometricExpert(Expert):
         if reserve < 0.0 or (reserve and not told):
             raise ConfigError(f"reserve {reserve:g}: must not be negative, and needs told=True")
         if late and (not told or set(late) - set(GAIN_NAMES)):
-            raise ConfigError(f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, and needs told=True")
+            raise ConfigError(
+                f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, and needs told=True"
+            )
         self.reserve = reserve
         v = self.vehicle
         self.gains = gains or v.geometric_gains or derived_gains(v)
         body = np.array([v.mass, v.gravity, *v.inertia, v.command_lag])
-        self._constants = self.gains.values()[:, None], body[:, None], v.mixer_inverse[None], np.array(v.thrust_range)[:, None]
+        self._constants = (
+            self.gains.values()[:, None],
+            body[:, None],
+            v.mixer_inverse[None],
+            np.array(v.thrust_range)[:, None],
+        )
         self._told = _TrueConstants(v, self.gains, late or {}) if told else None
 
     def actions(self, state: QuadcopterState) -> Actions:
@@ -159,7 +211,9 @@ class GeometricExpert(Expert):
             constants = self._told.constants(state.vehicles)
             if state.wrench is not None and state.vehicles[P.drag_x : P.drag_z + 1].any():
                 wrench = state.wrench.copy()
-                wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, np.zeros((3, 1)))
+                wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(
+                    state.array, state.vehicles, np.zeros((3, 1))
+                )
         _geometric(*moving, *constants, wrench, self.reserve, actions)
         return actions
 
@@ -170,15 +224,18 @@ def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
 
 def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of vehicles unlike this one.
+    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of
+    vehicles unlike this one.
 
-    Where commands act late, its outer loop is slower and its inner one faster: agents that learn from it bear slow motors.
+    Where commands act late, its outer loop is slower and its inner one faster: agents that learn
+    from it bear slow motors.
     """
     return GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True, late=_LATE)
 
 
 def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_geometric`, with 0.7 of the ``descent`` and of the ``tilt``, and 0.05 weights of thrust in reserve.
+    """As :func:`told_geometric`, with 0.7 of the ``descent`` and of the ``tilt``, and 0.05 weights
+    of thrust in reserve.
 
     It teaches agents that must find out what their rotors lift before they fall too fast to stop.
     """
@@ -189,13 +246,17 @@ def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
 
 @compiled
 def _braking_profile(gain, distance_by_deceleration):  # type: ignore[no-untyped-def]
-    """Speed per distance from which one can brake: the gain near the target, that of √(2 deceleration distance) far away."""
+    """Speed per distance from which one can brake: the gain near the target, that of √(2
+    deceleration distance) far away.
+    """
     return 2.0 * gain / (1.0 + math.sqrt(1.0 + 2.0 * gain * gain * distance_by_deceleration))
 
 
 @compiled
 def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, spare):  # type: ignore[no-untyped-def]
-    """Desired force of the rotors per mass in the world frame, m/s², where something else accelerates by (ax, ay, az)."""
+    """Desired force of the rotors per mass in the world frame, m/s², where something else
+    accelerates by (ax, ay, az).
+    """
     distance = math.sqrt(ex * ex + ey * ey)
     along = (ax * ex + ay * ey) / distance if distance > 0.0 else 0.0
     brake = _left_to_brake(gains[G.deceleration], along)
@@ -203,19 +264,29 @@ def _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, spare):  # type
         height_brake = _left_to_brake(gains[G.height_deceleration], az)
     else:
         height_brake = _left_to_brake(gains[G.descent_deceleration], spare - az)
-    way = math.sqrt((distance / brake) ** 2 + (ez / height_brake) ** 2)  # both brake at once, on a straight line
+    way = math.sqrt(
+        (distance / brake) ** 2 + (ez / height_brake) ** 2
+    )  # both brake at once, on a straight line
     speed = _braking_profile(gains[G.position], way)
     fx, fy = gains[G.velocity] * (speed * ex - vx), gains[G.velocity] * (speed * ey - vy)
     climb = gains[G.height_velocity] * (_braking_profile(gains[G.height_position], way) * ez - vz)
     climb = max(-gains[G.descent], climb)
-    # As much of this acceleration as leaves the force no greater than the one that holds the height at the greatest tilt.
+    # As much of this acceleration as leaves the force no greater than the one that holds the height
+    # at the greatest tilt.
     weight = g - az
     square, across = fx * fx + fy * fy + climb * climb, climb * weight - fx * ax - fy * ay
     room = g * g * (1.0 + gains[G.tilt] * gains[G.tilt]) - (weight * weight + ax * ax + ay * ay)
     scale = 1.0
     if square + 2.0 * across > room:
-        scale = max(0.0, math.sqrt(max(0.0, across * across + square * max(0.0, room))) - across) / square
-    return scale * fx - ax, scale * fy - ay, max(0.1 * g, weight + scale * climb)  # upwards, so that the force has a tilt
+        scale = (
+            max(0.0, math.sqrt(max(0.0, across * across + square * max(0.0, room))) - across)
+            / square
+        )
+    return (
+        scale * fx - ax,
+        scale * fy - ay,
+        max(0.1 * g, weight + scale * climb),
+    )  # upwards, so that the force has a tilt
 
 
 @compiled
@@ -226,7 +297,9 @@ def _left_to_brake(deceleration, push):  # type: ignore[no-untyped-def]
 
 @compiled
 def _rotated(b1, b2, b3, p, q, r, time):  # type: ignore[no-untyped-def]
-    """A direction fixed in the world as the body sees it after turning with its present rates for some time."""
+    """A direction fixed in the world as the body sees it after turning with its present rates for
+    some time.
+    """
     rate = math.sqrt(p * p + q * q + r * r)
     if rate < 1e-9:
         return b1, b2, b3
@@ -262,12 +335,18 @@ def _turn_moments(b1, b2, b3, p, q, r, gains, body):  # type: ignore[no-untyped-
 
 @compiled
 def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: ignore[no-untyped-def]
-    """Actions of one vehicle: roll and pitch before thrust, thrust before yaw, all within every rotor's limits."""
+    """Actions of one vehicle: roll and pitch before thrust, thrust before yaw, all within every
+    rotor's limits.
+    """
     middle, half = (high + low) / 2, (high - low) / 2
     least, most, largest = 0.0, 0.0, 0.0
     for k in range(4):
         difference = mixer_inverse[k, 1] * mx + mixer_inverse[k, 2] * my
-        least, most, largest = min(least, difference), max(most, difference), max(largest, abs(difference))
+        least, most, largest = (
+            min(least, difference),
+            max(most, difference),
+            max(largest, abs(difference)),
+        )
     scale = half / largest if largest > half else 1.0
     common = min(high - scale * most, max(low - scale * least, min(high, max(low, thrust / 4))))
     share = 1.0  # of the yaw moment, as far as there is room
@@ -278,12 +357,29 @@ def _allocate(thrust, mx, my, mz, mixer_inverse, low, high, actions):  # type: i
         if abs(yaw) * share > room:
             share = max(0.0, room / abs(yaw))
     for k in range(4):
-        each = common + scale * (mixer_inverse[k, 1] * mx + mixer_inverse[k, 2] * my) + share * mixer_inverse[k, 3] * mz
+        each = (
+            common
+            + scale * (mixer_inverse[k, 1] * mx + mixer_inverse[k, 2] * my)
+            + share * mixer_inverse[k, 3] * mz
+        )
         actions[k] = min(1.0, max(-1.0, (each - middle) / half))
 
 
 @compiled
-def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies, inverses, limits, wrench, reserve, actions):  # type: ignore[no-untyped-def]
+def _geometric(
+    position,
+    quaternion,
+    velocity,
+    rates,
+    target,
+    all_gains,
+    bodies,
+    inverses,
+    limits,
+    wrench,
+    reserve,
+    actions,
+):  # type: ignore[no-untyped-def]
     gains, body = np.empty(all_gains.shape[0]), np.empty(bodies.shape[0])
     for i in range(actions.shape[0]):
         column, pushed = min(i, bodies.shape[1] - 1), min(i, wrench.shape[1] - 1)
@@ -291,15 +387,27 @@ def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies,
         mixer_inverse, low, high = inverses[column], limits[0, column], limits[1, column]
         mass, g, _, _, izz, lag = body
         p, q, r = rates[0, i], rates[1, i], rates[2, i]
-        ex, ey, ez = target[0, i] - position[0, i], target[1, i] - position[1, i], target[2, i] - position[2, i]
+        ex, ey, ez = (
+            target[0, i] - position[0, i],
+            target[1, i] - position[1, i],
+            target[2, i] - position[2, i],
+        )
         (r11, r12, r13), (r21, r22, r23), (r31, r32, r33) = rotation_rows(
             quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
         )
-        ux, uy, uz = wrench[W.force_body, pushed], wrench[W.force_body + 1, pushed], wrench[W.force_body + 2, pushed]
+        ux, uy, uz = (
+            wrench[W.force_body, pushed],
+            wrench[W.force_body + 1, pushed],
+            wrench[W.force_body + 2, pushed],
+        )
         ax = (wrench[W.force_world, pushed] + r11 * ux + r12 * uy + r13 * uz) / mass
         ay = (wrench[W.force_world + 1, pushed] + r21 * ux + r22 * uy + r23 * uz) / mass
         az = (wrench[W.force_world + 2, pushed] + r31 * ux + r32 * uy + r33 * uz) / mass
-        tx, ty, tz = wrench[W.torque_world, pushed], wrench[W.torque_world + 1, pushed], wrench[W.torque_world + 2, pushed]
+        tx, ty, tz = (
+            wrench[W.torque_world, pushed],
+            wrench[W.torque_world + 1, pushed],
+            wrench[W.torque_world + 2, pushed],
+        )
         vx, vy, vz = velocity[0, i], velocity[1, i], velocity[2, i]
         fx, fy, fz = _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, reserve * g)
         size = math.sqrt(fx * fx + fy * fy + fz * fz)
@@ -310,5 +418,7 @@ def _geometric(position, quaternion, velocity, rates, target, all_gains, bodies,
         mx, my = _turn_moments(b1, b2, b3, p, q, r, gains, body)
         mx -= wrench[W.torque_body, pushed] + r11 * tx + r21 * ty + r31 * tz
         my -= wrench[W.torque_body + 1, pushed] + r12 * tx + r22 * ty + r32 * tz
-        mz = -gains[G.yaw_rate] * izz * r - (wrench[W.torque_body + 2, pushed] + r13 * tx + r23 * ty + r33 * tz)
+        mz = -gains[G.yaw_rate] * izz * r - (
+            wrench[W.torque_body + 2, pushed] + r13 * tx + r23 * ty + r33 * tz
+        )
         _allocate(mass * size * b3, mx, my, mz, mixer_inverse, low, high, actions[i])

@@ -8,14 +8,22 @@ import numpy.typing as npt
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.errors import ExpertError
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, GROUPS, OBSERVATION_SIZE
-from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY, QuadcopterState
+from sb3_quad.simulation.state import (
+    BODY_RATES,
+    POSITION,
+    QUATERNION,
+    STATE_SIZE,
+    VELOCITY,
+    QuadcopterState,
+)
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 Actions = Float32Array
 
 
 class Expert(ABC):
-    """A controller of a known vehicle: :meth:`actions` from the true state is all that a subclass has to write.
+    """A controller of a known vehicle: :meth:`actions` from the true state is all that a subclass
+    has to write.
 
     >>> class Hover(Expert):
     ...     def actions(self, state):
@@ -24,8 +32,10 @@ class Expert(ABC):
     Anything with such an ``actions(state)`` method can teach; this class adds ``predict``, so that
     ``evaluate_policy(PIDExpert(), env)`` works as for an SB3 model.
 
-    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that the expert is designed for.
-    :param observation_mean: μ of Eq. 3.16, shape (18,), that :meth:`predict` undoes; None for the environment's default.
+    :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that the expert
+        is designed for.
+    :param observation_mean: μ of Eq. 3.16, shape (18,), that :meth:`predict` undoes; None for the
+        environment's default.
     :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
     """
 
@@ -36,8 +46,12 @@ class Expert(ABC):
         observation_std: npt.ArrayLike | None = None,
     ) -> None:
         self.vehicle = load_vehicle(vehicle)
-        self.observation_mean = np.array(DEFAULT_MEAN if observation_mean is None else observation_mean, dtype=np.float64)
-        self.observation_std = np.array(DEFAULT_STD if observation_std is None else observation_std, dtype=np.float64)
+        self.observation_mean = np.array(
+            DEFAULT_MEAN if observation_mean is None else observation_mean, dtype=np.float64
+        )
+        self.observation_std = np.array(
+            DEFAULT_STD if observation_std is None else observation_std, dtype=np.float64
+        )
 
     @abstractmethod
     def actions(self, state: QuadcopterState) -> Actions:
@@ -57,15 +71,21 @@ class Expert(ABC):
         array = np.asarray(observation, dtype=np.float64)
         if array.ndim not in (1, 2) or array.shape[-1] != OBSERVATION_SIZE:
             sizes = f"({OBSERVATION_SIZE},) or (n, {OBSERVATION_SIZE})"
-            raise ExpertError(f"{type(self).__name__}: observation of shape {array.shape}, expected {sizes}")
-        actions = self.actions(observed_state(np.atleast_2d(array), self.observation_mean, self.observation_std))
+            raise ExpertError(
+                f"{type(self).__name__}: observation of shape {array.shape}, expected {sizes}"
+            )
+        actions = self.actions(
+            observed_state(np.atleast_2d(array), self.observation_mean, self.observation_std)
+        )
         return (actions[0] if array.ndim == 1 else actions), state
 
 
 def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:
-    """The state that observations of shape (n, 18) describe, with the target as origin (Eq. 3.16 undone).
+    """The state that observations of shape (n, 18) describe, with the target as origin (Eq. 3.16
+    undone).
 
-    Noise leaves ᴮRᴵ no rotation; the nearest one is taken. Rotor speeds cannot be observed and are zero.
+    Noise leaves ᴮRᴵ no rotation; the nearest one is taken. Rotor speeds cannot be observed and are
+    zero.
     """
     features = observation * std + mean
     part = {name: features[:, columns] for name, columns in GROUPS.items()}
@@ -79,9 +99,11 @@ def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -
 
 
 def _nearest_quaternion(matrices: FloatArray) -> FloatArray:
-    """Unit quaternions (w, x, y, z; body to world), (n, 4), of the rotations nearest to matrices (n, 3, 3); w is not negative.
+    """Unit quaternions (w, x, y, z; body to world), (n, 4), of the rotations nearest to matrices
+    (n, 3, 3); w is not negative.
 
-    By Davenport's q-method: of all q, the eigenvector to the greatest eigenvalue has the greatest trace of R(q)ᵀ M.
+    By Davenport's q-method: of all q, the eigenvector to the greatest eigenvalue has the greatest
+    trace of R(q)ᵀ M.
     """
     m, transposed = matrices, matrices.transpose(0, 2, 1)
     profile = np.zeros((len(m), 4, 4))

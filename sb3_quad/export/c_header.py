@@ -22,9 +22,11 @@ def c_name(text: str) -> str:
 
 
 def write_header(network: Network, metadata: Mapping[str, str], name: str) -> bytes:
-    """The header, with ``static inline void NAME_policy(const float observation[18], float thrust[4])``.
+    """The header, with ``static inline void NAME_policy(const float observation[18], float
+    thrust[4])``.
 
-    For a policy with a state the function takes a ``NAME_state *`` before these, which ``NAME_reset`` lets begin a flight.
+    For a policy with a state the function takes a ``NAME_state *`` before these, which
+    ``NAME_reset`` lets begin a flight.
 
     :param network: for speeds the second parameter is called ``rotor_speed``.
     :param metadata: becomes the comment at the top.
@@ -33,14 +35,26 @@ def write_header(network: Network, metadata: Mapping[str, str], name: str) -> by
     tables, layers = {"mean": network.mean, "inverse_std": network.inverse_std}, []
     for k, (layer, activation) in enumerate(network.steps):
         tables |= {f"weight_{k}": layer.weight, f"bias_{k}": layer.bias}
-        layers.append({"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation})
+        layers.append(
+            {"inputs": layer.in_features, "outputs": layer.out_features, "activation": activation}
+        )
     state: dict[str, Any] = {}
     if isinstance(network, StatefulNetwork):
-        numbers = zip(("gain", "distance2", "speed2", "limit"), network.integral or (), strict=False)
+        numbers = zip(
+            ("gain", "distance2", "speed2", "limit"), network.integral or (), strict=False
+        )
         integral = {key: _number(value) for key, value in numbers}
-        state = {"observation": network.observation, "integral": integral, "keeps_actions": bool(network.actions)}
+        state = {
+            "observation": network.observation,
+            "integral": integral,
+            "keeps_actions": bool(network.actions),
+        }
     loader = jinja2.PackageLoader("sb3_quad.export", "")
-    options: dict[str, Any] = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True}
+    options: dict[str, Any] = {
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+        "keep_trailing_newline": True,
+    }
     text = (
         jinja2.Environment(loader=loader, undefined=jinja2.StrictUndefined, **options)
         .get_template("policy.h.j2")

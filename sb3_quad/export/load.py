@@ -1,4 +1,6 @@
-"""An exported file as its users run it: loaded by torch, by onnxruntime, or compiled; and the time of a call."""
+"""An exported file as its users run it: loaded by torch, by onnxruntime, or compiled; and the time
+of a call.
+"""
 
 import ctypes
 import io
@@ -22,7 +24,9 @@ from sb3_quad.simulation.observation import OBSERVATION_SIZE
 N_ROTORS = 4
 FLAGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 Call = Callable[..., tuple[Float32Array, Any]]
-"""From observations in physical units, (n, 18), and states to results, (n, 4), and the next states; None: flights begin."""
+"""From observations in physical units, (n, 18), and states to results, (n, 4), and the next states;
+None: flights begin.
+"""
 
 
 def load_torchscript(content: bytes) -> tuple[Call, str]:
@@ -62,7 +66,9 @@ def _call(run: Callable[..., Sequence[Float32Array]], size: int) -> Call:
     def call(rows: Float32Array, state: Float32Array | None = None) -> tuple[Float32Array, Any]:
         if not size:
             return run(rows)[0], None
-        results, following = run(rows, np.zeros((len(rows), size), dtype=np.float32) if state is None else state)
+        results, following = run(
+            rows, np.zeros((len(rows), size), dtype=np.float32) if state is None else state
+        )
         return results, following
 
     return call
@@ -77,9 +83,15 @@ def load_header(content: bytes, name: str) -> tuple[Call, str]:
     """
     compiler = next(filter(None, map(shutil.which, ("cc", "gcc", "clang"))), None)
     if compiler is None:
-        raise ConfigError("--format c needs a C compiler, to check what it writes: install gcc or clang (apt install gcc)")
+        raise ConfigError(
+            "--format c needs a C compiler, to check what it writes: install gcc or clang (apt install gcc)"
+        )
     has_state = f"}} {name}_state;".encode() in content
-    instead = "" if has_state else f"typedef char {name}_state;\n#define {name}_reset(state) (*(state) = 0)\n"
+    instead = (
+        ""
+        if has_state
+        else f"typedef char {name}_state;\n#define {name}_reset(state) (*(state) = 0)\n"
+    )
     program = f"""\
 #include "policy.h"
 {instead}int size(void) {{ return (int)sizeof({name}_state); }}
@@ -100,13 +112,17 @@ void run(const float *in, float *out, {name}_state *states, int begin, long n)
             library = ctypes.CDLL(str(Path(folder) / "run.so"))
         except subprocess.CalledProcessError as error:
             said = " ".join(error.stderr.split())[:200]
-            raise ExportError(f"the C header cannot be checked: {compiler} failed ({said})") from None
+            raise ExportError(
+                f"the C header cannot be checked: {compiler} failed ({said})"
+            ) from None
         except OSError as error:
             raise ExportError(f"the C header cannot be checked: {one_line(error)}") from None
 
     def call(rows: Float32Array, state: Any = None) -> tuple[Float32Array, Any]:
         # A new struct holds anything before its reset.
-        states = np.full((len(rows), library.size()), 0xFF, dtype=np.uint8) if state is None else state
+        states = (
+            np.full((len(rows), library.size()), 0xFF, dtype=np.uint8) if state is None else state
+        )
         results = np.empty((len(rows), N_ROTORS), dtype=np.float32)
         arrays = map(np.ctypeslib.as_ctypes, (rows, results, states))
         library.run(*arrays, state is None, ctypes.c_long(len(rows)))

@@ -1,4 +1,6 @@
-"""The one maker of pages: sections as ``report.md``, their plots as files, and all of it as one file, ``report.html``."""
+"""The one maker of pages: sections as ``report.md``, their plots as files, and all of it as one
+file, ``report.html``.
+"""
 
 import html
 from collections.abc import Sequence
@@ -32,7 +34,8 @@ class Section:
 
 
 def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Section]) -> Path:
-    """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG, and the page, ``report.html``.
+    """Write ``report.md`` with the tables, ``figures/`` with each plot as PNG, and the page,
+    ``report.html``.
 
     The page needs no other file and no network. Files that are there are replaced.
 
@@ -51,15 +54,29 @@ def write_page(folder: str | Path, title: str, facts: str, sections: Sequence[Se
 def render(title: str, facts: str, sections: Sequence[Section]) -> str:
     """The page as text, which expects its plots as files in ``figures/``."""
     loader = jinja2.PackageLoader("sb3_quad.report", "templates")
-    options: Any = {"autoescape": True, "undefined": jinja2.StrictUndefined, "trim_blocks": True, "lstrip_blocks": True}
+    options: Any = {
+        "autoescape": True,
+        "undefined": jinja2.StrictUndefined,
+        "trim_blocks": True,
+        "lstrip_blocks": True,
+    }
     template = jinja2.Environment(loader=loader, **options).get_template("page.html.j2")
     return template.render(title=title, facts=facts, sections=sections, pictures=PICTURES)
 
 
 def _markdown(title: str, sections: Sequence[Section]) -> str:
-    """The tables as text, for the pages of a repository: a heading, what it is about, and a table for each section."""
+    """The tables as text, for the pages of a repository: a heading, what it is about, and a table
+    for each section.
+    """
     blocks = [f"# {html.escape(title, False)}"]
     for part in sections:
-        heading, *texts = (html.escape(" ".join(text.split()), False) for text in (part.heading, part.description, part.facts))
-        blocks += [f"## {heading}", *filter(None, texts), *(table.markdown() for table in part.tables)]
+        heading, *texts = (
+            html.escape(" ".join(text.split()), False)
+            for text in (part.heading, part.description, part.facts)
+        )
+        blocks += [
+            f"## {heading}",
+            *filter(None, texts),
+            *(table.markdown() for table in part.tables),
+        ]
     return "\n\n".join(blocks) + "\n"

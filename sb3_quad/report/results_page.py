@@ -1,4 +1,6 @@
-"""The report of an evaluation: who flew, an overview, and a section for each scenario or each group that ``vary`` makes."""
+"""The report of an evaluation: who flew, an overview, and a section for each scenario or each group
+that ``vary`` makes.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -22,7 +24,13 @@ from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table, text_table
 from sb3_quad.report.page import PAGE, Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.report.scenario_plots import ControllerFlights, arrivals_plot, errors_plot, group_plots, paths_plot
+from sb3_quad.report.scenario_plots import (
+    ControllerFlights,
+    arrivals_plot,
+    errors_plot,
+    group_plots,
+    paths_plot,
+)
 from sb3_quad.simulation.settings import in_words
 
 OVERVIEW = (
@@ -37,11 +45,13 @@ SMALL_PRINT = (
 
 
 def write_report(folder: str | Path, overwrite: bool = False) -> Path:
-    """Write the report of a folder of results: ``report.html``, its tables as ``report.md``, its plots as files.
+    """Write the report of a folder of results: ``report.html``, its tables as ``report.md``, its
+    plots as files.
 
     :param overwrite: replace a report that is there.
     :return: the page.
-    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that cannot be written.
+    :raises ConfigError: no results, damaged ones, a report that is there already, a folder that
+        cannot be written.
     """
     results = load_results(folder)
     if not results.entries:
@@ -70,8 +80,14 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
     """
     colours = colours_of([record.label for record in results.controllers])
     groups = scenario_groups(results)
-    shares = [_share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)]
-    parts = [Section("overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows])]
+    shares = [
+        _share_table(row, results, groups, colours, row.heading) for row in (SUCCESS, SURVIVAL)
+    ]
+    parts = [
+        Section(
+            "overview", "Success and survival", OVERVIEW, [table for table in shares if table.rows]
+        )
+    ]
     for heading, scenarios in groups:
         first, each_of = scenarios[0], ""
         if first.group is None:
@@ -83,47 +99,82 @@ def sections(results: Results, folder: str | Path) -> list[Section]:
             each_of = f" in each of {len(scenarios)} cells"
             tables, plots = [], group_plots(results, scenarios, colours)
             if len(first.cell) == 1:
-                cells = [(f"{value:g}", [scenario]) for scenario in scenarios for value in scenario.cell.values()]
+                cells = [
+                    (f"{value:g}", [scenario])
+                    for scenario in scenarios
+                    for value in scenario.cell.values()
+                ]
                 corner = f"{axis_label(next(iter(first.cell)), first)}: success (%)"
                 tables.append(_share_table(SUCCESS, results, cells, colours, corner))
         how = (
             f"{first.episodes} flights of each controller{each_of}, {first.duration:g} s; "
             f"observation noise {in_words(first.noise)}; seed {first.seed}."
         )
-        parts.append(Section(first.group or first.name, heading, first.description, tables, plots, how))
-    known = [(each.label, each.spec, each.algorithm or "", (each.content or "")[:12]) for each in results.controllers]
+        parts.append(
+            Section(first.group or first.name, heading, first.description, tables, plots, how)
+        )
+    known = [
+        (each.label, each.spec, each.algorithm or "", (each.content or "")[:12])
+        for each in results.controllers
+    ]
     table = text_table("", ("name", "controller", "algorithm", "SHA-256"), known, align="left")
     parts.append(Section("controllers", "Controllers", tables=[table]))
     if results.failures:
-        failures = [(each.controller, each.scenario or "", each.message) for each in results.failures]
+        failures = [
+            (each.controller, each.scenario or "", each.message) for each in results.failures
+        ]
         table = text_table("", ("controller", "scenario", "what happened"), failures, align="left")
         parts.append(Section("failures", "Failures", tables=[table]))
     return parts
 
 
-def _scenario_plots(results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path) -> list[Plot]:
+def _scenario_plots(
+    results: Results, scenario: Scenario, colours: Mapping[str, str], folder: str | Path
+) -> list[Plot]:
     found = {label: results.entry(label, scenario.name) for label in colours}
     entries = {label: entry for label, entry in found.items() if entry is not None}
     tracks = {label: read_tracks(Path(folder) / entry.flights) for label, entry in entries.items()}
-    recorded = [ControllerFlights(label, colours[label], each) for label, each in tracks.items() if each]
+    recorded = [
+        ControllerFlights(label, colours[label], each) for label, each in tracks.items() if each
+    ]
     plots = [paths_plot(scenario, recorded)] if recorded else []
-    if entries and scenario.target.waypoints is None and scenario.target.distance != 0.0 and len(scenario.tolerances) > 2:
-        plots.append(arrivals_plot(scenario, {label: entry.metrics for label, entry in entries.items()}, colours))
+    if (
+        entries
+        and scenario.target.waypoints is None
+        and scenario.target.distance != 0.0
+        and len(scenario.tolerances) > 2
+    ):
+        plots.append(
+            arrivals_plot(
+                scenario, {label: entry.metrics for label, entry in entries.items()}, colours
+            )
+        )
     if recorded:
         plots.append(errors_plot(scenario, recorded))
     return plots
 
 
 def _share_table(
-    row: Row, results: Results, groups: Sequence[tuple[str, Sequence[Scenario]]], colours: Mapping[str, str], corner: str
+    row: Row,
+    results: Results,
+    groups: Sequence[tuple[str, Sequence[Scenario]]],
+    colours: Mapping[str, str],
+    corner: str,
 ) -> Table:
-    """Success or survival in each group of scenarios; where there are several in one, from the worst to the best."""
+    """Success or survival in each group of scenarios; where there are several in one, from the
+    worst to the best.
+    """
     references = [scenarios[0].reference for _, scenarios in groups]
-    others = dict.fromkeys(name for given in references for name in given if row in reference_cells(given[name]))
+    others = dict.fromkeys(
+        name for given in references for name in given if row in reference_cells(given[name])
+    )
     rows = []
     for (heading, scenarios), given in zip(groups, references, strict=True):
         own = mark_best(row, [_share(row, results, label, scenarios) for label in colours])
-        beside = [reference_cells(given[name]).get(row, Cell()) if name in given else Cell() for name in others]
+        beside = [
+            reference_cells(given[name]).get(row, Cell()) if name in given else Cell()
+            for name in others
+        ]
         if any(cell != Cell() for cell in own):
             rows.append(Row(heading, "", [*own, *beside]))
     return Table(_columns(colours, others, results.source), rows, corner)
@@ -141,4 +192,7 @@ def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]
 
 
 def _columns(colours: Mapping[str, str], others: Iterable[str], source: str) -> list[Column]:
-    return [*(Column(*each) for each in colours.items()), *(Column(name, source=source) for name in others)]
+    return [
+        *(Column(*each) for each in colours.items()),
+        *(Column(name, source=source) for name in others),
+    ]

@@ -1,4 +1,6 @@
-"""What is flown to be shown, by whom, and how it is recorded: the same episodes for all controllers, on PyBullet."""
+"""What is flown to be shown, by whom, and how it is recorded: the same episodes for all
+controllers, on PyBullet.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -30,14 +32,19 @@ class Recording:
     vehicle: Vehicle
     times: FloatArray  # (T + 1,), s since the start
     state: QuadcopterState  # the true state at each of them
-    wrench: FloatArray  # (T + 1, 12), of the step before: force in the world and in the body frame, N; torques likewise, N m
+    # (T + 1, 12), of the step before: force in the world and in the body frame, N; torques
+    # likewise, N m
+    wrench: FloatArray
     reward: float  # sum of the rewards
     lost: str  # how it was lost: "collision", "out of range", or empty
 
     @cached_property
     def rotor_angles(self) -> FloatArray:
         """How far the drawn rotors have turned, (T + 1, 4), rad."""
-        return np.cumsum(rotor_turning(self.vehicle, self.state.rotor_speeds), axis=0) * self.vehicle.control_step
+        return (
+            np.cumsum(rotor_turning(self.vehicle, self.state.rotor_speeds), axis=0)
+            * self.vehicle.control_step
+        )
 
     @property
     def targets(self) -> FloatArray:
@@ -65,13 +72,17 @@ class Recording:
         return np.stack([self.state.position[step], self.state.target[step]])
 
     def wrench_around(self, step: int, seconds: float = 0.4) -> FloatArray:
-        """The largest force and torque, (12,), of the last while before ``step``: a short blow stays to be seen."""
+        """The largest force and torque, (12,), of the last while before ``step``: a short blow
+        stays to be seen.
+        """
         recent = self.wrench[max(0, step - round(seconds / self.vehicle.control_step)) : step + 1]
         return np.asarray(recent[np.linalg.norm(recent, axis=1).argmax()])
 
     def pose(self, step: int, seconds: float = 0.4) -> Pose:
         """The vehicle as it is to be drawn, with the wrench of the last ``seconds``."""
-        return Pose(self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step])
+        return Pose(
+            self.state.array[:, step], self.wrench_around(step, seconds), self.rotor_angles[step]
+        )
 
 
 class Setting(NamedTuple):
@@ -80,7 +91,9 @@ class Setting(NamedTuple):
     vehicle: Any  # that experts are made for; in a scenario another one may fly
     settings: FlightSettings  # how all episodes are flown
     plan: Callable[[int], Plan]  # what happens in an episode, by its seed
-    own: Mapping[str, Mapping[str, Any]] = {}  # changes to the settings that go with a controller, by its label
+    own: Mapping[
+        str, Mapping[str, Any]
+    ] = {}  # changes to the settings that go with a controller, by its label
 
 
 def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = None) -> Setting:
@@ -93,7 +106,9 @@ def fixed_setting(settings: FlightSettings, target: Sequence[float] | None = Non
     if target is not None:
         start["target"] = per_row("--target", target, 1, 3).T
         if target[2] <= least:
-            raise ConfigError(f"--target {list(target)}: lies below ground; z must exceed {least:g} m")
+            raise ConfigError(
+                f"--target {list(target)}: lies below ground; z must exceed {least:g} m"
+            )
     return Setting(settings.vehicle, settings, lambda seed: Plan(start))
 
 
@@ -107,7 +122,9 @@ def scenario_setting(text: str, own: Any = None) -> Setting:
     if not colon:
         raise ConfigError(f"--scenario {text}: must be suite:name, such as thesis:side_hit")
     scenario = load_suite(suite).scenario(name).flown_by(own)
-    return Setting(scenario.nominal_vehicle(), scenario.flown_as, lambda seed: sample_plan(scenario, [seed]))
+    return Setting(
+        scenario.nominal_vehicle(), scenario.flown_as, lambda seed: sample_plan(scenario, [seed])
+    )
 
 
 def fly_all(
@@ -122,7 +139,8 @@ def fly_all(
 
     :param controllers: by label; each as of :func:`~sb3_quad.evaluation.flights.fly`.
     :param seed: of the first episode; the next has the next one.
-    :param n_timesteps: control steps, until which new episodes begin, as long as the longest of each lasts; None: one episode.
+    :param n_timesteps: control steps, until which new episodes begin, as long as the longest of
+        each lasts; None: one episode.
     :param deterministic: whether a policy gives the mean of its actions, or a sample of them.
     :param n_envs: episodes, with one seed after the other, that each controller flies side by side.
     :raises ConfigError: settings that the environment refuses.
@@ -135,7 +153,10 @@ def fly_all(
         together: list[Recording] = []
         for name, controller in controllers.items():
             for each in range(seed, seed + n_envs):
-                label, colour = name if n_envs == 1 else f"seed {each}, {name}", COLOURS[len(together) % len(COLOURS)]
+                label, colour = (
+                    name if n_envs == 1 else f"seed {each}, {name}",
+                    COLOURS[len(together) % len(COLOURS)],
+                )
                 try:
                     its = settings.with_changes(**setting.own.get(name, {}))
                     flown = controller, its, setting.plan(each), each, deterministic
@@ -150,10 +171,18 @@ def fly_all(
 
 
 def _record(
-    name: str, colour: str, controller: Any, settings: FlightSettings, plan: Plan, seed: int, deterministic: bool
+    name: str,
+    colour: str,
+    controller: Any,
+    settings: FlightSettings,
+    plan: Plan,
+    seed: int,
+    deterministic: bool,
 ) -> Recording:
     every = _EveryStep()
-    flights = fly_settings(controller, settings, [seed], "pybullet", (), [every], plan, deterministic)
+    flights = fly_settings(
+        controller, settings, [seed], "pybullet", (), [every], plan, deterministic
+    )
     return Recording(
         name=name,
         colour=colour,
@@ -167,14 +196,24 @@ def _record(
 
 
 class _EveryStep(Hook):
-    """Keeps the state after every control step of a flight, and before the first, and the wrench in each."""
+    """Keeps the state after every control step of a flight, and before the first, and the wrench in
+    each.
+    """
 
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         self.vehicle, self.states = vehicle, [state.copy()]
         self.wrenches: list[FloatArray] = []
 
-    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
+    def before_step(
+        self,
+        state: QuadcopterState,
+        observation: Float32Array,
+        wrench: FloatArray,
+        flying: BoolArray,
+    ) -> None:
         self.wrenches.append(wrench[0].copy())
 
-    def after_step(self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray) -> None:
+    def after_step(
+        self, step: int, state: QuadcopterState, actions: Float32Array, flying: BoolArray
+    ) -> None:
         self.states.append(state.copy())

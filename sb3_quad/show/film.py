@@ -1,4 +1,6 @@
-"""Recorded flights in motion: a film with a panel for each, or PyBullet's window with all vehicles together, in real time."""
+"""Recorded flights in motion: a film with a panel for each, or PyBullet's window with all vehicles
+together, in real time.
+"""
 
 import math
 import tempfile
@@ -25,9 +27,13 @@ from sb3_quad.show.labels import side_by_side, with_header
 
 FPS = 25
 HOLD = 1.0  # the last picture stays for that long, s
-MARGIN, AHEAD = 0.9, 2.5  # around the vehicle, and how much of the way to its target is seen, m; for the default vehicle
+MARGIN, AHEAD = (
+    0.9,
+    2.5,
+)  # around the vehicle, and how much of the way to its target is seen, m; for the default vehicle
 PANELS_ABREAST = 3
-LAG = 0.044  # s of flight after which a camera has followed to 1/e of a jump, as of a target that is replaced
+# S of flight after which a camera has followed to 1/e of a jump, as of a target that is replaced
+LAG = 0.044
 WINDOW_SLOPE = math.tan(math.radians(30.0))  # PyBullet's
 MP4 = {"codec": "libx264", "quality": 7, "macro_block_size": 2, "ffmpeg_log_level": "error"}
 FORMATS = (".mp4", ".webp", ".gif")
@@ -36,16 +42,20 @@ FORMATS = (".mp4", ".webp", ".gif")
 def check_film(path: Path) -> Any:
     """See whether a film can be written, before anything is flown; the package that writes it.
 
-    :raises ConfigError: the suffix is not one of FORMATS, or the packages that write videos are missing.
+    :raises ConfigError: the suffix is not one of FORMATS, or the packages that write videos are
+        missing.
     """
     if path.suffix.lower() not in FORMATS:
-        raise ConfigError(f"{path}: must end in {', '.join(FORMATS)} for a film, .png for a picture")
+        raise ConfigError(
+            f"{path}: must end in {', '.join(FORMATS)} for a film, .png for a picture"
+        )
     require("imageio_ffmpeg", "video", "a video")
     return require("imageio.v2", "video", "a video")
 
 
 def write_film(path: Path, frames: Iterable[Image]) -> None:
-    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves what was there before.
+    """Write all ``frames``, uint8 (height, width, 3), all of one size; an interruption leaves what
+    was there before.
 
     :raises ConfigError: a folder that cannot be written, a full disk, missing packages.
     """
@@ -71,7 +81,9 @@ def frame_times(recordings: Sequence[Recording], speed: float) -> FloatArray:
     return np.minimum(np.arange(round((last / speed + HOLD) * FPS) + 1) * speed / FPS, last)
 
 
-def film_frames(recordings: Sequence[Recording], width: int, height: int, speed: float = 1.0) -> Iterator[Image]:
+def film_frames(
+    recordings: Sequence[Recording], width: int, height: int, speed: float = 1.0
+) -> Iterator[Image]:
     """The frames of a film, FPS of them a second, uint8 (height, width, 3), all of one size.
 
     :param recordings: one for each panel; they start together and are seen from one direction.
@@ -86,9 +98,14 @@ def film_frames(recordings: Sequence[Recording], width: int, height: int, speed:
 
 
 def following_cameras(
-    recordings: Sequence[Recording], times: FloatArray, scale: float, forward: FloatArray, lens: Lens
+    recordings: Sequence[Recording],
+    times: FloatArray,
+    scale: float,
+    forward: FloatArray,
+    lens: Lens,
 ) -> Iterator[Camera]:
-    """For each time (s) a camera that has all vehicles in its picture, and their targets when these are near.
+    """For each time (s) a camera that has all vehicles in its picture, and their targets when these
+    are near.
 
     :param scale: the vehicles' size, in that of the default one.
     :param forward: where the cameras look, a unit vector, (3,), not vertical.
@@ -99,22 +116,31 @@ def following_cameras(
         for recording in recordings:
             vehicle, target = recording.vehicle_and_target(recording.at(seconds))
             way = target - vehicle
-            seen += [vehicle, vehicle + way * min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9))]
+            seen += [
+                vehicle,
+                vehicle + way * min(1.0, AHEAD * scale / max(float(np.linalg.norm(way)), 1e-9)),
+            ]
         camera = framing_camera(np.stack(seen), MARGIN * scale, forward, lens)
         eye = camera.eye if eye is None else eye + share * (camera.eye - eye)
         yield camera._replace(eye=eye)
 
 
-def _panel(recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens) -> Iterator[Image]:
+def _panel(
+    recording: Recording, times: FloatArray, forward: FloatArray, lens: Lens
+) -> Iterator[Image]:
     """One flight at the times (s) of a film's frames, seen along ``forward``, (3,)."""
     path, font_size = recording.state.position, max(12, round(lens.height / 26))
     with closing(Scene(recording.vehicle)) as scene:
-        for seconds, camera in zip(times, following_cameras([recording], times, scene.scale, forward, lens), strict=True):
+        for seconds, camera in zip(
+            times, following_cameras([recording], times, scene.scale, forward, lens), strict=True
+        ):
             step = recording.at(seconds)
             scene.place([recording.pose(step)], recording.state.target[[step]])
             trail = Trail(path[: step + 1 : 2], recording.colour, 0.03 * scene.scale)
             pixels = scene.picture(camera, [trail])
-            yield with_header(pixels, recording.name, [_caption(recording, step)], recording.colour, font_size)
+            yield with_header(
+                pixels, recording.name, [_caption(recording, step)], recording.colour, font_size
+            )
 
 
 def _caption(recording: Recording, step: int) -> str:
@@ -127,7 +153,9 @@ def _caption(recording: Recording, step: int) -> str:
     return f"{seconds}   {recording.state.distance[step]:.2f} m from target   {height:.1f} m high{push}"
 
 
-def show_in_window(episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float) -> None:
+def show_in_window(
+    episodes: Sequence[Sequence[Recording]], width: int, height: int, speed: float
+) -> None:
     """Show episodes one after the other, until the window is shut; flights of one start together.
 
     :raises ConfigError: the window cannot be opened.
@@ -159,10 +187,17 @@ def _play(scene: Scene, recordings: Sequence[Recording], lens: Lens, speed: floa
         scene.place([recording.pose(step) for recording, step in now], targets)
         for k, (recording, step) in enumerate(now):
             if step > drawn_to[k]:
-                ends, colour = recording.state.position[[drawn_to[k], step]], to_rgb(recording.colour)
-                p.addUserDebugLine(*ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client)
+                ends, colour = (
+                    recording.state.position[[drawn_to[k], step]],
+                    to_rgb(recording.colour),
+                )
+                p.addUserDebugLine(
+                    *ends.tolist(), lineColorRGB=colour, lineWidth=3.0, physicsClientId=client
+                )
                 drawn_to[k] = step
         positions = np.stack([recording.state.position[step] for recording, step in now])
         point_window(client, cameras[number], positions.mean(axis=0))
-        number = max(number + 1, int((time.perf_counter() - begun) * FPS))  # frames that come too late are left out
+        number = max(
+            number + 1, int((time.perf_counter() - begun) * FPS)
+        )  # frames that come too late are left out
         time.sleep(max(0.0, begun + number / FPS - time.perf_counter()))

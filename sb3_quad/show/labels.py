@@ -31,7 +31,9 @@ def tag_size(text: str, size: int) -> tuple[float, float]:
 
 
 def with_tags(pixels: Image, tags: Sequence[tuple[str, tuple[float, float]]], size: int) -> Image:
-    """A picture with small plates on it, each a text and its centre, column and row; ``size`` of the font."""
+    """A picture with small plates on it, each a text and its centre, column and row; ``size`` of
+    the font.
+    """
     image = Pillow.fromarray(pixels)
     draw = ImageDraw.Draw(image, "RGBA")
     for text, (column, row) in tags:
@@ -60,9 +62,15 @@ def with_header(pixels: Image, heading: str, lines: Sequence[str], colour: str, 
 
 
 def side_by_side(pictures: Sequence[Image], columns: int) -> Image:
-    """Pictures of one size in rows of ``columns``, on white; even in width and height, as video codecs ask for."""
-    padded = [np.pad(picture, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for picture in pictures]
+    """Pictures of one size in rows of ``columns``, on white; even in width and height, as video
+    codecs ask for.
+    """
+    padded = [
+        np.pad(picture, ((0, GAP), (0, GAP), (0, 0)), constant_values=255) for picture in pictures
+    ]
     columns = min(columns, len(padded))
     padded += [np.full_like(padded[0], 255)] * (-len(padded) % columns)
-    sheet = np.vstack([np.hstack(padded[first : first + columns]) for first in range(0, len(padded), columns)])
+    sheet = np.vstack(
+        [np.hstack(padded[first : first + columns]) for first in range(0, len(padded), columns)]
+    )
     return sheet[: sheet.shape[0] // 2 * 2, : sheet.shape[1] // 2 * 2]

@@ -1,4 +1,6 @@
-"""The motion sequence of a flight in one picture: several poses with their times (cf. the thesis's Fig. A.1)."""
+"""The motion sequence of a flight in one picture: several poses with their times (cf. the thesis's
+Fig. A.1).
+"""
 
 from collections.abc import Sequence
 from contextlib import closing
@@ -28,20 +30,26 @@ class _View(NamedTuple):
     breadth: float  # of a drawn vehicle, m
 
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where points, (n, 3), are in the picture, (n, 2), and how broad vehicles are there, (n,); pixels."""
+        """Where points, (n, 3), are in the picture, (n, 2), and how broad vehicles are there, (n,);
+        pixels.
+        """
         screen, lens = self.camera.project(points), self.camera.lens
         return screen[:, :2], self.breadth * lens.height / (2.0 * lens.slope * screen[:, 2])
 
 
 def sequence(recordings: Sequence[Recording], width: int, height: int) -> Image:
-    """One panel for each recording, all seen by the same camera; as many poses as do not hide one another.
+    """One panel for each recording, all seen by the same camera; as many poses as do not hide one
+    another.
 
     :param width: of a panel, its header not counted, pixels; ``height`` likewise.
     :return: uint8 (height, about panels * width, 3).
     """
     ends = [_end(recording) for recording in recordings]
     view = _view(recordings, ends, Lens(width, height))
-    panels = [_panel(each, _steps(each, end, view), end, view) for each, end in zip(recordings, ends, strict=True)]
+    panels = [
+        _panel(each, _steps(each, end, view), end, view)
+        for each, end in zip(recordings, ends, strict=True)
+    ]
     return side_by_side(panels, columns=len(panels))
 
 
@@ -52,7 +60,9 @@ def _end(recording: Recording) -> int:
 
 
 def _view(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) -> _View:
-    paths = [recording.state.position[: end + 1] for recording, end in zip(recordings, ends, strict=True)]
+    paths = [
+        recording.state.position[: end + 1] for recording, end in zip(recordings, ends, strict=True)
+    ]
     points = np.concatenate([*paths, *(recording.targets for recording in recordings)])
     forward, breadth, enlarged = broadside(points), 2.0 * span(recordings[0].vehicle), 1.0
     for _ in range(5):  # a larger vehicle needs a camera farther away
@@ -63,9 +73,15 @@ def _view(recordings: Sequence[Recording], ends: Sequence[int], lens: Lens) -> _
 
 
 def _steps(recording: Recording, end: int, view: _View) -> list[int]:
-    """The steps of the poses: each that hides none before it, the pushes, and how the flight was lost."""
+    """The steps of the poses: each that hides none before it, the pushes, and how the flight was
+    lost.
+    """
     places, breadth = view.project(recording.state.position[: end + 1])
-    shown = {0, *(push for push in recording.pushes if push <= end), *([end] if recording.lost else [])}
+    shown = {
+        0,
+        *(push for push in recording.pushes if push <= end),
+        *([end] if recording.lost else []),
+    }
     for step in range(1, end + 1):
         if np.linalg.norm(places[[*shown]] - places[step], axis=1).min() > APART * breadth[step]:
             shown.add(step)
@@ -74,7 +90,9 @@ def _steps(recording: Recording, end: int, view: _View) -> list[int]:
 
 def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) -> Image:
     trail = Trail(recording.state.position[: end + 1], recording.colour, 0.05 * view.breadth)
-    with closing(Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)) as scene:
+    with closing(
+        Scene(recording.vehicle, None, len(steps), len(recording.targets), view.size)
+    ) as scene:
         scene.place([recording.pose(step, seconds=0.0) for step in steps], recording.targets)
         pixels = scene.picture(view.camera, [trail])
     size = max(12, round(view.camera.lens.height / 34))
@@ -85,18 +103,28 @@ def _panel(recording: Recording, steps: Sequence[int], end: int, view: _View) ->
     elif end < len(recording.times) - 1:
         lines = [f"within {SETTLED:g} m of its target from {recording.times[end]:.2f} s on"]
     else:
-        lines = [f"{recording.state.distance[end]:.2f} m from its target after {recording.times[end]:.2f} s"]
+        lines = [
+            f"{recording.state.distance[end]:.2f} m from its target after {recording.times[end]:.2f} s"
+        ]
     if view.size > 1.05:
         lines.append(f"vehicle drawn {view.size:.1f} × its size")
-    arrows = "; arrows: force (red), torque (violet)" if any(recording.wrench[step].any() for step in steps) else ""
+    arrows = (
+        "; arrows: force (red), torque (violet)"
+        if any(recording.wrench[step].any() for step in steps)
+        else ""
+    )
     lines.append(f"green hoops: target{arrows}")
     return with_header(pixels, recording.name, lines, recording.colour, size)
 
 
-def _time_tags(recording: Recording, steps: Sequence[int], view: _View, size: int) -> list[tuple[str, tuple[float, float]]]:
+def _time_tags(
+    recording: Recording, steps: Sequence[int], view: _View, size: int
+) -> list[tuple[str, tuple[float, float]]]:
     """The time of each pose and where it is written: above it, inside the picture."""
     tags = []
-    for step, (column, row), breadth in zip(steps, *view.project(recording.state.position[list(steps)]), strict=True):
+    for step, (column, row), breadth in zip(
+        steps, *view.project(recording.state.position[list(steps)]), strict=True
+    ):
         text = f"{recording.times[step]:.2f} s"
         half = 0.5 * np.array(tag_size(text, size))
         middle = np.clip([column, row - 0.4 * breadth - half[1]], half, view.camera.lens[:2] - half)

@@ -14,7 +14,16 @@ from sb3_quad.base.validate import validate
 from sb3_quad.simulation.checks import load_vehicles, per_row, repeated, whole_number
 from sb3_quad.simulation.compiled import compile_notice
 from sb3_quad.simulation.frames import PositionIntegral
-from sb3_quad.simulation.kernel import CHUNK, FLY, LOOK, OUTCOME, SCORE, BatchArrays, rotor_wrenches, step
+from sb3_quad.simulation.kernel import (
+    CHUNK,
+    FLY,
+    LOOK,
+    OUTCOME,
+    SCORE,
+    BatchArrays,
+    rotor_wrenches,
+    step,
+)
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD, OBSERVATION_SIZE
 from sb3_quad.simulation.random import new_streams
 from sb3_quad.simulation.randomization import Randomization
@@ -49,10 +58,13 @@ class QuadcopterBatch:
 
     :param n_envs: number of rows, from 1 to 2^20.
     :param settings: how they fly.
-    :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the operating system's entropy.
-    :param n_threads: threads that share the work, at most; None: the CPUs this process may use. Results do not depend on it.
+    :param seed: of :func:`~sb3_quad.base.seeds.row_seeds`, which give each row a stream; None: the
+        operating system's entropy.
+    :param n_threads: threads that share the work, at most; None: the CPUs this process may use.
+        Results do not depend on it.
     :param autoreset: whether a row that ends begins its next episode within the same step.
-    :raises ConfigError: an argument that does not fit; a vehicle that cannot fly as the settings say.
+    :raises ConfigError: an argument that does not fit; a vehicle that cannot fly as the settings
+        say.
     """
 
     _arrays: BatchArrays
@@ -67,23 +79,35 @@ class QuadcopterBatch:
     ) -> None:
         settings = settings or FlightSettings()
         n = self.n = whole_number("n_envs", n_envs, 1, MAX_ROWS)
-        self.threads = available_cpus() if n_threads is None else whole_number("n_threads", n_threads, 1, MAX_THREADS)
+        self.threads = (
+            available_cpus()
+            if n_threads is None
+            else whole_number("n_threads", n_threads, 1, MAX_THREADS)
+        )
         self.autoreset, self.observation = autoreset, settings.observation
         self.distribution, self.randomize = settings.vehicles, settings.randomize or Randomization()
 
         several = isinstance(settings.vehicle, (list, tuple))
-        vehicles = load_vehicles(settings.vehicle if several else [settings.vehicle], settings.rotor_layout)
+        vehicles = load_vehicles(
+            settings.vehicle if several else [settings.vehicle], settings.rotor_layout
+        )
         self.vehicle_list: list[Vehicle] = repeated("vehicle", vehicles, n)
         for each in vehicles:
-            self.randomize.check(each if self.distribution is None else self.distribution.weakest(each))
+            self.randomize.check(
+                each if self.distribution is None else self.distribution.weakest(each)
+            )
         columns = self.vehicle_list if several else vehicles
         self.base_vehicles = np.stack([each.parameters() for each in columns], axis=1)
         own = n if self.distribution is not None or self.randomize.sets_vehicle else len(columns)
         self.vehicles = np.broadcast_to(self.base_vehicles, (len(self.base_vehicles), own)).copy()
-        self.distribution_numbers = NO_DISTRIBUTION if self.distribution is None else self.distribution.numbers()
+        self.distribution_numbers = (
+            NO_DISTRIBUTION if self.distribution is None else self.distribution.numbers()
+        )
         self.randomize_numbers = self.randomize.numbers(vehicles[0].control_step)
         kinds = self.randomize.gusts, self.randomize.wind_gusts
-        self.gust, self.wind_gust = (np.zeros((GUST_SIZE, 0 if each is None else n)) for each in kinds)
+        self.gust, self.wind_gust = (
+            np.zeros((GUST_SIZE, 0 if each is None else n)) for each in kinds
+        )
         self.wind = np.zeros((3, n))
         drags = (self.randomize.drag, self.distribution and self.distribution.drag)
         self.has_drag = bool(self.base_vehicles[P.drag_x : P.drag_z + 1].any()) or any(drags)
@@ -93,7 +117,9 @@ class QuadcopterBatch:
         self.frames = np.zeros((n, depth, self.observation.frame_size), dtype=np.float32)
         self.ages = np.array(self.observation.ages, dtype=np.int64)
         self.integral = np.zeros((0 if integral is None else 3, n))
-        self.integral_numbers = np.array((integral or PositionIntegral()).numbers(vehicles[0].control_step))
+        self.integral_numbers = np.array(
+            (integral or PositionIntegral()).numbers(vehicles[0].control_step)
+        )
         self.last_observations = np.zeros((n, self.observation.size), dtype=np.float32)
 
         self.task: TaskSpec = settings.task
@@ -101,21 +127,34 @@ class QuadcopterBatch:
         self.task_parameters, self.task_weights = resolve_tasks(self.task, self.task_kwargs)
         self.task_index = np.zeros(n, dtype=np.int64)
         steps = settings.max_episode_steps
-        steps_of_rows = repeated("max_episode_steps", steps if isinstance(steps, list) else [steps], n)
+        steps_of_rows = repeated(
+            "max_episode_steps", steps if isinstance(steps, list) else [steps], n
+        )
         self.max_steps = np.array(steps_of_rows, dtype=np.int64)
         self.limits = self.max_steps.copy()  # control steps of the present episodes, at most
         self.state = np.zeros((STATE_SIZE, n))
-        longest = int(self.randomize.delay.high) if self.randomize.delay else 0  # delay, control steps
+        longest = (
+            int(self.randomize.delay.high) if self.randomize.delay else 0
+        )  # delay, control steps
         self.queue = np.zeros((max(longest, *(each.delay for each in vehicles)), 4, n))
         self.wrench = np.zeros((WRENCH_SIZE, n))
         self.streams = np.zeros((4, n), dtype=np.uint32)
-        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[:, None]  # until rows are set apart
+        self.scaling = np.concatenate([DEFAULT_MEAN, DEFAULT_STD, np.zeros(2)])[
+            :, None
+        ]  # until rows are set apart
         self.returns = np.zeros(n)
         self.outcome = np.zeros(n, dtype=OUTCOME)
         self.physics_step, self.substeps = vehicles[0].physics_step, vehicles[0].substeps
-        self.own_delays = self.randomize.delay is not None or bool((self.base_vehicles[P.delay] != len(self.queue)).any())
-        self.own_arms = len(columns) > 1 or self.distribution is not None or self.randomize.sets_arms
-        self.constants = np.array([self.physics_step, self.substeps, self.own_delays, self.own_arms, autoreset], np.float64)
+        self.own_delays = self.randomize.delay is not None or bool(
+            (self.base_vehicles[P.delay] != len(self.queue)).any()
+        )
+        self.own_arms = (
+            len(columns) > 1 or self.distribution is not None or self.randomize.sets_arms
+        )
+        self.constants = np.array(
+            [self.physics_step, self.substeps, self.own_delays, self.own_arms, autoreset],
+            np.float64,
+        )
         self._bind()
         self.set_noise(settings.noise)
         self._set_scaling(settings)
@@ -124,51 +163,75 @@ class QuadcopterBatch:
         self.seed([None] * n if seed is None else row_seeds(seed, n))
 
     def seed(self, seeds: Sequence[int | None], rows: Rows = None) -> None:
-        """New streams of the given rows, from one seed each; their next reset begins the first episode."""
+        """New streams of the given rows, from one seed each; their next reset begins the first
+        episode.
+        """
         self.streams[:, self.rows(rows)] = new_streams(seeds)
 
     def reset(self, rows: Rows = None) -> Float32Array:
-        """Begin the next episode of the given rows (None: all); the observations of all rows, float32 (n, size)."""
+        """Begin the next episode of the given rows (None: all); the observations of all rows,
+        float32 (n, size).
+        """
         return self._look(self.rows(rows))
 
     def stagger(self) -> None:
-        """Truncate the present episodes at times spread evenly over ``max_episode_steps``; those that follow, after it."""
+        """Truncate the present episodes at times spread evenly over ``max_episode_steps``; those
+        that follow, after it.
+        """
         self.limits[:] = self.max_steps - np.arange(self.n) * self.max_steps // self.n
 
     def observe(self) -> Float32Array:
-        """The present observations, float32 (n, size), of ``observation.size``; the same numbers until the next step."""
+        """The present observations, float32 (n, size), of ``observation.size``; the same numbers
+        until the next step.
+        """
         return self._look([])
 
     def step(self, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
         """One control step of every row.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays. Of rows that are done,
-            ``outcome`` (fields total, reward, length, distance, collision, out_of_range, truncated, success) and
-            ``last_observations`` tell how the episode ended, until the row's next one ends; without autoreset they are of
-            every row's last step.
+        :return: observations float32 (n, size), rewards float32 (n,), done bool (n,): fresh arrays.
+            Of rows that are done, ``outcome`` (fields total, reward, length, distance, collision,
+            out_of_range, truncated, success) and ``last_observations`` tell how the episode ended,
+            until the row's next one ends; without autoreset they are of every row's last step.
         """
         return self._move(FLY, actions)
 
-    def score(self, actions: npt.NDArray[Any] | None = None) -> tuple[Float32Array, Float32Array, BoolArray]:
-        """As :meth:`step`, of a control step that another simulator has flown and written into ``state``.
+    def score(
+        self, actions: npt.NDArray[Any] | None = None
+    ) -> tuple[Float32Array, Float32Array, BoolArray]:
+        """As :meth:`step`, of a control step that another simulator has flown and written into
+        ``state``.
 
         :param actions: for those that a policy is to see; None: zeros.
         """
         return self._move(SCORE, np.zeros((self.n, 4), np.float32) if actions is None else actions)
 
-    def _move(self, mode: int, actions: npt.NDArray[Any]) -> tuple[Float32Array, Float32Array, BoolArray]:
+    def _move(
+        self, mode: int, actions: npt.NDArray[Any]
+    ) -> tuple[Float32Array, Float32Array, BoolArray]:
         array = np.ascontiguousarray(actions, dtype=np.float32)
         if array.shape != (self.n, 4):
-            raise ValueError(f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment")
-        out = np.empty(self.last_observations.shape, np.float32), np.empty(self.n, np.float32), np.empty(self.n, np.bool_)
+            raise ValueError(
+                f"actions of shape {array.shape}: must be ({self.n}, 4), one row per environment"
+            )
+        out = (
+            np.empty(self.last_observations.shape, np.float32),
+            np.empty(self.n, np.float32),
+            np.empty(self.n, np.bool_),
+        )
         if not self._step(mode, array, *out):
             row = int(np.flatnonzero(~np.isfinite(array).all(axis=1))[0])
-            raise ValueError(f"actions: row {row} is {array[row].tolist()}; every number must be finite")
+            raise ValueError(
+                f"actions: row {row} is {array[row].tolist()}; every number must be finite"
+            )
         return out
 
     def _look(self, resetting: Any) -> Float32Array:
-        observations, dones = np.empty(self.last_observations.shape, np.float32), np.zeros(self.n, np.bool_)
+        observations, dones = (
+            np.empty(self.last_observations.shape, np.float32),
+            np.zeros(self.n, np.bool_),
+        )
         dones[resetting] = True
         self._step(LOOK, _NO_ACTIONS, observations, _NO_REWARDS, dones)
         return observations
@@ -178,19 +241,31 @@ class QuadcopterBatch:
         return bool(share_out(step, chunks - 1, mode, *arrays, *self._arrays))
 
     def turn_rotors(self, actions: npt.NDArray[Any]) -> FloatArray:
-        """The rotors' part of a control step of row 0, for another simulator, whose part :meth:`score` judges.
+        """The rotors' part of a control step of row 0, for another simulator, whose part
+        :meth:`score` judges.
 
         :param actions: (n, 4), clipped to [-1, 1].
-        :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame, (substeps, 2, 3); what the
-            wrench has in the world frame acts besides.
+        :return: force (N) and torque (N m) of rotors and wrench in each physics step, body frame,
+            (substeps, 2, 3); what the wrench has in the world frame acts besides.
         """
         wrenches = np.empty((self.substeps, 2, 3))
         a = self._arrays
-        rotor_wrenches(actions, wrenches, a.state, a.queue, a.wrench, a.vehicles, self.physics_step, self.own_delays)
+        rotor_wrenches(
+            actions,
+            wrenches,
+            a.state,
+            a.queue,
+            a.wrench,
+            a.vehicles,
+            self.physics_step,
+            self.own_delays,
+        )
         return wrenches
 
     def clear_outcome(self, rows: Rows = None) -> None:
-        """Of rows that have just begun an episode: nothing has ended, and the distance is that of the start."""
+        """Of rows that have just begun an episode: nothing has ended, and the distance is that of
+        the start.
+        """
         chosen = self.rows(rows)
         self.outcome[chosen] = 0
         self.outcome["truncated"][chosen] = True
@@ -202,12 +277,18 @@ class QuadcopterBatch:
         if rows is None:
             return everything
         try:
-            return np.atleast_1d(everything[rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)])
+            return np.atleast_1d(
+                everything[rows if isinstance(rows, (int, slice, np.ndarray)) else list(rows)]
+            )
         except (IndexError, TypeError):
-            raise ConfigError(f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}") from None
+            raise ConfigError(
+                f"indices {rows!r}: must be row numbers of 0 to {self.n - 1}"
+            ) from None
 
     def true_state(self) -> QuadcopterState:
-        """The true state of all rows, a live view but for gusts and drag, which is a part of its wrench."""
+        """The true state of all rows, a live view but for gusts and drag, which is a part of its
+        wrench.
+        """
         vehicles = np.broadcast_to(self.vehicles, (len(self.vehicles), self.n))
         wrench = self.total_wrench()
         if self.has_drag:
@@ -216,7 +297,9 @@ class QuadcopterBatch:
         return QuadcopterState(self.state, vehicles, wrench)
 
     def total_wrench(self) -> FloatArray:
-        """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and gusts; without drag."""
+        """What pushes the rows in this control step, (WRENCH_SIZE, n): what was set or sampled, and
+        gusts; without drag.
+        """
         if self.randomize.gusts is None:
             return self.wrench
         total = self.wrench.copy()
@@ -224,8 +307,14 @@ class QuadcopterBatch:
         return total
 
     def total_wind(self) -> FloatArray:
-        """The velocity of the air in this control step, (3, n), world frame, m/s: what was set or sampled, and gusts."""
-        return self.wind if self.randomize.wind_gusts is None else self.wind + self.wind_gust[GUST_VALUE]
+        """The velocity of the air in this control step, (3, n), world frame, m/s: what was set or
+        sampled, and gusts.
+        """
+        return (
+            self.wind
+            if self.randomize.wind_gusts is None
+            else self.wind + self.wind_gust[GUST_VALUE]
+        )
 
     def snapshot(self) -> Arrays:
         """Copies of all that future flight depends on, by name."""
@@ -239,8 +328,14 @@ class QuadcopterBatch:
         for name in dict.fromkeys((*_KEPT, *snapshot)):
             array: Any = snapshot.get(name)
             own = getattr(self, name) if name in _KEPT else None
-            fits = array is not None and own is not None and (array.dtype, array.shape) == (own.dtype, own.shape)
-            if not fits or (name == "task_index" and not ((array >= 0) & (array < self.task_weights.size)).all()):
+            fits = (
+                array is not None
+                and own is not None
+                and (array.dtype, array.shape) == (own.dtype, own.shape)
+            )
+            if not fits or (
+                name == "task_index" and not ((array >= 0) & (array < self.task_weights.size)).all()
+            ):
                 found = "missing" if array is None else f"{array.dtype} of shape {array.shape}"
                 raise ConfigError(
                     f"the saved state of the environments does not fit these ({name}: {found}); use the run's own settings"
@@ -261,28 +356,41 @@ class QuadcopterBatch:
         torque_frame: str = "body",
         indices: Rows = None,
     ) -> None:
-        """Apply an external force (N) and torque (N m), (3,) or (rows, 3) each, at the centre of mass; until set anew.
+        """Apply an external force (N) and torque (N m), (3,) or (rows, 3) each, at the centre of
+        mass; until set anew.
 
         Without arguments, nothing pushes any more.
 
         :param force_frame: ``"world"`` or ``"body"``; ``torque_frame`` likewise.
         """
         chosen = self.rows(indices)
-        vectors = [per_row(name, each, chosen.size, 3).T for name, each in (("force", force), ("torque", torque))]
+        vectors = [
+            per_row(name, each, chosen.size, 3).T
+            for name, each in (("force", force), ("torque", torque))
+        ]
         self.wrench[:, chosen] = make_wrench(vectors[0], vectors[1], force_frame, torque_frame)
 
     def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
-        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s; until set anew. It acts on vehicles with drag."""
+        """Set the velocity of the air, (3,) or (rows, 3), world frame, m/s; until set anew. It acts
+        on vehicles with drag.
+        """
         chosen = self.rows(indices)
         self.wind[:, chosen] = per_row("wind", velocity, chosen.size, 3)
 
     def set_noise(self, level: Any, indices: Rows = None) -> None:
-        """Set the relative standard deviation of the observation noise, () or (rows,), or a ``Noise``; 0: none."""
+        """Set the relative standard deviation of the observation noise, () or (rows,), or a
+        ``Noise``; 0: none.
+        """
         chosen = self.rows(indices)
         noise = validate(FlightSettings, {"noise": level}, "set_noise").noise
-        relative, additive = (per_row("noise", each, chosen.size, None)[0] for each in levels(noise))
+        relative, additive = (
+            per_row("noise", each, chosen.size, None)[0] for each in levels(noise)
+        )
         columns = self._columns(indices, one_for_all=not isinstance(noise, list))
-        self.noise_level[columns], self.additive_level[columns] = relative[: columns.size], additive[: columns.size]
+        self.noise_level[columns], self.additive_level[columns] = (
+            relative[: columns.size],
+            additive[: columns.size],
+        )
 
     def _set_scaling(self, settings: FlightSettings) -> None:
         """Set μ and σ of Eq. 3.16, (18,) or (n, 18) each; None leaves one as it is."""
@@ -297,7 +405,9 @@ class QuadcopterBatch:
             getattr(self, name)[:, columns] = values[:, : columns.size]
 
     def _columns(self, rows: Rows, one_for_all: bool) -> IntArray:
-        """The columns of noise level and scaling to write for some rows, which are set apart unless one serves all."""
+        """The columns of noise level and scaling to write for some rows, which are set apart unless
+        one serves all.
+        """
         if self.mean.shape[1] < self.n:
             if rows is None and one_for_all:
                 return np.zeros(1, dtype=np.int64)
@@ -306,6 +416,9 @@ class QuadcopterBatch:
         return self.rows(rows)
 
     def _bind(self) -> None:
-        self.mean, self.std = self.scaling[:OBSERVATION_SIZE], self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE]
+        self.mean, self.std = (
+            self.scaling[:OBSERVATION_SIZE],
+            self.scaling[OBSERVATION_SIZE : 2 * OBSERVATION_SIZE],
+        )
         self.noise_level, self.additive_level = self.scaling[-2:]
         self._arrays = BatchArrays(*(getattr(self, name) for name in BatchArrays._fields))

@@ -17,7 +17,9 @@ MAX_SIZE = 2048  # of a picture, pixels
 
 
 def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
-    """``value`` of shape (size,) or (rows, size) as (size, rows); with no size, () or (rows,) as (1, rows)."""
+    """``value`` of shape (size,) or (rows, size) as (size, rows); with no size, () or (rows,) as
+    (1, rows).
+    """
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -26,7 +28,9 @@ def per_row(name: str, value: Any, rows: int, size: int | None) -> FloatArray:
         raise ConfigError(f"{name} {array.tolist()}: every number must be finite")
     inner = () if size is None else (size,)
     if array.shape not in (inner, (rows, *inner)):
-        raise ConfigError(f"{name} of shape {array.shape}: must be {inner}, or {(rows, *inner)} for {rows} rows")
+        raise ConfigError(
+            f"{name} of shape {array.shape}: must be {inner}, or {(rows, *inner)} for {rows} rows"
+        )
     return np.ascontiguousarray(np.broadcast_to(array, (rows, *inner)).T).reshape(-1, rows)
 
 
@@ -41,19 +45,27 @@ def whole_number(name: str, value: Any, least: int, most: int, unit: str = "") -
 def repeated(name: str, values: Sequence[Any], n: int) -> list[Any]:
     """The values of n rows: row i has the i-th, and fewer values than rows repeat."""
     if not 0 < len(values) <= n:
-        raise ConfigError(f"{name}: {len(values)} values for {n} environments; give from one to as many")
+        raise ConfigError(
+            f"{name}: {len(values)} values for {n} environments; give from one to as many"
+        )
     return [values[row % len(values)] for row in range(n)]
 
 
-def load_vehicles(sources: Sequence[Any], layout: str | Path | Vehicle | None = None) -> list[Vehicle]:
-    """Vehicles whose time steps agree, with rotors in the layout of another vehicle if one is named."""
+def load_vehicles(
+    sources: Sequence[Any], layout: str | Path | Vehicle | None = None
+) -> list[Vehicle]:
+    """Vehicles whose time steps agree, with rotors in the layout of another vehicle if one is
+    named.
+    """
     vehicles = [load_vehicle(each) for each in sources]
     if layout is not None:
         wanted = load_vehicle(layout)
         vehicles = [each.in_layout_of(wanted) for each in vehicles]
     for row, each in enumerate(vehicles):
         if (each.physics_step, each.substeps) != (vehicles[0].physics_step, vehicles[0].substeps):
-            raise ConfigError(f"vehicle of row {row}: physics_step and control_step must be those of row 0")
+            raise ConfigError(
+                f"vehicle of row {row}: physics_step and control_step must be those of row 0"
+            )
     return vehicles
 
 

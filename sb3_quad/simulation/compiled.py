@@ -1,4 +1,6 @@
-"""The decorator of all compiled functions, where compiled code is kept, and atomic operations, which numba lacks."""
+"""The decorator of all compiled functions, where compiled code is kept, and atomic operations,
+which numba lacks.
+"""
 
 import functools
 import hashlib
@@ -13,23 +15,31 @@ from numba.extending import intrinsic
 
 from sb3_quad.base.notices import tell
 
-LANES = 64  # rows of a block; a multiple of every vector width, small enough for a block to stay in the first cache
+# Rows of a block; a multiple of every vector width, small enough for a block to stay in the first
+# cache
+LANES = 64
 _COMPILED_IN = ("simulation", "vehicles", "experts", "algorithms/networks")
 
 
 def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
-    """``numba.njit`` that releases the GIL, with a cache that notices a change in any module of ``_COMPILED_IN``.
+    """``numba.njit`` that releases the GIL, with a cache that notices a change in any module of
+    ``_COMPILED_IN``.
 
-    Numba itself looks only at the file of the function, but code called from other files is compiled in, too. Every call is
-    inlined. Otherwise a cached and a freshly compiled copy may round differently under ``fastmath``.
+    Numba itself looks only at the file of the function, but code called from other files is
+    compiled in, too. Every call is inlined. Otherwise a cached and a freshly compiled copy may
+    round differently under ``fastmath``.
     """
     if function is None:
         return lambda inner: compiled(inner, **options)
     dispatcher = numba.njit(error_model="numpy", nogil=True, forceinline=True, **options)(function)
     try:
         dispatcher.enable_caching()
-    except RuntimeError:  # neither the package's folder nor the user's folder for caches can be written
-        tell("compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder")
+    except (
+        RuntimeError
+    ):  # neither the package's folder nor the user's folder for caches can be written
+        tell(
+            "compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder"
+        )
     else:
         dispatcher._cache._cache_file._source_stamp = _source_stamp()
     return dispatcher

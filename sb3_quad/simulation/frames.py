@@ -1,7 +1,9 @@
-"""What a policy sees beside the present features: the last action, earlier frames, and the integral of the position error.
+"""What a policy sees beside the present features: the last action, earlier frames, and the integral
+of the position error.
 
-A frame is the scaled features of a control step, with ``last_action`` followed by the action that led there. An observation is
-the frames of some ages, one after the other. The compiled functions keep the frames of a row and make observations of them.
+A frame is the scaled features of a control step, with ``last_action`` followed by the action that
+led there. An observation is the frames of some ages, one after the other. The compiled functions
+keep the frames of a row and make observations of them.
 """
 
 from typing import Any
@@ -17,11 +19,13 @@ MAX_AGE = 1000  # control steps
 
 
 class PositionIntegral(Frozen):
-    """s += ``gain`` e dt where e is shorter than ``distance`` and v than ``speed``; each component stays within ±``limit``.
+    """s += ``gain`` e dt where e is shorter than ``distance`` and v than ``speed``; each component
+    stays within ±``limit``.
 
-    e is the observed position relative to the target, v the observed velocity; s is zero at an episode's start. The policy
-    sees e + s in place of e, also in earlier frames. It flies to where e + s is zero, so that neither a constant force nor a
-    bias of its own leaves an error. It need not have been trained with the integral.
+    e is the observed position relative to the target, v the observed velocity; s is zero at an
+    episode's start. The policy sees e + s in place of e, also in earlier frames. It flies to where
+    e + s is zero, so that neither a constant force nor a bias of its own leaves an error. It need
+    not have been trained with the integral.
     """
 
     gain: PositiveFloat = Field(default=0.5, le=100, description="1/s")
@@ -37,11 +41,17 @@ class PositionIntegral(Frozen):
 class ObservationSettings(Frozen):
     """What an observation is made of; the default is the 18 features alone."""
 
-    last_action: bool = Field(default=False, description="whether a frame ends with the action before it, clipped to [-1, 1]")
-    history: tuple[int, ...] | None = Field(
-        default=None, description="ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode began"
+    last_action: bool = Field(
+        default=False,
+        description="whether a frame ends with the action before it, clipped to [-1, 1]",
     )
-    position_integral: PositionIntegral | None = Field(default=None, description="see PositionIntegral; {} for its defaults")
+    history: tuple[int, ...] | None = Field(
+        default=None,
+        description="ages of the frames, control steps, such as [0, 1, 2, 4]; zeros before the episode began",
+    )
+    position_integral: PositionIntegral | None = Field(
+        default=None, description="see PositionIntegral; {} for its defaults"
+    )
 
     @field_validator("history", mode="before")
     @classmethod
@@ -53,8 +63,12 @@ class ObservationSettings(Frozen):
     @field_validator("history")
     @classmethod
     def _rises(cls, value: tuple[int, ...] | None) -> tuple[int, ...] | None:
-        if value is not None and (not value or value[0] != 0 or list(value) != sorted(set(value)) or value[-1] > MAX_AGE):
-            raise ValueError(f"{list(value)}: must rise from 0, the present frame, to at most {MAX_AGE}")
+        if value is not None and (
+            not value or value[0] != 0 or list(value) != sorted(set(value)) or value[-1] > MAX_AGE
+        ):
+            raise ValueError(
+                f"{list(value)}: must rise from 0, the present frame, to at most {MAX_AGE}"
+            )
         return value
 
     @property
@@ -80,7 +94,9 @@ class ObservationSettings(Frozen):
 
 @compiled
 def store_action(i, step, action, frames):
-    """Keep the action (4,) that led row i to control step ``step``, in place; ``frames`` as in :func:`observe_frames`."""
+    """Keep the action (4,) that led row i to control step ``step``, in place; ``frames`` as in
+    :func:`observe_frames`.
+    """
     slot = step % frames.shape[1]
     for k in range(frames.shape[2] - OBSERVATION_SIZE):
         frames[i, slot, OBSERVATION_SIZE + k] = min(max(action[k], float32(-1.0)), float32(1.0))
@@ -97,7 +113,8 @@ def clear_frames(i, frames, integral):
 
 @compiled
 def integrate_position(i, feature, lane, mean, inverse_std, numbers, integral):
-    """Advance the position integral of row i by a control step, in place, from its scaled features (OBSERVATION_SIZE, lanes).
+    """Advance the position integral of row i by a control step, in place, from its scaled features
+    (OBSERVATION_SIZE, lanes).
 
     :param numbers: float64 (4,), :meth:`PositionIntegral.numbers`.
     """
@@ -112,7 +129,9 @@ def integrate_position(i, feature, lane, mean, inverse_std, numbers, integral):
         for axis in range(3):
             k = F.position + axis
             e = feature[k, lane] / inverse_std[k, lane] + mean[k, lane]
-            integral[axis, i] = min(max(integral[axis, i] + numbers[0] * e, -numbers[3]), numbers[3])
+            integral[axis, i] = min(
+                max(integral[axis, i] + numbers[0] * e, -numbers[3]), numbers[3]
+            )
 
 
 @compiled
@@ -120,10 +139,12 @@ def observe_frames(i, step, feature, lane, inverse_std, integral, ages, frames, 
     """Keep row i's present frame and write its observation, in place.
 
     :param step: control steps since the episode began.
-    :param feature: scaled features, float32 (OBSERVATION_SIZE, lanes), of which ``lane`` is the row's.
+    :param feature: scaled features, float32 (OBSERVATION_SIZE, lanes), of which ``lane`` is the
+        row's.
     :param integral: float64 (3, n), or (0, n) without.
     :param ages: int64, of the observed frames, control steps.
-    :param frames: float32 (n, depth, frame_size), the frames of the latest control steps, step s in slot s % depth.
+    :param frames: float32 (n, depth, frame_size), the frames of the latest control steps, step s in
+        slot s % depth.
     :param out: float32 (n, size).
     """
     depth, size = frames.shape[1], frames.shape[2]

@@ -1,9 +1,11 @@
-"""One control step of a batch, block by block: a block goes through all of it while it is in the first cache.
+"""One control step of a batch, block by block: a block goes through all of it while it is in the
+first cache.
 
-A block is ``LANES`` neighbouring rows with all that a control step needs of them in one piece of memory. Its arrays have
-constant shapes and places: LLVM then knows each distance between two rows, needs no test for overlap, and vectorises the loops
-over lanes. Lanes behind the last row repeat it, so that every loop runs over all lanes: a row's numbers then never depend on
-how many others fly, or on where in the batch it stands.
+A block is ``LANES`` neighbouring rows with all that a control step needs of them in one piece of
+memory. Its arrays have constant shapes and places: LLVM then knows each distance between two rows,
+needs no test for overlap, and vectorises the loops over lanes. Lanes behind the last row repeat it,
+so that every loop runs over all lanes: a row's numbers then never depend on how many others fly, or
+on where in the batch it stands.
 """
 
 from typing import Any, NamedTuple
@@ -12,20 +14,40 @@ import numpy as np
 
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 from sb3_quad.simulation.compiled import LANES, atomic_add, compiled
-from sb3_quad.simulation.frames import clear_frames, integrate_position, observe_frames, store_action
+from sb3_quad.simulation.frames import (
+    clear_frames,
+    integrate_position,
+    observe_frames,
+    store_action,
+)
 from sb3_quad.simulation.observation import GUST_WORDS, NORMALS, OBSERVATION_SIZE, WORDS, observe
-from sb3_quad.simulation.physics import command_rotors, fly, moment, motor_factor, rotation_rows, turn_rotors
+from sb3_quad.simulation.physics import (
+    command_rotors,
+    fly,
+    moment,
+    motor_factor,
+    rotation_rows,
+    turn_rotors,
+)
 from sb3_quad.simulation.random import STEP, gust_words
 from sb3_quad.simulation.reward import score, succeeds
-from sb3_quad.simulation.sampling import add_gusts, advance_gusts, count_episode, sample_episode, start_episode
+from sb3_quad.simulation.sampling import (
+    add_gusts,
+    advance_gusts,
+    count_episode,
+    sample_episode,
+    start_episode,
+)
 from sb3_quad.simulation.state import STATE, STATE_SIZE, WRENCH, WRENCH_SIZE, P, W, X
 from sb3_quad.simulation.tasks import SCORED, S, T
 from sb3_quad.simulation.threads import DONE, LEFT, finish
 
 CHUNK = 2 * LANES  # rows that a thread takes at once
 LOOK, SCORE, FLY = range(3)
-"""What :func:`step` does: it observes, after it has begun the next episodes of the rows whose ``dones`` are set; it scores a
-control step that another simulator has flown; it flies and scores one."""
+"""What :func:`step` does: it observes, after it has begun the next episodes of the rows whose
+``dones`` are set; it scores a control step that another simulator has flown; it flies and scores
+one.
+"""
 
 OUTCOME = np.dtype(
     [
@@ -78,9 +100,14 @@ _CONTENTS: dict[str, tuple[str, Any]] = {
     "word": ("u4", WORDS),  # random
     "stream": ("u4", 4),
 }
-_WHOLE = np.dtype([(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()])
+_WHOLE = np.dtype(
+    [(name, kind, (*np.empty(shape).shape, LANES)) for name, (kind, shape) in _CONTENTS.items()]
+)
 _FIELDS: Any = dict(_WHOLE.fields or {})
-for _whole, _parts, _first in (("state", STATE, X), ("wrench", WRENCH, W)):  # each part under its name, too
+for _whole, _parts, _first in (
+    ("state", STATE, X),
+    ("wrench", WRENCH, W),
+):  # each part under its name, too
     for _name, _size in _parts.items():
         _place = _FIELDS[_whole][1] + 8 * LANES * getattr(_first, _name)
         _FIELDS[_name] = np.dtype(("f8", (_size, LANES))), _place
@@ -89,10 +116,13 @@ _SIZE = BLOCK.itemsize
 
 
 class BatchArrays(NamedTuple):
-    """What control steps of n rows read and write. Where a shape says 1 or n, one column may serve all rows."""
+    """What control steps of n rows read and write. Where a shape says 1 or n, one column may serve
+    all rows.
+    """
 
     state: FloatArray  # (STATE_SIZE, n), see STATE
-    queue: FloatArray  # (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s
+    # (delay, 4, n), rotor speeds that have been commanded and are not due yet, rad/s
+    queue: FloatArray
     wrench: FloatArray  # (WRENCH_SIZE, n), see WRENCH
     vehicles: FloatArray  # (parameters, 1 or n), that fly
     base_vehicles: FloatArray  # (parameters, 1 or n), before anything is random
@@ -101,12 +131,16 @@ class BatchArrays(NamedTuple):
     gust: FloatArray  # (GUST_SIZE, 0 or n), of force
     wind: FloatArray  # (3, n), velocity of the air without gusts, world frame, m/s
     wind_gust: FloatArray  # (GUST_SIZE, 0 or n)
-    frames: Float32Array  # (n, depth, frame size), depth 0 where an observation is the present features
+    frames: (
+        Float32Array  # (n, depth, frame size), depth 0 where an observation is the present features
+    )
     ages: IntArray  # (ages,), of the frames in an observation, control steps
     integral: FloatArray  # (0 or 3, n), of the position
     integral_numbers: FloatArray  # (4,), see PositionIntegral
     streams: Any  # uint32 (4, n), see random.py
-    scaling: FloatArray  # (2 OBSERVATION_SIZE + 2, 1 or n), μ and σ of Eq. 3.16, levels of the relative and additive noise
+    # (2 OBSERVATION_SIZE + 2, 1 or n), μ and σ of Eq. 3.16, levels of the relative and additive
+    # noise
+    scaling: FloatArray
     task_index: IntArray  # (n,), of the episodes under way
     task_parameters: FloatArray  # (tasks, columns), see TASK
     task_weights: FloatArray  # (tasks,), cumulative
@@ -115,7 +149,9 @@ class BatchArrays(NamedTuple):
     max_steps: IntArray  # (n,), of those that follow
     outcome: Any  # OUTCOME (n,)
     last_observations: Float32Array  # (n, size), of the episodes that outcome tells of
-    constants: FloatArray  # (5,): physics step, s; physics steps in a control step; whether delays differ by row; whether
+    # (5,): physics step, s; physics steps in a control step; whether delays differ by row;
+    # whether
+    constants: FloatArray
     # rotor positions do; whether a row that ends begins its next episode within the same step
 
 
@@ -126,13 +162,15 @@ def step(
     frames, ages, integral, integral_numbers, streams, scaling,
     task_index, task_parameters, task_weights, returns, limits, max_steps, outcome, last_observations, constants,
 ):  # fmt: skip
-    """A control step of all rows, of which this thread takes as many as others leave it; see :func:`.threads.share_out`.
+    """A control step of all rows, of which this thread takes as many as others leave it; see
+    :func:`.threads.share_out`.
 
-    Arrays as flat arguments: with them in a named tuple numba took twice as long to compile, and each block a tenth longer.
+    Arrays as flat arguments: with them in a named tuple numba took twice as long to compile, and
+    each block a tenth longer.
 
     :param leads: whether this is the thread that returns to the batch.
-    :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and ``dones`` bool (n,) are
-        written; the others are :class:`BatchArrays`.
+    :param actions: float32 (n, 4); ``observations`` float32 (n, size), ``rewards`` float32 (n,) and
+        ``dones`` bool (n,) are written; the others are :class:`BatchArrays`.
     :return: False if an action is not finite, and then nothing has happened.
     """
     n, physics_step, substeps = state.shape[1], constants[0], np.int64(constants[1])
@@ -196,7 +234,9 @@ def step(
                     i = first + lane
                     store_action(i, np.int64(b.stream[STEP, lane]), actions[i], frames)
                     if integral.shape[0] > 0:
-                        integrate_position(i, b.feature, lane, b.mean, b.inverse_std, integral_numbers, integral)
+                        integrate_position(
+                            i, b.feature, lane, b.mean, b.inverse_std, integral_numbers, integral
+                        )
             _write_observations(b, count, integral, ages, frames, observations)
 
             height, radius, distance, scored = b.position[2], b.radius, b.distance, b.scored
@@ -205,7 +245,9 @@ def step(
                 i = first + lane
                 returns[i] += b.reward[lane]
                 rewards[i] = b.reward[lane]
-                lost = (height[lane] <= radius[lane]) | (distance[lane] > scored[S.max_distance, lane])
+                lost = (height[lane] <= radius[lane]) | (
+                    distance[lane] > scored[S.max_distance, lane]
+                )
                 dones[i] = lost | (b.stream[STEP, lane] >= limits[i])
                 ends += dones[i]
             if ends == 0 and autoreset:
@@ -239,9 +281,20 @@ def step(
             returns[i], limits[i] = 0.0, max_steps[i]
             count_episode(i, streams)
             sample_episode(
-                i, streams, base_vehicles, distribution_numbers, randomize_numbers, vehicles, wrench, gust, wind, wind_gust
+                i,
+                streams,
+                base_vehicles,
+                distribution_numbers,
+                randomize_numbers,
+                vehicles,
+                wrench,
+                gust,
+                wind,
+                wind_gust,
             )
-            start_episode(i, state, queue, streams, task_index, vehicles, task_parameters, task_weights)
+            start_episode(
+                i, state, queue, streams, task_index, vehicles, task_parameters, task_weights
+            )
             if frames.shape[1] > 0:
                 clear_frames(i, frames, integral)
         if fresh or scaling.shape[1] > 1:
@@ -266,12 +319,15 @@ def step(
 
 @compiled
 def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, own_delays):
-    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body itself.
+    """Advance delay and rotors of row 0 by a control step, for a simulator that moves the body
+    itself.
 
-    Motors do not feel the body, so that all physics steps of a control step can be worked out before it moves.
+    Motors do not feel the body, so that all physics steps of a control step can be worked out
+    before it moves.
 
     :param actions: float32 (n, 4), clipped to [-1, 1].
-    :param out: (substeps, 2, 3): what rotors and wrench do in each physics step, force (N) and torque (N m), body frame.
+    :param out: (substeps, 2, 3): what rotors and wrench do in each physics step, force (N) and
+        torque (N m), body frame.
     """
     blocks = _new_block()
     for each in range(len(out)):
@@ -293,18 +349,24 @@ def rotor_wrenches(actions, out, state, queue, wrench, vehicles, physics_step, o
 
 @compiled
 def write_body(state, position, quaternion, velocity, rates):
-    """Write another simulator's pose, quaternion (x, y, z, w), and world-frame velocities into column 0 of ``state``."""
+    """Write another simulator's pose, quaternion (x, y, z, w), and world-frame velocities into
+    column 0 of ``state``.
+    """
     x, y, z, w = quaternion
     r, state[X.quaternion, 0] = rotation_rows(w, x, y, z), w
     for axis in range(3):
         state[X.position + axis, 0], state[X.velocity + axis, 0] = position[axis], velocity[axis]
         state[X.quaternion + 1 + axis, 0] = quaternion[axis]
-        state[X.body_rates + axis, 0] = r[0][axis] * rates[0] + r[1][axis] * rates[1] + r[2][axis] * rates[2]
+        state[X.body_rates + axis, 0] = (
+            r[0][axis] * rates[0] + r[1][axis] * rates[1] + r[2][axis] * rates[2]
+        )
 
 
 @compiled
 def _new_block():
-    """Room for a block, (1,), which begins with a cache line: vectors that straddle two take a third longer."""
+    """Room for a block, (1,), which begins with a cache line: vectors that straddle two take a
+    third longer.
+    """
     room = np.empty(_SIZE + 64, np.uint8)
     start = -room.ctypes.data % 64
     return room[start : start + _SIZE].view(BLOCK)
@@ -330,7 +392,9 @@ def _write_observations(b, count, integral, ages, frames, out):
         return
     for lane in range(count):
         since = np.int64(b.stream[STEP, lane])
-        observe_frames(b.row[lane], since, b.feature, lane, b.inverse_std, integral, ages, frames, out)
+        observe_frames(
+            b.row[lane], since, b.feature, lane, b.inverse_std, integral, ages, frames, out
+        )
 
 
 @compiled
@@ -350,7 +414,9 @@ def _load_rows(source, first, count, target):
 
 @compiled
 def _load_vehicles(b, vehicles, first, count, dt, arms):
-    """What the control step needs of the vehicles of a block, with the divisions done; without ``arms`` those stay."""
+    """What the control step needs of the vehicles of a block, with the divisions done; without
+    ``arms`` those stay.
+    """
     if vehicles.shape[1] > 1 and count == LANES:
         _divide(b, vehicles, first, dt)
     else:
@@ -369,7 +435,11 @@ def _divide(b, v, first, dt):
         b.motor[0, lane] = motor_factor(v[P.motor_gain_up, i], exact, dt)
         b.motor[1, lane] = motor_factor(v[P.motor_gain_down, i], exact, dt)
         b.push[lane] = dt / v[P.mass, i]
-        b.drag[0, lane], b.drag[1, lane], b.drag[2, lane] = v[P.drag_x, i], v[P.drag_y, i], v[P.drag_z, i]
+        b.drag[0, lane], b.drag[1, lane], b.drag[2, lane] = (
+            v[P.drag_x, i],
+            v[P.drag_y, i],
+            v[P.drag_z, i],
+        )
         b.fall[lane], b.lift[lane] = v[P.gravity, i] * dt, lift
         b.twist[0, lane], b.twist[1, lane], b.twist[2, lane] = dt / ixx, dt / iyy, dt / izz
         b.gyro[0, lane], b.gyro[1, lane], b.gyro[2, lane] = izz - iyy, ixx - izz, iyy - ixx
@@ -380,7 +450,9 @@ def _divide(b, v, first, dt):
 
 @compiled
 def _load_commands(actions, queue, own_delays, b, first, count):
-    """Actions into the delay's end, or where delays differ the row's own, and what leaves it into the wanted speeds."""
+    """Actions into the delay's end, or where delays differ the row's own, and what leaves it into
+    the wanted speeds.
+    """
     command, wanted, own = b.command, b.wanted_speeds, b.delay
     delay = queue.shape[0]
     for lane in range(LANES):
@@ -397,9 +469,13 @@ def _load_commands(actions, queue, own_delays, b, first, count):
         for lane in range(LANES):
             wanted[k, lane] = queue[0, k, first + min(lane, count - 1)]
         for late in range(delay - 1):
-            here, behind = queue[late, k, first : first + count], queue[late + 1, k, first : first + count]
+            here, behind = (
+                queue[late, k, first : first + count],
+                queue[late + 1, k, first : first + count],
+            )
             for lane in range(count):
-                # Both are read whichever is taken, and the rows are views: else the loop is not vectorised.
+                # Both are read whichever is taken, and the rows are views: else the loop is not
+                # vectorised.
                 new, old = command[k, lane], behind[lane]
                 here[lane] = new if own_delays and own[lane] == late + 1.0 else old
         if own_delays:
@@ -424,7 +500,10 @@ def _load_scaling(b, scaling):
     """μ, 1/σ and the noise levels of a block, in float32."""
     for lane in range(LANES):
         i = 0 if scaling.shape[1] == 1 else b.row[lane]
-        b.noise_level[lane], b.additive[lane] = scaling[2 * OBSERVATION_SIZE, i], scaling[2 * OBSERVATION_SIZE + 1, i]
+        b.noise_level[lane], b.additive[lane] = (
+            scaling[2 * OBSERVATION_SIZE, i],
+            scaling[2 * OBSERVATION_SIZE + 1, i],
+        )
         for k in range(OBSERVATION_SIZE):
             b.mean[k, lane] = scaling[k, i]
             b.inverse_std[k, lane] = np.float32(1.0) / np.float32(scaling[OBSERVATION_SIZE + k, i])

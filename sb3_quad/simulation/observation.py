@@ -1,6 +1,7 @@
 """The features of an observation (thesis 3.3.1), their noise and their scaling (Eq. 3.16).
 
-:data:`FEATURES` names them and :func:`features` computes them: a new one is a line in the table and its formula.
+:data:`FEATURES` names them and :func:`features` computes them: a new one is a line in the table and
+its formula.
 """
 
 import math
@@ -18,7 +19,8 @@ from sb3_quad.simulation.state import first_rows, row_slices
 class Feature(NamedTuple):
     """Features of one kind.
 
-    :param name: of the group; ``each`` begins the name of one feature, which ends in one of ``parts``.
+    :param name: of the group; ``each`` begins the name of one feature, which ends in one of
+        ``parts``.
     :param std: σ of Eq. 3.16 (Table A.2), in ``unit``.
     """
 
@@ -31,7 +33,9 @@ class Feature(NamedTuple):
 
 _MATRIX = tuple(f"{row}{column}" for row in range(3) for column in range(3))
 FEATURES = (
-    Feature("position", "position", ("x", "y", "z"), 10.0 / math.sqrt(3.0), "m"),  # r - r_T, world frame
+    Feature(
+        "position", "position", ("x", "y", "z"), 10.0 / math.sqrt(3.0), "m"
+    ),  # r - r_T, world frame
     Feature("rotation", "rotation", _MATRIX, math.sqrt(3.0), "-"),  # world to body
     Feature("velocity", "velocity", ("x", "y", "z"), 5.0, "m/s"),  # body frame
     Feature("body_rates", "body_rate", ("x", "y", "z"), 5.0, "rad/s"),  # body frame
@@ -51,11 +55,22 @@ DEFAULT_STD = np.concatenate([np.full(len(feature.parts), feature.std) for featu
 
 @compiled(fastmath=True)
 def features(b):
-    """``b.feature``, float32: what is observed of a loaded block, in the units of the table, without noise."""
-    position, target, q, v, w, out = b.position, b.target, b.quaternion, b.velocity, b.body_rates, b.feature
+    """``b.feature``, float32: what is observed of a loaded block, in the units of the table,
+    without noise.
+    """
+    position, target, q, v, w, out = (
+        b.position,
+        b.target,
+        b.quaternion,
+        b.velocity,
+        b.body_rates,
+        b.feature,
+    )
     for lane in range(LANES):
         vx, vy, vz = v[0, lane], v[1, lane], v[2, lane]
-        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(q[0, lane], q[1, lane], q[2, lane], q[3, lane])
+        (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = rotation_rows(
+            q[0, lane], q[1, lane], q[2, lane], q[3, lane]
+        )
         for k in range(3):
             out[F.position + k, lane] = float32(position[k, lane] - target[k, lane])
             out[F.body_rates + k, lane] = float32(w[k, lane])
@@ -86,7 +101,10 @@ def _disturb_and_scale(b):
                 noisy = feature[k, lane] * (float32(1.0) + b.noise_level[lane] * noise[k, lane])
             else:
                 fixed = b.additive[lane] / inverse_std[k, lane]
-                noisy = feature[k, lane] + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
+                noisy = (
+                    feature[k, lane]
+                    + math.sqrt(relative * relative + fixed * fixed) * noise[k, lane]
+                )
             feature[k, lane] = (noisy - mean[k, lane]) * inverse_std[k, lane]
 
 

@@ -1,14 +1,16 @@
-"""Counter-based random numbers: a stream per row, so that neither threads nor neighbours change what a row gets.
+"""Counter-based random numbers: a stream per row, so that neither threads nor neighbours change
+what a row gets.
 
-Every number is Philox4x32 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011) of a key and a
-counter: the key names the row, the counter is ``(block, step, episode, purpose)``. Nothing is kept in between.
+Every number is Philox4x32 (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011)
+of a key and a counter: the key names the row, the counter is ``(block, step, episode, purpose)``.
+Nothing is kept in between.
 
-``streams``, uint32 of shape ``(4, n)``: key_lo, key_hi, episode, step. Resetting a row adds one to ``episode`` and sets
-``step`` to 0; each control step adds one to ``step``.
+``streams``, uint32 of shape ``(4, n)``: key_lo, key_hi, episode, step. Resetting a row adds one to
+``episode`` and sets ``step`` to 0; each control step adds one to ``step``.
 
-Normals are Box-Muller in float32, lane by lane. The logarithm, sine and cosine are short polynomials instead of library
-calls, so that the loops vectorise; their error (1e-7) is far below what any test of the numbers could see. The largest
-number there can be is 6.7.
+Normals are Box-Muller in float32, lane by lane. The logarithm, sine and cosine are short
+polynomials instead of library calls, so that the loops vectorise; their error (1e-7) is far below
+what any test of the numbers could see. The largest number there can be is 6.7.
 """
 
 import math
@@ -22,7 +24,9 @@ from numba import float32, int32, uint32, uint64
 from sb3_quad.simulation.compiled import LANES, compiled
 
 KEY_LO, KEY_HI, EPISODE, STEP = range(4)
-OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DISTRIBUTION, WIND = range(7)  # purposes: the last word of the counter
+OBSERVATION_NOISE, EPISODE_START, VEHICLE, PUSH, GUST, DISTRIBUTION, WIND = range(
+    7
+)  # purposes: the last word of the counter
 ROUNDS = 10
 _MASK, _SHIFT = uint64(0xFFFFFFFF), uint64(32)
 _SQRT_HALF_BITS = 0x3F3504F3  # of sqrt(1/2)
@@ -32,12 +36,15 @@ _TO_ANGLE = float32(2.0 * math.pi * 2.0**-32)
 
 
 def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
-    """Streams before their first episode, shape (4, n), from n seeds; None: the operating system's entropy.
+    """Streams before their first episode, shape (4, n), from n seeds; None: the operating system's
+    entropy.
 
     A key is the first number of the generator that Gymnasium makes of the seed.
     """
     generators = [seeding.np_random(None if seed is None else int(seed))[0] for seed in seeds]
-    keys = np.array([generator.integers(2**64, dtype=np.uint64) for generator in generators], dtype=np.uint64)
+    keys = np.array(
+        [generator.integers(2**64, dtype=np.uint64) for generator in generators], dtype=np.uint64
+    )
     streams = np.zeros((4, keys.size), dtype=np.uint32)
     streams[KEY_LO] = keys & np.uint64(0xFFFFFFFF)
     streams[KEY_HI] = keys >> np.uint64(32)
@@ -46,7 +53,8 @@ def new_streams(seeds: Sequence[int | None]) -> npt.NDArray[np.uint32]:
 
 @compiled
 def _round(c0, c1, c2, c3, k0, k1):
-    # In uint64 whose upper half is left to hold anything: AVX2 multiplies the lower halves of 64-bit lanes.
+    # In uint64 whose upper half is left to hold anything: AVX2 multiplies the lower halves of
+    # 64-bit lanes.
     p0 = uint64(0xD2511F53) * (c0 & _MASK)
     p1 = uint64(0xCD9E8D57) * (c2 & _MASK)
     return (p1 >> _SHIFT) ^ c1 ^ k0, p1, (p0 >> _SHIFT) ^ c3 ^ k1, p0
@@ -76,7 +84,9 @@ def uniforms(streams, row, blocks, purpose):
     for block in range(blocks):
         w0, w1, w2, w3 = _words(streams, row, block, purpose)
         numbers[2 * block] = (((uint64(w0) << _SHIFT | uint64(w1)) >> uint64(11)) + 0.5) * 2.0**-53
-        numbers[2 * block + 1] = (((uint64(w2) << _SHIFT | uint64(w3)) >> uint64(11)) + 0.5) * 2.0**-53
+        numbers[2 * block + 1] = (
+            ((uint64(w2) << _SHIFT | uint64(w3)) >> uint64(11)) + 0.5
+        ) * 2.0**-53
     return numbers
 
 
@@ -115,7 +125,9 @@ def _log(x):
 
 @compiled(fastmath=True)
 def standard_normals(b):
-    """``b.noise``: standard normals of every lane, an even number, from the first of its ``b.word``, two from two."""
+    """``b.noise``: standard normals of every lane, an even number, from the first of its
+    ``b.word``, two from two.
+    """
     word, noise = b.word, b.noise
     for pair in range(noise.shape[0] // 2):
         for lane in range(LANES):
@@ -125,13 +137,22 @@ def standard_normals(b):
             quadrant = int32(uint32(turn + uint32(0x20000000)) >> uint32(30))
             t = float32(int32(uint32(turn - (uint32(quadrant) << uint32(30))))) * _TO_ANGLE
             t2 = t * t
-            sine = t + t * t2 * (float32(-1.6666654611e-1) + t2 * (float32(8.3321608736e-3) + t2 * float32(-1.9515295891e-4)))
-            p = float32(4.166664568298827e-2) + t2 * (float32(-1.388731625493765e-3) + t2 * float32(2.443315711809948e-5))
+            sine = t + t * t2 * (
+                float32(-1.6666654611e-1)
+                + t2 * (float32(8.3321608736e-3) + t2 * float32(-1.9515295891e-4))
+            )
+            p = float32(4.166664568298827e-2) + t2 * (
+                float32(-1.388731625493765e-3) + t2 * float32(2.443315711809948e-5)
+            )
             cosine = float32(1.0) - float32(0.5) * t2 + t2 * t2 * p
             odd = (quadrant & 1) != 0
             first = sine if odd else cosine
             second = cosine if odd else sine
             first_sign = int32((quadrant ^ (quadrant >> int32(1))) & int32(1)) << int32(31)
             second_sign = int32(quadrant >> int32(1)) << int32(31)
-            noise[2 * pair, lane] = radius * np.int32(np.float32(first).view(np.int32) ^ first_sign).view(np.float32)
-            noise[2 * pair + 1, lane] = radius * np.int32(np.float32(second).view(np.int32) ^ second_sign).view(np.float32)
+            noise[2 * pair, lane] = radius * np.int32(
+                np.float32(first).view(np.int32) ^ first_sign
+            ).view(np.float32)
+            noise[2 * pair + 1, lane] = radius * np.int32(
+                np.float32(second).view(np.int32) ^ second_sign
+            ).view(np.float32)

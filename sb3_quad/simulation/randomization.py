@@ -31,7 +31,10 @@ V = first_rows(VECTOR)
 RANDOMIZATION = {
     "share": 1,
     "wrench_share": 1,
-    **dict.fromkeys(("mass", "inertia", "motor_gain", "motor_gain_up", "motor_gain_down", "thrust", "arm"), _RANGE),
+    **dict.fromkeys(
+        ("mass", "inertia", "motor_gain", "motor_gain_up", "motor_gain_down", "thrust", "arm"),
+        _RANGE,
+    ),
     **dict.fromkeys(("center_of_mass", "delay", "drag"), _RANGE),
     **dict.fromkeys(("force", "torque", "wind"), sum(VECTOR.values())),
     "gust_std": _RANGE,
@@ -50,7 +53,8 @@ class Range(Frozen):
     low: Number = Field(description="the least number")
     high: Number = Field(description="the greatest number, at least low")
     distribution: Literal["uniform", "log_uniform", "uniform_cube_root"] = Field(
-        default="uniform", description="of the number, of its logarithm (low > 0), or of its cube root"
+        default="uniform",
+        description="of the number, of its logarithm (low > 0), or of its cube root",
     )
 
     @model_validator(mode="before")
@@ -69,9 +73,13 @@ class Range(Frozen):
         if self.low > self.high:
             raise ValueError(f"[{self.low:g}, {self.high:g}]: the first number exceeds the second")
         if self.distribution == "log_uniform" and self.low <= 0.0:
-            raise ValueError(f"[{self.low:g}, {self.high:g}]: log_uniform numbers are greater than 0")
+            raise ValueError(
+                f"[{self.low:g}, {self.high:g}]: log_uniform numbers are greater than 0"
+            )
         if self.distribution == "uniform_cube_root" and self.low < 0.0:
-            raise ValueError(f"[{self.low:g}, {self.high:g}]: uniform_cube_root numbers are not negative")
+            raise ValueError(
+                f"[{self.low:g}, {self.high:g}]: uniform_cube_root numbers are not negative"
+            )
         return self
 
     def numbers(self) -> list[float]:
@@ -95,32 +103,43 @@ class Offset(Range):
     """A :class:`Range` of distances of at most 1 m either way."""
 
     low: Annotated[float, Field(ge=-1, le=1)] = Field(description="the least number, at least -1")
-    high: Annotated[float, Field(ge=-1, le=1)] = Field(description="the greatest number, from low to 1")
+    high: Annotated[float, Field(ge=-1, le=1)] = Field(
+        description="the greatest number, from low to 1"
+    )
 
 
 class Factor(Range):
     """A factor between 0.1 and 10; its logarithm is uniform unless ``distribution`` says otherwise."""
 
     low: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the least factor")
-    high: Annotated[float, Field(ge=0.1, le=10)] = Field(description="the greatest factor, at least low")
+    high: Annotated[float, Field(ge=0.1, le=10)] = Field(
+        description="the greatest factor, at least low"
+    )
     distribution: Literal["uniform", "log_uniform"] = Field(
         default="log_uniform", description="of the factor or its logarithm"
     )
 
 
 class RandomVector(Frozen):
-    """A force or torque at the centre of mass, the same throughout an episode; ``[low, high]`` for short."""
+    """A force or torque at the centre of mass, the same throughout an episode; ``[low, high]`` for
+    short.
+    """
 
     magnitude: NonNegativeRange = Field(description="its length, N or N m, or as unit says")
     unit: Literal["SI", "weight"] = Field(
-        default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
+        default="SI",
+        description="weight: force in weights m g of the vehicle, torque in weights times its arm length",
     )
     frame: Literal["world", "body"] | None = Field(
-        default=None, description="the axes it keeps to; left out: a force to the world's, a torque to the body's"
+        default=None,
+        description="the axes it keeps to; left out: a force to the world's, a torque to the body's",
     )
-    direction: Vector | None = Field(default=None, description="where to; left out: uniformly random")
+    direction: Vector | None = Field(
+        default=None, description="where to; left out: uniformly random"
+    )
     axes: tuple[AxisFactor, AxisFactor, AxisFactor] = Field(
-        default=(1.0, 1.0, 1.0), description="factor of each component, such as [1, 1, 0] for a horizontal one"
+        default=(1.0, 1.0, 1.0),
+        description="factor of each component, such as [1, 1, 0] for a horizontal one",
     )
 
     @model_validator(mode="before")
@@ -142,26 +161,36 @@ class RandomVector(Frozen):
 
     def numbers(self, frame: str) -> list[float]:
         """Numbers in the order of ``VECTOR``; ``frame`` holds if none is given."""
-        direction = np.zeros(3) if self.direction is None else np.array(self.direction) / np.linalg.norm(self.direction)
+        direction = (
+            np.zeros(3)
+            if self.direction is None
+            else np.array(self.direction) / np.linalg.norm(self.direction)
+        )
         marks = float(self.unit == "weight"), float((self.frame or frame) == "body")
         return [*self.magnitude.numbers(), *marks, *direction, *self.axes]
 
 
 class Gusts(Frozen):
-    """A force, or velocity of the air, that wanders: an Ornstein-Uhlenbeck process of each component in the world frame.
+    """A force, or velocity of the air, that wanders: an Ornstein-Uhlenbeck process of each
+    component in the world frame.
 
-    Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930); the update of D. T. Gillespie,
-    "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E 54, 1996), but that what comes to a gust in a
-    control step is no normal number, only as wide as one: their sums are normal, over a time constant of many steps. The first
-    gust of an episode is normal, too; deviation and time constant are exact, whatever the control step. It is what
+    Uhlenbeck and Ornstein, "On the theory of the Brownian motion" (Phys. Rev. 36, 1930); the update
+    of D. T. Gillespie, "Exact numerical simulation of the Ornstein-Uhlenbeck process" (Phys. Rev. E
+    54, 1996), but that what comes to a gust in a control step is no normal number, only as wide as
+    one: their sums are normal, over a time constant of many steps. The first gust of an episode is
+    normal, too; deviation and time constant are exact, whatever the control step. It is what
     MIL-F-8785C's Dryden model has along the flight path, with the time constant L / V.
     """
 
     std: NonNegativeRange = Field(
         description="standard deviation of each component, N or as unit says, of wind m/s; sampled per episode"
     )
-    unit: Literal["SI", "weight"] = Field(default="SI", description="weight: in weights m g of the vehicle")
-    time_constant: PositiveFloat = Field(default=1.0, le=1e6, description="after which a gust has faded to 1/e, s")
+    unit: Literal["SI", "weight"] = Field(
+        default="SI", description="weight: in weights m g of the vehicle"
+    )
+    time_constant: PositiveFloat = Field(
+        default=1.0, le=1e6, description="after which a gust has faded to 1/e, s"
+    )
 
     @model_validator(mode="after")
     def _of_a_quadcopter(self) -> "Gusts":
@@ -170,47 +199,84 @@ class Gusts(Frozen):
 
 
 class Randomization(Frozen):
-    """What is random in each episode, sampled from the row's own stream when it begins; what is left out is not random.
+    """What is random in each episode, sampled from the row's own stream when it begins; what is
+    left out is not random.
 
-    Factors multiply the vehicle's own parameters and are log-uniform unless they say otherwise. Motors and their limits in N
-    stay what they are, so action 0 gives the thrust that the vehicle hovers with before it is randomised.
+    Factors multiply the vehicle's own parameters and are log-uniform unless they say otherwise.
+    Motors and their limits in N stay what they are, so action 0 gives the thrust that the vehicle
+    hovers with before it is randomised.
     """
 
-    share: Share = Field(default=1.0, description="share of the episodes whose vehicle is randomised")
-    mass: Factor | None = Field(default=None, description="factor, such as [0.8, 1.25]; the thrusts in N stay")
+    share: Share = Field(
+        default=1.0, description="share of the episodes whose vehicle is randomised"
+    )
+    mass: Factor | None = Field(
+        default=None, description="factor, such as [0.8, 1.25]; the thrusts in N stay"
+    )
     inertia: Factor | None = Field(
-        default=None, description="factor, of Ixx, Iyy and Izz each; none exceeds the sum of the other two"
+        default=None,
+        description="factor, of Ixx, Iyy and Izz each; none exceeds the sum of the other two",
     )
     motor_gain: Factor | None = Field(default=None, description="factor of k_m (Eq. 4.1)")
-    motor_gain_up: Factor | None = Field(default=None, description="another, of rotors that speed up")
-    motor_gain_down: Factor | None = Field(default=None, description="another, of rotors that slow down")
-    thrust: Factor | None = Field(default=None, description="factor of the thrust of a command, as a tired battery has it")
-    arm: Factor | None = Field(default=None, description="factor of the rotors' distances from the centre of mass")
-    center_of_mass: Offset | None = Field(default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]")
+    motor_gain_up: Factor | None = Field(
+        default=None, description="another, of rotors that speed up"
+    )
+    motor_gain_down: Factor | None = Field(
+        default=None, description="another, of rotors that slow down"
+    )
+    thrust: Factor | None = Field(
+        default=None, description="factor of the thrust of a command, as a tired battery has it"
+    )
+    arm: Factor | None = Field(
+        default=None, description="factor of the rotors' distances from the centre of mass"
+    )
+    center_of_mass: Offset | None = Field(
+        default=None, description="its offset in body x and in y, m, such as [-0.01, 0.01]"
+    )
     delay: Range | None = Field(
         default=None,
         description="whole control steps from a command to its effect, such as [0, 3]; log_uniform: short ones more often",
     )
     drag: NonNegativeRange | None = Field(
-        default=None, description="added to the drag along each body axis, in 1/s times the nominal mass, such as [0, 0.5]"
+        default=None,
+        description="added to the drag along each body axis, in 1/s times the nominal mass, such as [0, 0.5]",
     )
-    wrench_share: Share = Field(default=1.0, description="share of the episodes with force, torque, gusts and wind")
-    force: RandomVector | None = Field(default=None, description="a constant force, such as {magnitude: [0, 5]}, N")
-    torque: RandomVector | None = Field(default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, N m")
-    gusts: Gusts | None = Field(default=None, description="a force that wanders, such as {std: [0, 1], time_constant: 1}")
+    wrench_share: Share = Field(
+        default=1.0, description="share of the episodes with force, torque, gusts and wind"
+    )
+    force: RandomVector | None = Field(
+        default=None, description="a constant force, such as {magnitude: [0, 5]}, N"
+    )
+    torque: RandomVector | None = Field(
+        default=None, description="a constant torque, such as {magnitude: [0, 0.1]}, N m"
+    )
+    gusts: Gusts | None = Field(
+        default=None, description="a force that wanders, such as {std: [0, 1], time_constant: 1}"
+    )
     wind: RandomVector | None = Field(
-        default=None, description="a constant velocity of the air, m/s, level unless direction says otherwise; needs drag"
+        default=None,
+        description="a constant velocity of the air, m/s, level unless direction says otherwise; needs drag",
     )
-    wind_gusts: Gusts | None = Field(default=None, description="what comes to it and wanders, such as {std: [0, 1]}, m/s")
+    wind_gusts: Gusts | None = Field(
+        default=None, description="what comes to it and wanders, such as {std: [0, 1]}, m/s"
+    )
 
     @model_validator(mode="after")
     def _possible(self) -> "Randomization":
         limits = self.delay
-        if limits and (limits.low < 0 or limits.high > MAX_DELAY or limits.low % 1 or limits.high % 1):
-            raise ValueError(f"delay [{limits.low:g}, {limits.high:g}]: must be whole control steps of 0 to {MAX_DELAY}")
-        marks = [each.unit for each in (self.wind, self.wind_gusts) if each] + [self.wind and self.wind.frame]
+        if limits and (
+            limits.low < 0 or limits.high > MAX_DELAY or limits.low % 1 or limits.high % 1
+        ):
+            raise ValueError(
+                f"delay [{limits.low:g}, {limits.high:g}]: must be whole control steps of 0 to {MAX_DELAY}"
+            )
+        marks = [each.unit for each in (self.wind, self.wind_gusts) if each] + [
+            self.wind and self.wind.frame
+        ]
         if any(mark not in ("SI", None) for mark in marks):
-            raise ValueError("wind and wind_gusts: leave out unit and frame; they are velocities, m/s, in the world frame")
+            raise ValueError(
+                "wind and wind_gusts: leave out unit and frame; they are velocities, m/s, in the world frame"
+            )
         return self
 
     @property
@@ -244,7 +310,9 @@ class Randomization(Frozen):
         if thrust.low * most <= mass.high:
             raise ConfigError(text.format(mass.high, thrust.low, vehicle.name, f"lift {most:g}"))
         if thrust.high * least > mass.low:
-            raise ConfigError(text.format(mass.low, thrust.high, vehicle.name, f"give at least {least:g}"))
+            raise ConfigError(
+                text.format(mass.low, thrust.high, vehicle.name, f"give at least {least:g}")
+            )
         both, up, down = ((each and each.high) or 1.0 for each in self._motor_gains)
         gain = both * max(vehicle.motor_gain_up * up, vehicle.motor_gain_down * down)
         if gain * vehicle.physics_step > 1.0:
@@ -253,9 +321,22 @@ class Randomization(Frozen):
             )
 
     def numbers(self, control_step: float) -> FloatArray:
-        """What :mod:`.sampling` reads, in the order of ``RANDOMIZATION``; a share of 0 where no vehicle is randomised."""
-        delay = self.delay and self.delay.model_copy(update={"high": self.delay.high + 1.0})  # its whole part is the delay
-        ranges = (self.mass, self.inertia, *self._motor_gains, self.thrust, self.arm, self.center_of_mass, delay, self.drag)
+        """What :mod:`.sampling` reads, in the order of ``RANDOMIZATION``; a share of 0 where no
+        vehicle is randomised.
+        """
+        delay = self.delay and self.delay.model_copy(
+            update={"high": self.delay.high + 1.0}
+        )  # its whole part is the delay
+        ranges = (
+            self.mass,
+            self.inertia,
+            *self._motor_gains,
+            self.thrust,
+            self.arm,
+            self.center_of_mass,
+            delay,
+            self.drag,
+        )
         numbers = [self.share if self.sets_vehicle else 0.0, self.wrench_share]
         for each in ranges:
             numbers += FIXED_NUMBERS if each is None else each.numbers()
@@ -263,7 +344,9 @@ class Randomization(Frozen):
             numbers += [*FIXED_NUMBERS, *[0.0] * 8] if vector is None else vector.numbers(frame)
         by_weight = float(self.gusts is not None and self.gusts.unit == "weight")
         gusts, wind_gusts = (
-            [*each.std.numbers(), math.exp(-control_step / each.time_constant)] if each else [*FIXED_NUMBERS, 0.0]
+            [*each.std.numbers(), math.exp(-control_step / each.time_constant)]
+            if each
+            else [*FIXED_NUMBERS, 0.0]
             for each in (self.gusts, self.wind_gusts)
         )
         return np.array([*numbers, *gusts, by_weight, *wind_gusts])
@@ -276,10 +359,14 @@ def _check_push(numbers: Range, unit: str) -> None:
 
 @compiled
 def between(table, k, u, nominal):
-    """The number that u in (0, 1) stands for in the range at ``table[k : k + 3]``; ``nominal`` if the range is FIXED."""
+    """The number that u in (0, 1) stands for in the range at ``table[k : k + 3]``; ``nominal`` if
+    the range is FIXED.
+    """
     low, high, kind = table[k], table[k + 1], table[k + 2]
     if kind == FIXED:
         return nominal
     if kind == CUBE_ROOT:
         return (low ** (1.0 / 3.0) + (high ** (1.0 / 3.0) - low ** (1.0 / 3.0)) * u) ** 3
-    return low * math.exp(u * math.log(high / low)) if kind == LOG_UNIFORM else low + (high - low) * u
+    return (
+        low * math.exp(u * math.log(high / low)) if kind == LOG_UNIFORM else low + (high - low) * u
+    )

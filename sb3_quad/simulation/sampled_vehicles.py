@@ -10,20 +10,28 @@ from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 
-def sample_vehicles(vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle = "itm") -> list[Vehicle]:
+def sample_vehicles(
+    vehicles: Any, n: int, seed: int = 0, vehicle: str | Vehicle = "itm"
+) -> list[Vehicle]:
     """n vehicles of a distribution, such as ``sample_vehicles("raptor", 1000)``.
 
-    :param vehicles: a name, a path, a :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution` or its fields.
+    :param vehicles: a name, a path, a
+        :class:`~sb3_quad.simulation.vehicle_distribution.VehicleDistribution` or its fields.
     :param seed: vehicle i is that of the first episode of row i in environments of this seed.
     :param vehicle: the base vehicle, which says what the distribution does not.
-    :raises ConfigError: an unknown name or field, or a value that does not fit; or some of them could not fly.
+    :raises ConfigError: an unknown name or field, or a value that does not fit; or some of them
+        could not fly.
     """
     base, distribution = load_vehicle(vehicle), validate(VehicleDistribution, vehicles, "vehicles")
     batch = QuadcopterBatch(n, FlightSettings(vehicles=distribution, vehicle=base), seed)
     batch.reset()
     found = []
     for number, column in enumerate(batch.vehicles.T):
-        hover, middle, half = column[P.hover_thrust], column[P.thrust_middle], column[P.thrust_half_range]
+        hover, middle, half = (
+            column[P.hover_thrust],
+            column[P.thrust_middle],
+            column[P.thrust_half_range],
+        )
         roll, pitch = column[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4)
         changes = {
             "name": f"sampled_{seed}_{number}",

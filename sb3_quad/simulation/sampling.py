@@ -6,20 +6,34 @@ import numpy as np
 
 from sb3_quad.simulation.compiled import compiled
 from sb3_quad.simulation.observation import GUST_WORDS
-from sb3_quad.simulation.random import EPISODE, EPISODE_START, GUST, PUSH, STEP, VEHICLE, WIND, uniforms
+from sb3_quad.simulation.random import (
+    EPISODE,
+    EPISODE_START,
+    GUST,
+    PUSH,
+    STEP,
+    VEHICLE,
+    WIND,
+    uniforms,
+)
 from sb3_quad.simulation.randomization import FIXED, FIXED_NUMBERS, R, V, between
 from sb3_quad.simulation.state import P, W, X, first_rows, row_slices
 from sb3_quad.simulation.tasks import T
 from sb3_quad.simulation.vehicle_distribution import arm_length, sample_from_distribution
 
 GUSTS = {"value": 3, "keeps": 1, "adds": 1}
-"""Of each row: the present gust, world frame, N or m/s; the share left after a control step; the spread of what is added."""
+"""Of each row: the present gust, world frame, N or m/s; the share left after a control step; the
+spread of what is added.
+"""
 GUST_SIZE = sum(GUSTS.values())
 GUST_VALUE = row_slices(GUSTS)["value"]
 G = first_rows(GUSTS)
 TURN = 2.0 * math.pi
 _SEVEN = np.uint64(127)
-_SUM_MEAN, _SUM_STD = 3 * 127 / 2, math.sqrt(3 * (128**2 - 1) / 12)  # of three whole numbers, uniform from 0 to 127
+_SUM_MEAN, _SUM_STD = (
+    3 * 127 / 2,
+    math.sqrt(3 * (128**2 - 1) / 12),
+)  # of three whole numbers, uniform from 0 to 127
 
 
 @compiled
@@ -31,7 +45,8 @@ def count_episode(i, streams):
 
 @compiled
 def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights):
-    """Begin the episode that row i's stream has come to, in place: a task, state and target sampled from it.
+    """Begin the episode that row i's stream has come to, in place: a task, state and target sampled
+    from it.
 
     Targets are never below ground.
 
@@ -40,7 +55,8 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     :param streams: uint32 (4, n), see :mod:`.random`.
     :param task_index: int64 (n,), the sampled row of the table of tasks.
     :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) for all rows.
-    :param tasks: float64 (K, columns), :meth:`sb3_quad.simulation.tasks.Task.parameters` of each task.
+    :param tasks: float64 (K, columns), :meth:`sb3_quad.simulation.tasks.Task.parameters` of each
+        task.
     :param weights: float64 (K,), cumulative.
     """
     u = uniforms(streams, i, 7, EPISODE_START)
@@ -54,7 +70,8 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
 
     nearest = tasks[k, T.nearest_target]
     distance = nearest + (tasks[k, T.target_distance] - nearest) * u[12]
-    # A uniform direction has a uniform height (Archimedes): cut it where the target would lie too close to the ground.
+    # A uniform direction has a uniform height (Archimedes): cut it where the target would lie too
+    # close to the ground.
     ground = vehicles[P.collision_radius, column] + tasks[k, T.target_clearance]
     lowest = min(max(-1.0, (ground - z) / distance), 1.0) if distance > 0.0 else -1.0
     up = lowest + (1.0 - lowest) * height
@@ -68,7 +85,12 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
     qw, qx, qy, qz = 1.0, 0.0, 0.0, 0.0
     if tasks[k, T.random_attitude] != 0.0:  # uniform on SO(3) (Shoemake)
         a, b, alpha, beta = math.sqrt(1.0 - u[3]), math.sqrt(u[3]), TURN * u[4], TURN * u[5]
-        qw, qx, qy, qz = b * math.cos(beta), a * math.sin(alpha), a * math.cos(alpha), b * math.sin(beta)
+        qw, qx, qy, qz = (
+            b * math.cos(beta),
+            a * math.sin(alpha),
+            a * math.cos(alpha),
+            b * math.sin(beta),
+        )
     state[X.quaternion, i], state[X.quaternion + 1, i] = qw, qx
     state[X.quaternion + 2, i], state[X.quaternion + 3, i] = qy, qz
     spin = math.hypot(tasks[k, T.body_rates_std], tasks[k, T.hit_rates_std])
@@ -85,12 +107,14 @@ def start_episode(i, state, queue, streams, task_index, vehicles, tasks, weights
 
 @compiled
 def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust, wind, wind_gust):
-    """The vehicle, the constant wrench and wind, and the first gusts of row i's episode, in place; the rest stays as it is.
+    """The vehicle, the constant wrench and wind, and the first gusts of row i's episode, in place;
+    the rest stays as it is.
 
     :param base: float64 (len(PARAMETER_NAMES), n or 1), the vehicles before anything is random.
     :param distribution: :meth:`.VehicleDistribution.numbers`.
     :param table: :meth:`.Randomization.numbers`.
-    :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) if one serves all rows.
+    :param vehicles: float64 (len(PARAMETER_NAMES), n), or (len(PARAMETER_NAMES), 1) if one serves
+        all rows.
     :param wrench: float64 (WRENCH_SIZE, n).
     :param gust: float64 (GUST_SIZE, n), or (GUST_SIZE, 0) without gusts; ``wind_gust`` likewise.
     :param wind: float64 (3, n).
@@ -102,14 +126,19 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
         sample_from_distribution(i, streams, distribution, vehicles)
     # Forces in weights are those of the vehicle before it is randomised.
     column, u = min(i, vehicles.shape[1] - 1), uniforms(streams, i, 4, PUSH)
-    is_pushed, weight = u[0] < table[R.wrench_share], vehicles[P.mass, column] * vehicles[P.gravity, column]
+    is_pushed, weight = (
+        u[0] < table[R.wrench_share],
+        vehicles[P.mass, column] * vehicles[P.gravity, column],
+    )
     if table[R.force + 2] != FIXED or table[R.torque + 2] != FIXED:
         for k in range(wrench.shape[0]):
             wrench[k, i] = 0.0
         if is_pushed:
             moment = weight * arm_length(column, vehicles)
             _push(table, R.force, u[1], u[2], u[3], weight, wrench, W.force_world, W.force_body, i)
-            _push(table, R.torque, u[4], u[5], u[6], moment, wrench, W.torque_world, W.torque_body, i)
+            _push(
+                table, R.torque, u[4], u[5], u[6], moment, wrench, W.torque_world, W.torque_body, i
+            )
     if gust.shape[1] > 0:
         unit = weight if table[R.gust_by_weight] != 0.0 else 1.0
         _begin_gusts(i, table, R.gust_std, unit * is_pushed, uniforms(streams, i, 4, GUST), gust)
@@ -121,13 +150,19 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
 
 @compiled
 def _push(table, k, length, height, azimuth, unit, wrench, world, body, i):
-    """Write a constant vector, whose numbers begin at ``k``, to its rows of a wrench or wind; ``unit``: of a weight, SI."""
+    """Write a constant vector, whose numbers begin at ``k``, to its rows of a wrench or wind;
+    ``unit``: of a weight, SI.
+    """
     size = between(table, k, length, 0.0)
     if table[k + V.by_weight] != 0.0:
         size *= unit
     up = 2.0 * height - 1.0
     across = math.sqrt(max(0.0, 1.0 - up * up))
-    x, y, z = across * math.cos(2.0 * math.pi * azimuth), across * math.sin(2.0 * math.pi * azimuth), up
+    x, y, z = (
+        across * math.cos(2.0 * math.pi * azimuth),
+        across * math.sin(2.0 * math.pi * azimuth),
+        up,
+    )
     to = k + V.direction
     if table[to] != 0.0 or table[to + 1] != 0.0 or table[to + 2] != 0.0:
         x, y, z = table[to], table[to + 1], table[to + 2]
@@ -165,12 +200,16 @@ def _randomize_vehicle(i, streams, table, vehicles):
         vehicles[P.roll_arm_0 + rotor, i] = arm * vehicles[P.roll_arm_0 + rotor, i] - y
         vehicles[P.pitch_arm_0 + rotor, i] = arm * vehicles[P.pitch_arm_0 + rotor, i] + x
     if table[R.delay + 2] != FIXED:
-        vehicles[P.delay, i] = min(math.floor(between(table, R.delay, u[10], 0.0)), table[R.delay + 1] - 1.0)
+        vehicles[P.delay, i] = min(
+            math.floor(between(table, R.delay, u[10], 0.0)), table[R.delay + 1] - 1.0
+        )
 
 
 @compiled
 def _begin_wind(i, streams, table, is_pushed, wind, wind_gust):
-    """The constant wind of row i's episode, level unless its direction is given, and the first of its gusts, in place."""
+    """The constant wind of row i's episode, level unless its direction is given, and the first of
+    its gusts, in place.
+    """
     u = uniforms(streams, i, 5, WIND)
     if table[R.wind + 2] != FIXED:
         for axis in range(3):
@@ -183,7 +222,9 @@ def _begin_wind(i, streams, table, is_pushed, wind, wind_gust):
 
 @compiled
 def _begin_gusts(i, table, k, unit, u, gust):
-    """How row i's gusts are in its episode, and the first, in place; their numbers begin at ``k``, ``u`` is eight uniforms."""
+    """How row i's gusts are in its episode, and the first, in place; their numbers begin at ``k``,
+    ``u`` is eight uniforms.
+    """
     std, keeps = unit * between(table, k, u[0], 0.0), table[k + len(FIXED_NUMBERS)]
     gust[G.keeps, i], gust[G.adds, i] = keeps, std * math.sqrt(1.0 - keeps * keeps)
     for axis in range(3):  # stationary from the start; two normals from two uniforms (Box-Muller)
@@ -203,15 +244,23 @@ def add_gusts(to, gust, first, count):
 def advance_gusts(b, gust, first, count):
     """Advance the gusts of a block by a control step, in place, by two random words of each lane.
 
-    What is added to a component is the sum of three numbers of seven bits each, scaled. A gust's time constant is many
-    control steps, so the sum of what was added is normal.
+    What is added to a component is the sum of three numbers of seven bits each, scaled. A gust's
+    time constant is many control steps, so the sum of what was added is normal.
     """
     word = b.word
     for lane in range(count):
         i = first + lane
-        bits = np.uint64(word[GUST_WORDS, lane]) | np.uint64(word[GUST_WORDS + 1, lane]) << np.uint64(32)
+        bits = np.uint64(word[GUST_WORDS, lane]) | np.uint64(
+            word[GUST_WORDS + 1, lane]
+        ) << np.uint64(32)
         for axis in range(3):
             part = bits >> np.uint64(21 * axis)
-            added = np.float64(np.int64((part & _SEVEN) + (part >> np.uint64(7) & _SEVEN) + (part >> np.uint64(14) & _SEVEN)))
+            added = np.float64(
+                np.int64(
+                    (part & _SEVEN)
+                    + (part >> np.uint64(7) & _SEVEN)
+                    + (part >> np.uint64(14) & _SEVEN)
+                )
+            )
             kept = gust[G.keeps, i] * gust[G.value + axis, i]
             gust[G.value + axis, i] = kept + gust[G.adds, i] * ((added - _SUM_MEAN) / _SUM_STD)

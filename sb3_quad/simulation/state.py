@@ -1,11 +1,11 @@
 """The true state of n quadcopters, the wrench that acts on them, and how both lie in memory.
 
-One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle per column, so that
-compiled loops over vehicles run over neighbouring numbers. The order of the rows is that of :data:`STATE`;
-:class:`QuadcopterState` says what they are.
+One float64 array of shape ``(STATE_SIZE, n)`` holds n vehicles, a quantity per row and a vehicle
+per column, so that compiled loops over vehicles run over neighbouring numbers. The order of the
+rows is that of :data:`STATE`; :class:`QuadcopterState` says what they are.
 
-A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N), ``torque_world`` and ``torque_body`` (N m),
-three rows each, all at the centre of mass.
+A wrench is a ``(WRENCH_SIZE, n)`` array: ``force_world`` and ``force_body`` (N), ``torque_world``
+and ``torque_body`` (N m), three rows each, all at the centre of mass.
 """
 
 from collections import namedtuple
@@ -37,10 +37,20 @@ def first_rows(sizes: Mapping[str, int]) -> Any:
 
 def row_slices(sizes: Mapping[str, int]) -> dict[str, slice]:
     """The rows of each quantity, by its name."""
-    return {name: slice(start, start + sizes[name]) for name, start in first_rows(sizes)._asdict().items()}
+    return {
+        name: slice(start, start + sizes[name])
+        for name, start in first_rows(sizes)._asdict().items()
+    }
 
 
-STATE = {"position": 3, "quaternion": 4, "velocity": 3, "body_rates": 3, "rotor_speeds": 4, "target": 3}
+STATE = {
+    "position": 3,
+    "quaternion": 4,
+    "velocity": 3,
+    "body_rates": 3,
+    "rotor_speeds": 4,
+    "target": 3,
+}
 STATE_SIZE = sum(STATE.values())
 POSITION, QUATERNION, VELOCITY, BODY_RATES, ROTOR_SPEEDS, TARGET = row_slices(STATE).values()
 
@@ -58,11 +68,14 @@ P = first_rows(dict.fromkeys(PARAMETER_NAMES, 1))  # of a vehicle's parameters
 class QuadcopterState:
     """Read access to the true state of n vehicles; what an expert is given.
 
-    :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The properties are views
-        of it with one vehicle per row, so they show later changes: copy what must last.
-    :param vehicles: the true parameters of the vehicles, float64 ``(len(PARAMETER_NAMES), n)``, their rows in the
-        order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None: unknown.
-    :param wrench: what pushes them, float64 ``(WRENCH_SIZE, n)``, its rows in the order of :data:`WRENCH`; None: unknown.
+    :param array: float64 of shape ``(STATE_SIZE, n)``, its rows in the order of :data:`STATE`. The
+        properties are views of it with one vehicle per row, so they show later changes: copy what
+        must last.
+    :param vehicles: the true parameters of the vehicles, float64 ``(len(PARAMETER_NAMES), n)``,
+        their rows in the order of :data:`~sb3_quad.vehicles.vehicle.PARAMETER_NAMES`; None:
+        unknown.
+    :param wrench: what pushes them, float64 ``(WRENCH_SIZE, n)``, its rows in the order of
+        :data:`WRENCH`; None: unknown.
     """
 
     array: FloatArray
@@ -124,7 +137,9 @@ class QuadcopterState:
         return self._each(lambda part: part[:, rows])
 
     def _each(self, change: Callable[[FloatArray], FloatArray]) -> "QuadcopterState":
-        vehicles, wrench = (None if part is None else change(part) for part in (self.vehicles, self.wrench))
+        vehicles, wrench = (
+            None if part is None else change(part) for part in (self.vehicles, self.wrench)
+        )
         return QuadcopterState(change(self.array), vehicles, wrench)
 
     @staticmethod
@@ -136,7 +151,11 @@ class QuadcopterState:
             return np.concatenate(known, axis=1) if len(known) == len(states) else None
 
         array = np.concatenate([state.array for state in states], axis=1)
-        return QuadcopterState(array, joined([each.vehicles for each in states]), joined([each.wrench for each in states]))
+        return QuadcopterState(
+            array,
+            joined([each.vehicles for each in states]),
+            joined([each.wrench for each in states]),
+        )
 
 
 def rotation_matrices(quaternions: FloatArray) -> FloatArray:
@@ -145,7 +164,8 @@ def rotation_matrices(quaternions: FloatArray) -> FloatArray:
 
 
 def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> FloatArray:
-    """Drag of n vehicles, (3, n), world frame, N: -R diag(d) Rᵀ (v - wind) (Faessler, Franchi and Scaramuzza, RA-L 2018).
+    """Drag of n vehicles, (3, n), world frame, N: -R diag(d) Rᵀ (v - wind) (Faessler, Franchi and
+    Scaramuzza, RA-L 2018).
 
     :param state: (STATE_SIZE, n).
     :param vehicles: parameters, (len(PARAMETER_NAMES), n).
@@ -156,11 +176,14 @@ def drag_forces(state: FloatArray, vehicles: FloatArray, wind: FloatArray) -> Fl
     return np.asarray(-np.einsum("nij,jn->in", rotation, in_body))
 
 
-def make_wrench(force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body") -> FloatArray:
+def make_wrench(
+    force: FloatArray, torque: FloatArray, force_frame: str = "world", torque_frame: str = "body"
+) -> FloatArray:
     """The wrench of n vehicles, (WRENCH_SIZE, n).
 
     :param force: (n, 3), N; ``torque`` (n, 3), N m; both at the centre of mass.
-    :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of ``torque``.
+    :param force_frame: ``"world"`` or ``"body"``, the axes of ``force``; ``torque_frame`` those of
+        ``torque``.
     :raises ConfigError: another frame.
     """
     wrench = np.zeros((WRENCH_SIZE, len(force)))

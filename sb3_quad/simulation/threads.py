@@ -1,7 +1,8 @@
 """Threads that share a compiled function's work in chunks.
 
-Whoever comes takes the next chunk: a thread that is late, or never comes, costs time but changes nothing. Numba's own pools do
-not suit: one spins between calls and fights torch for the cores, and forbids fork.
+Whoever comes takes the next chunk: a thread that is late, or never comes, costs time but changes
+nothing. Numba's own pools do not suit: one spins between calls and fights torch for the cores, and
+forbids fork.
 """
 
 import os
@@ -14,15 +15,23 @@ import numpy as np
 
 from sb3_quad.simulation.compiled import atomic_add, compiled, give_way
 
-LEFT, DONE, LATE, CONTROL = 0, 16, 32, 48  # places in a control array, each on a cache line of its own, and its size
-SPIN = 20_000  # looks at a chunk that another thread still has, before that gets the core: some 30 microseconds
+LEFT, DONE, LATE, CONTROL = (
+    0,
+    16,
+    32,
+    48,
+)  # places in a control array, each on a cache line of its own, and its size
+# Looks at a chunk that another thread still has, before that gets the core: some 30 microseconds
+SPIN = 20_000
 PATIENCE = 5_000  # looks after that, with which the call counts as late: longer than a chunk takes
 REST = 100  # calls without other threads after a late one: their core is busy with something else
 
 
 @compiled
 def finish(control, chunks):
-    """Wait for the chunks that other threads still have, and note in ``control[LATE]`` whether one has lost its core."""
+    """Wait for the chunks that other threads still have, and note in ``control[LATE]`` whether one
+    has lost its core.
+    """
     looks = 0
     while atomic_add(control, DONE, 0) < chunks:
         looks += 1
@@ -49,11 +58,13 @@ _pool = _Pool()
 
 
 def share_out(function: Callable[..., Any], helpers: int, *arguments: Any) -> Any:
-    """``function(control, True, *arguments)``, while up to so many threads call it with False; what it returns here.
+    """``function(control, True, *arguments)``, while up to so many threads call it with False; what
+    it returns here.
 
-    :param function: a compiled one. With True it sets ``control[LEFT]`` to the number of chunks first, and at its end calls
-        :func:`finish`. In all threads it takes chunks by ``atomic_add(control, LEFT, -1)`` and counts those done in
-        ``control[DONE]``. It is one call, since an interrupt, which Python sees to between two calls, must leave nothing half
+    :param function: a compiled one. With True it sets ``control[LEFT]`` to the number of chunks
+        first, and at its end calls :func:`finish`. In all threads it takes chunks by
+        ``atomic_add(control, LEFT, -1)`` and counts those done in ``control[DONE]``. It is one
+        call, since an interrupt, which Python sees to between two calls, must leave nothing half
         done.
     """
     pool, control = _pool, np.zeros(CONTROL, np.int64)

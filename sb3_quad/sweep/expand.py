@@ -1,4 +1,6 @@
-"""From a sweep to its runs: every configuration that its grid and list stand for, by every seed, each checked."""
+"""From a sweep to its runs: every configuration that its grid and list stand for, by every seed,
+each checked.
+"""
 
 import copy
 import itertools
@@ -19,7 +21,14 @@ from sb3_quad.evaluation.scenarios.load import load_suite
 from sb3_quad.evaluation.scenarios.scenario import Suite
 from sb3_quad.sweep.spec import MAX_RUNS, Configuration, SweepSpec
 from sb3_quad.training.options import RunOptions, SettingsOptions
-from sb3_quad.training.pipeline import Pipeline, Stage, is_pipeline, load_pipeline, stage_jobs, with_settings
+from sb3_quad.training.pipeline import (
+    Pipeline,
+    Stage,
+    is_pipeline,
+    load_pipeline,
+    stage_jobs,
+    with_settings,
+)
 from sb3_quad.vehicles.vehicle import first_vehicle
 
 NAMED_ALONE = ("algo", "env", "conf_file", "vehicle", "expert")  # whose value says enough
@@ -32,8 +41,12 @@ class Run(Frozen):
     name: str = Field(description="configuration/seed_k: its folder under runs/")
     configuration: str
     seed: int
-    job: dict[str, Any] = Field(description="arguments of TrainingJob, less config, seed and log_folder")
-    stages: tuple[Stage, ...] = Field(description="of its pipeline, with all their settings; a single run is one of one stage")
+    job: dict[str, Any] = Field(
+        description="arguments of TrainingJob, less config, seed and log_folder"
+    )
+    stages: tuple[Stage, ...] = Field(
+        description="of its pipeline, with all their settings; a single run is one of one stage"
+    )
     gym_packages: tuple[str, ...] = ()
 
     @property
@@ -45,22 +58,37 @@ class Run(Frozen):
 def expand(spec: SweepSpec) -> list[Run]:
     """The runs of a sweep, the seeds of a configuration one after another.
 
-    :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm, two configurations that
-        are called alike, too many runs.
+    :raises ConfigError: an empty grid, an unknown key, a setting that does not fit its algorithm,
+        two configurations that are called alike, too many runs.
     """
     runs: dict[str, list[Run]] = {}
     for varied, data in _cells(spec):
-        configuration = validate(Configuration, data, f"configuration {_name(varied)!r}" if varied else "sweep")
-        file = Path(configuration.conf_file).with_suffix("").as_posix() if configuration.conf_file else ""
-        called = configuration.name or _name(varied) or "-".join(filter(None, [configuration.algo, file]))
+        configuration = validate(
+            Configuration, data, f"configuration {_name(varied)!r}" if varied else "sweep"
+        )
+        file = (
+            Path(configuration.conf_file).with_suffix("").as_posix()
+            if configuration.conf_file
+            else ""
+        )
+        called = (
+            configuration.name
+            or _name(varied)
+            or "-".join(filter(None, [configuration.algo, file]))
+        )
         name = re.sub(r"[^A-Za-z0-9_.=,+-]+", "-", called).strip("-.,")[:LONGEST] or "run"
         if name in runs:
-            raise ConfigError(f"two configurations are called {name!r}; give them names, or values that differ")
+            raise ConfigError(
+                f"two configurations are called {name!r}; give them names, or values that differ"
+            )
         try:
             run = _run(configuration, name, spec.gym_packages)
         except ConfigError as error:
             raise ConfigError(f"configuration {name!r}: {error}") from None
-        runs[name] = [run.model_copy(update={"name": f"{name}/seed_{seed}", "seed": seed}) for seed in spec.seed]
+        runs[name] = [
+            run.model_copy(update={"name": f"{name}/seed_{seed}", "seed": seed})
+            for seed in spec.seed
+        ]
     return [*itertools.chain.from_iterable(runs.values())]
 
 
@@ -79,7 +107,9 @@ def _cells(spec: SweepSpec) -> list[tuple[dict[str, Any], dict[str, Any]]]:
     for key, values in spec.grid.items():
         if not isinstance(values, list) or not values:
             raise ConfigError(f"grid: {key}: must be a list of at least one value, not {values!r}")
-    count = math.prod(map(len, spec.grid.values())) * max(1, len(spec.configurations)) * len(spec.seed)
+    count = (
+        math.prod(map(len, spec.grid.values())) * max(1, len(spec.configurations)) * len(spec.seed)
+    )
     if count > MAX_RUNS:
         raise ConfigError(f"the sweep has {count:,} runs, at most {MAX_RUNS:,} are allowed")
     found = []
@@ -111,7 +141,10 @@ def _run(configuration: Configuration, name: str, gym_packages: tuple[str, ...])
     given = configuration.given
     if configuration.vehicle is not None:
         given["env_kwargs"] = {**(configuration.env_kwargs or {}), "vehicle": configuration.vehicle}
-    changes = {**configuration.hyperparams, **{key: given[key] for key in SettingsOptions.model_fields if key in given}}
+    changes = {
+        **configuration.hyperparams,
+        **{key: given[key] for key in SettingsOptions.model_fields if key in given},
+    }
     if "trained_agent" in given:
         named, given["trained_agent"] = given["trained_agent"], agent_path(given["trained_agent"])
         if not Path(given["trained_agent"]).is_file():
@@ -121,20 +154,35 @@ def _run(configuration: Configuration, name: str, gym_packages: tuple[str, ...])
     if file is not None and is_pipeline(file):
         for key in ("algo", "env", "n_timesteps", "trained_agent"):
             if key in given:
-                raise ConfigError(f"{key} goes with a single run; the stages of a pipeline have their own in {file}")
+                raise ConfigError(
+                    f"{key} goes with a single run; the stages of a pipeline have their own in {file}"
+                )
         pipeline = with_settings(load_pipeline(file), changes)
     else:
         algo, env = configuration.algo, configuration.env
         if algo is None or env is None:
             missing = "algo" if algo is None else "env"
-            raise ConfigError(f"{missing} is missing; give algo and env, or a conf_file with the stages of a pipeline")
-        pipeline = Pipeline(stages=(Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes),))
+            raise ConfigError(
+                f"{missing} is missing; give algo and env, or a conf_file with the stages of a pipeline"
+            )
+        pipeline = Pipeline(
+            stages=(Stage(name=algo, algo=algo, env=env, conf_file=file, settings=changes),)
+        )
     stages = []
     for stage, planned in zip(pipeline.stages, stage_jobs(pipeline, job), strict=True):
         if planned.config.task is not None:
             first_vehicle(planned.flight_settings.vehicle)
-        stages.append(stage.model_copy(update={"conf_file": None, "settings": planned.config.settings}))
-    return Run(name=name, configuration=name, seed=0, job=job, stages=tuple(stages), gym_packages=gym_packages)
+        stages.append(
+            stage.model_copy(update={"conf_file": None, "settings": planned.config.settings})
+        )
+    return Run(
+        name=name,
+        configuration=name,
+        seed=0,
+        job=job,
+        stages=tuple(stages),
+        gym_packages=gym_packages,
+    )
 
 
 def _name(varied: Mapping[str, Any]) -> str:

@@ -2,10 +2,12 @@
 
 A sweep's folder holds
 
-- ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Plan`: its runs with all their settings;
+- ``sweep.yaml``, what was asked for; ``plan.json``, a :class:`Plan`: its runs with all their
+  settings;
 - ``runs/<configuration>/seed_<k>/``, folders as ``train`` leaves them;
 - ``records/<configuration>/seed_<k>.json``, a :class:`RunRecord` of each run that ended;
-- ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was measured.
+- ``results.csv``, ``results.json``, ``report.md``, ``report.html``, ``figures/``: what was
+  measured.
 """
 
 from collections.abc import Sequence
@@ -41,9 +43,13 @@ class RunRecord(Frozen):
     agent: str = Field(default="", description="the zip that flew, relative to the run's folder")
     weights: str = Field(default="", description="SHA-256 of that agent's parameters")
     timesteps: int = 0
-    seconds: float = Field(default=0.0, description="wall-clock time of the training; of a run that was resumed, since then")
+    seconds: float = Field(
+        default=0.0,
+        description="wall-clock time of the training; of a run that was resumed, since then",
+    )
     flights: dict[str, dict[str, Numbers]] = Field(
-        default={}, description="by scenario and measure, a number for each episode, the same episodes in every run"
+        default={},
+        description="by scenario and measure, a number for each episode, the same episodes in every run",
     )
 
 
@@ -83,7 +89,9 @@ class SweepFolder:
         return read_record(self.plan, Plan)
 
     def run(self, run: Run) -> Path:
-        """The folder of a run, absolute: what is written in it names files that are looked for from anywhere."""
+        """The folder of a run, absolute: what is written in it names files that are looked for from
+        anywhere.
+        """
         return self.path.absolute() / "runs" / run.name
 
     def add(self, record: RunRecord) -> None:
@@ -92,7 +100,11 @@ class SweepFolder:
 
     def records(self, runs: Sequence[Run]) -> dict[str, RunRecord]:
         """The records of those runs that ended, by name."""
-        return {run.name: read_record(self._record(run.name), RunRecord) for run in runs if self._record(run.name).is_file()}
+        return {
+            run.name: read_record(self._record(run.name), RunRecord)
+            for run in runs
+            if self._record(run.name).is_file()
+        }
 
     def _record(self, name: str) -> Path:
         return self.path / "records" / f"{name}.json"

@@ -1,9 +1,11 @@
-"""What a sweep found: ``results.csv``, ``results.json``, and the tables that the terminal and the page show.
+"""What a sweep found: ``results.csv``, ``results.json``, and the tables that the terminal and the
+page show.
 
-Intervals are bootstraps over seeds and episodes. A resample takes as many seeds as there are, with replacement, and as many
-episodes; the episodes are the same in every run, so that seeds and episodes are crossed (Owen, The pigeonhole bootstrap,
-Annals of Applied Statistics 1, 2007). Few seeds give intervals that are too narrow (Agarwal et al., Deep Reinforcement
-Learning at the Edge of the Statistical Precipice, NeurIPS 2021): with one they tell of episodes alone.
+Intervals are bootstraps over seeds and episodes. A resample takes as many seeds as there are, with
+replacement, and as many episodes; the episodes are the same in every run, so that seeds and
+episodes are crossed (Owen, The pigeonhole bootstrap, Annals of Applied Statistics 1, 2007). Few
+seeds give intervals that are too narrow (Agarwal et al., Deep Reinforcement Learning at the Edge of
+the Statistical Precipice, NeurIPS 2021): with one they tell of episodes alone.
 """
 
 import itertools
@@ -26,7 +28,17 @@ from sb3_quad.evaluation.tables import Cell, Column, Row, Table
 from sb3_quad.report.curves import plot_curves
 from sb3_quad.report.page import Section, write_page
 from sb3_quad.report.plots import Plot
-from sb3_quad.sweep.folder import ERROR, MEASURES, REWARD, SUCCESS, SURVIVAL, TIME, Plan, RunRecord, SweepFolder
+from sb3_quad.sweep.folder import (
+    ERROR,
+    MEASURES,
+    REWARD,
+    SUCCESS,
+    SURVIVAL,
+    TIME,
+    Plan,
+    RunRecord,
+    SweepFolder,
+)
 
 ROWS = {  # by measure: its row, factor and decimals
     SUCCESS: (Row("success", "%"), 100.0, 2),
@@ -44,7 +56,8 @@ CAPTION = "means over seeds; in brackets: 95 % intervals, by a bootstrap over se
 class SweepResults:
     """What the finished runs of a sweep reached.
 
-    :param groups: by configuration, its finished runs, in the order of the seeds; only configurations that have any.
+    :param groups: by configuration, its finished runs, in the order of the seeds; only
+        configurations that have any.
     :param estimates: by configuration, scenario and measure; None: not measured.
     :param comparisons: by scenario, measure and pair of configurations, the first less the second.
     """
@@ -68,14 +81,19 @@ def evaluate(plan: Plan, records: Mapping[str, RunRecord]) -> SweepResults:
         if run.name in records and records[run.name].state == "finished":
             groups.setdefault(run.configuration, []).append(records[run.name])
     estimates = {
-        (name, scenario, measure): over_seeds(_matrix(groups[name], scenario, measure), STATISTICS[measure])
+        (name, scenario, measure): over_seeds(
+            _matrix(groups[name], scenario, measure), STATISTICS[measure]
+        )
         for name, scenario, measure in itertools.product(groups, _scenarios(groups), MEASURES)
     }
     return SweepResults(plan, records, groups, estimates, _compare(groups))
 
 
-def over_seeds(values: FloatArray, statistic: Callable[..., FloatArray] = np.nanmean) -> Estimate | None:
-    """The mean over seeds of a statistic of a run's episodes; of the difference of two configurations, a paired bootstrap.
+def over_seeds(
+    values: FloatArray, statistic: Callable[..., FloatArray] = np.nanmean
+) -> Estimate | None:
+    """The mean over seeds of a statistic of a run's episodes; of the difference of two
+    configurations, a paired bootstrap.
 
     :param values: of a measure, (seeds, episodes), NaN where there is none.
     :return: None if a run has no number at all.
@@ -85,20 +103,32 @@ def over_seeds(values: FloatArray, statistic: Callable[..., FloatArray] = np.nan
     random = np.random.default_rng(0)
     seeds, episodes = (random.integers(0, n, (RESAMPLES, n)) for n in values.shape)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a resample may miss the few episodes that have a number
-        runs = np.stack([statistic(row[episodes], axis=1) for row in values], axis=1)  # (resamples, seeds)
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # a resample may miss the few episodes that have a number
+        runs = np.stack(
+            [statistic(row[episodes], axis=1) for row in values], axis=1
+        )  # (resamples, seeds)
         means = np.nanmean(np.take_along_axis(runs, seeds, axis=1), axis=1)
     low, high = np.nanpercentile(means, [2.5, 97.5])
     value = float(statistic(values, axis=1).mean())
-    return Estimate(value=value, low=min(value, float(low)), high=max(value, float(high)), n=values.size)
+    return Estimate(
+        value=value, low=min(value, float(low)), high=max(value, float(high)), n=values.size
+    )
 
 
-def _compare(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, str, str], Estimate]:
+def _compare(
+    groups: Mapping[str, Sequence[RunRecord]],
+) -> dict[tuple[str, str, str, str], Estimate]:
     found = {}
-    for scenario, measure, pair in itertools.product(_scenarios(groups), COMPARED, itertools.combinations(groups, 2)):
+    for scenario, measure, pair in itertools.product(
+        _scenarios(groups), COMPARED, itertools.combinations(groups, 2)
+    ):
         first, second = ({record.seed: record for record in groups[name]} for name in pair)
         common = [seed for seed in first if seed in second]
-        one, two = (_matrix([each[seed] for seed in common], scenario, measure) for each in (first, second))
+        one, two = (
+            _matrix([each[seed] for seed in common], scenario, measure) for each in (first, second)
+        )
         difference = over_seeds(one - two) if common and one.shape == two.shape else None
         if difference is not None:
             found[scenario, measure, pair[0], pair[1]] = difference
@@ -106,7 +136,9 @@ def _compare(groups: Mapping[str, Sequence[RunRecord]]) -> dict[tuple[str, str, 
 
 
 def verdict(difference: Estimate) -> str:
-    """Whether the first of two is better or worse: whether the interval of the difference leaves out zero."""
+    """Whether the first of two is better or worse: whether the interval of the difference leaves
+    out zero.
+    """
     return "better" if difference.low > 0 else "worse" if difference.high < 0 else "cannot tell"
 
 
@@ -116,20 +148,45 @@ def write_results(place: SweepFolder, found: SweepResults) -> None:
     :raises ConfigError: a folder that cannot be written, a full disk.
     """
     records = [found.records[run.name] for run in found.plan.runs if run.name in found.records]
-    columns = ["run", "configuration", "seed", "state", "scenario", "episodes", *MEASURES, "timesteps", "agent", "weights"]
-    write_csv(place.path / "results.csv", [*columns, "message"], (row for record in records for row in _rows(record)))
+    columns = [
+        "run",
+        "configuration",
+        "seed",
+        "state",
+        "scenario",
+        "episodes",
+        *MEASURES,
+        "timesteps",
+        "agent",
+        "weights",
+    ]
+    write_csv(
+        place.path / "results.csv",
+        [*columns, "message"],
+        (row for record in records for row in _rows(record)),
+    )
     content = {
         "sweep": found.plan.spec.name,
         "package_version": __version__,
         "runs": len(found.plan.runs),
         "finished": found.finished,
-        "failed": {name: record.message for name, record in found.records.items() if record.state == "failed"},
+        "failed": {
+            name: record.message
+            for name, record in found.records.items()
+            if record.state == "failed"
+        },
         "configurations": {
             name: {"seeds": [record.seed for record in group], "scenarios": _summary(found, name)}
             for name, group in found.groups.items()
         },
         "comparisons": [
-            {"scenario": scenario, "measure": measure, "first": first, "second": second, "verdict": verdict(difference)}
+            {
+                "scenario": scenario,
+                "measure": measure,
+                "first": first,
+                "second": second,
+                "verdict": verdict(difference),
+            }
             | difference.model_dump()
             for (scenario, measure, first, second), difference in found.comparisons.items()
         ],
@@ -139,45 +196,72 @@ def write_results(place: SweepFolder, found: SweepResults) -> None:
 
 def tables(found: SweepResults) -> dict[str, list[Table]]:
     """By scenario, a column for each configuration; and who is better than whom."""
-    columns = [Column(f"{name} ({len(group)} seed{'s' * (len(group) > 1)})") for name, group in found.groups.items()]
+    columns = [
+        Column(f"{name} ({len(group)} seed{'s' * (len(group) > 1)})")
+        for name, group in found.groups.items()
+    ]
     made: dict[str, list[Table]] = {}
     for scenario in _scenarios(found.groups):
         rows = []
         for measure, (row, _, _) in ROWS.items():
-            cells = [_cell(found.estimates[name, scenario, measure], measure) for name in found.groups]
+            cells = [
+                _cell(found.estimates[name, scenario, measure], measure) for name in found.groups
+            ]
             if any(cell != Cell() for cell in cells):
                 rows.append(Row(row.name, row.unit, cells))
         made[scenario] = [Table(columns, rows, title=scenario, caption=CAPTION)]
         lines = [
-            Row(f"{one} than {two}", ROWS[measure][0].heading, [Cell(words=verdict(difference)), _cell(difference, measure)])
+            Row(
+                f"{one} than {two}",
+                ROWS[measure][0].heading,
+                [Cell(words=verdict(difference)), _cell(difference, measure)],
+            )
             for (where, measure, one, two), difference in found.comparisons.items()
             if where == scenario
         ]
         if lines:
             heads = [Column("is", align="left"), Column("difference")]
             note = "paired bootstrap over the seeds and episodes that both have"
-            made[scenario].append(Table(heads, lines, title=f"{scenario}: better, worse, cannot tell", caption=note))
+            made[scenario].append(
+                Table(heads, lines, title=f"{scenario}: better, worse, cannot tell", caption=note)
+            )
     return made
 
 
 def _scenarios(groups: Mapping[str, Sequence[RunRecord]]) -> list[str]:
     """All scenarios that were flown, in order."""
-    return [*dict.fromkeys(name for group in groups.values() for record in group for name in record.flights)]
+    return [
+        *dict.fromkeys(
+            name for group in groups.values() for record in group for name in record.flights
+        )
+    ]
 
 
 def _matrix(records: Sequence[RunRecord], scenario: str, measure: str) -> FloatArray:
-    """A measure of some runs, (runs, episodes), NaN where there is no number; (runs, 0) if it was not measured."""
-    return np.array([record.flights.get(scenario, {}).get(measure, ()) for record in records], dtype=np.float64)
+    """A measure of some runs, (runs, episodes), NaN where there is no number; (runs, 0) if it was
+    not measured.
+    """
+    return np.array(
+        [record.flights.get(scenario, {}).get(measure, ()) for record in records], dtype=np.float64
+    )
 
 
 def _summary(found: SweepResults, configuration: str) -> dict[str, Any]:
     names = _scenarios({configuration: found.groups[configuration]})
-    estimates = {name: {measure: found.estimates[configuration, name, measure] for measure in MEASURES} for name in names}
-    return {name: {key: each and each.model_dump() for key, each in group.items()} for name, group in estimates.items()}
+    estimates = {
+        name: {measure: found.estimates[configuration, name, measure] for measure in MEASURES}
+        for name in names
+    }
+    return {
+        name: {key: each and each.model_dump() for key, each in group.items()}
+        for name, group in estimates.items()
+    }
 
 
 def _rows(record: RunRecord) -> list[dict[str, Any]]:
-    common = record.model_dump(include={"configuration", "seed", "state", "timesteps", "agent", "weights", "message"})
+    common = record.model_dump(
+        include={"configuration", "seed", "state", "timesteps", "agent", "weights", "message"}
+    )
     common["run"] = record.name
     lines = []
     for scenario, measures in record.flights.items():
@@ -197,8 +281,11 @@ def _cell(estimate: Estimate | None, measure: str) -> Cell:
     return Cell(factor * estimate.value, (factor * estimate.low, factor * estimate.high), decimals)
 
 
-def write_report(place: SweepFolder, found: SweepResults, shown: Mapping[str, Sequence[Table]]) -> Path:
-    """Write the report of a sweep's finished runs: a section for each scenario and the learning curves.
+def write_report(
+    place: SweepFolder, found: SweepResults, shown: Mapping[str, Sequence[Table]]
+) -> Path:
+    """Write the report of a sweep's finished runs: a section for each scenario and the learning
+    curves.
 
     :param shown: the tables of :func:`~sb3_quad.sweep.results.tables`, by scenario.
     :return: the page.
@@ -210,14 +297,18 @@ def write_report(place: SweepFolder, found: SweepResults, shown: Mapping[str, Se
     ]
     plots = _curves(place, found)
     if plots:
-        parts.append(Section("curves", "Learning curves", "Mean over seeds, with their range.", [], plots))
+        parts.append(
+            Section("curves", "Learning curves", "Mean over seeds, with their range.", [], plots)
+        )
     configurations = len({run.configuration for run in found.plan.runs})
     facts = f"{found.finished} of {len(found.plan.runs)} runs of {configurations} configurations are finished."
     return write_page(place.path, f"Sweep: {found.plan.spec.name}", facts, parts)
 
 
 def _curves(place: SweepFolder, found: SweepResults) -> list[Plot]:
-    """A plot of the evaluations along the way; of pipelines, one for each algorithm and environment of a stage."""
+    """A plot of the evaluations along the way; of pipelines, one for each algorithm and environment
+    of a stage.
+    """
     curves: dict[str, dict[str, list[Curve]]] = {}
     for name, group in found.groups.items():
         for record in group:
@@ -230,5 +321,7 @@ def _curves(place: SweepFolder, found: SweepResults) -> list[Plot]:
             figure = plot_curves(groups, {}, kind)
         except ConfigError:  # nothing of what is shown was measured
             continue
-        plots.append(Plot(f"curves_{number}", f"{kind}: success and reward along the training.", figure))
+        plots.append(
+            Plot(f"curves_{number}", f"{kind}: success and reward along the training.", figure)
+        )
     return plots

@@ -1,4 +1,6 @@
-"""Doing the runs of a sweep by an executor, and what a worker does of it: train as ``train`` does, and fly the agent."""
+"""Doing the runs of a sweep by an executor, and what a worker does of it: train as ``train`` does,
+and fly the agent.
+"""
 
 import hashlib
 from collections import Counter
@@ -29,7 +31,13 @@ from sb3_quad.sweep.folder import MEASURES, REWARD, Numbers, Plan, RunRecord, Sw
 from sb3_quad.sweep.spec import Evaluation
 from sb3_quad.training.environments import make_environments
 from sb3_quad.training.job import TrainingJob
-from sb3_quad.training.pipeline import STATUS_FILE, Pipeline, PipelineResult, resume_pipeline, run_pipeline
+from sb3_quad.training.pipeline import (
+    STATUS_FILE,
+    Pipeline,
+    PipelineResult,
+    resume_pipeline,
+    run_pipeline,
+)
 
 EPISODES = 240  # of each task, where no suite is named
 TASKS = ("state_recovery", "target_tracking")
@@ -39,12 +47,17 @@ LOG = "log.txt"  # what the training reports, in the run's folder
 
 
 def execute(
-    place: SweepFolder, plan: Plan, executor: Executor, signals: StopSignals, show: Show, report: Callable[[str], None]
+    place: SweepFolder,
+    plan: Plan,
+    executor: Executor,
+    signals: StopSignals,
+    show: Show,
+    report: Callable[[str], None],
 ) -> dict[str, RunRecord]:
     """Do all runs that are not finished.
 
-    A run whose worker process ends is tried once more, from its snapshot; one that fails is left, and the others go on.
-    After a signal, the runs under way save and end.
+    A run whose worker process ends is tried once more, from its snapshot; one that fails is left,
+    and the others go on. After a signal, the runs under way save and end.
 
     :param report: told of each event in one line.
     :return: the records of all runs that ended, those of earlier calls included, by name.
@@ -55,11 +68,17 @@ def execute(
     calls, tries = dict["Future[RunRecord]", Run](), Counter[str]()
 
     def submit(run: Run) -> None:
-        calls[executor.submit(work, run, str(place.run(run)), plan.suite, plan.spec.evaluation)] = run
+        calls[executor.submit(work, run, str(place.run(run)), plan.suite, plan.spec.evaluation)] = (
+            run
+        )
         tries[run.name] += 1
 
     def next_step(run: Run) -> str:
-        return "goes on where it was left" if pipeline_folder(place.run(run)) is not None else "begins again"
+        return (
+            "goes on where it was left"
+            if pipeline_folder(place.run(run)) is not None
+            else "begins again"
+        )
 
     for run in plan.runs:
         if run.name in records:
@@ -86,16 +105,22 @@ def execute(
             continue
         place.add(record)
         records[run.name] = record
-        how = f"failed: {record.message}" if record.state == "failed" else f"finished in {record.seconds:.1f} s"
+        how = (
+            f"failed: {record.message}"
+            if record.state == "failed"
+            else f"finished in {record.seconds:.1f} s"
+        )
         report(f"{run.name}: {how} ({len(records)} of {len(plan.runs)})")
         show(len(records), len(plan.runs), "runs")
     return records
 
 
 def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> RunRecord:
-    """Train a run in its folder, or what is left of it, and fly its agent; of a run that fails, why.
+    """Train a run in its folder, or what is left of it, and fly its agent; of a run that fails,
+    why.
 
-    :param suite: what the agent flies; None: fresh episodes of both tasks, as many as ``evaluation`` says.
+    :param suite: what the agent flies; None: fresh episodes of both tasks, as many as
+        ``evaluation`` says.
     """
     use_cpus(1)
     place = Path(folder)
@@ -109,7 +134,10 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
         flights = _fly(agent, result.job, suite, evaluation)
     except KeyboardInterrupt:
         return RunRecord(**run.identity, state="interrupted")
-    except (Exception, SystemExit) as error:  # of a callback or environment of the user's, too; the other runs go on
+    except (
+        Exception,
+        SystemExit,
+    ) as error:  # of a callback or environment of the user's, too; the other runs go on
         kind = "" if isinstance(error, SB3QuadError) else f"{type(error).__name__}: "
         return RunRecord(**run.identity, state="failed", message=kind + one_line(error))
     return RunRecord(
@@ -126,7 +154,9 @@ def work(run: Run, folder: str, suite: Suite | None, evaluation: Evaluation) -> 
 def digest(agent: Path) -> str:
     """The SHA-256 of the parameters in an agent's zip."""
     parameters = load_model(agent).policy.state_dict()
-    content = b"".join(name.encode() + tensor.numpy().tobytes() for name, tensor in sorted(parameters.items()))
+    content = b"".join(
+        name.encode() + tensor.numpy().tobytes() for name, tensor in sorted(parameters.items())
+    )
     return hashlib.sha256(content).hexdigest()
 
 
@@ -145,7 +175,9 @@ def _train(run: Run, place: Path) -> PipelineResult:
     if begun is not None:
         return resume_pipeline(begun, report)
     stages = []
-    for number, stage in enumerate(run.stages):  # with its settings in a file here: one of the user's may have changed
+    for number, stage in enumerate(
+        run.stages
+    ):  # with its settings in a file here: one of the user's may have changed
         settings = place / f"stage_{number}.yml"
         write_text(settings, yaml.safe_dump({stage.env: stage.settings}, sort_keys=False))
         stages.append(stage.model_copy(update={"conf_file": str(settings), "settings": {}}))
@@ -153,20 +185,27 @@ def _train(run: Run, place: Path) -> PipelineResult:
     return run_pipeline(Pipeline(stages=tuple(stages)), job, "pipeline", report)
 
 
-def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluation) -> dict[str, dict[str, Numbers]]:
+def _fly(
+    agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluation
+) -> dict[str, dict[str, Numbers]]:
     """The numbers of an agent's flights, by scenario and measure."""
     model = load_model(agent)
     episodes, seed = evaluation.episodes or EPISODES, seed_for("table", evaluation.seed or 0)
     if job.config.task is None:  # an environment of others has rewards, and no scenarios
         if suite is not None:
-            raise ConfigError(f"evaluation: suites are for this package's environments, not for {job.config.env_id}")
+            raise ConfigError(
+                f"evaluation: suites are for this package's environments, not for {job.config.env_id}"
+            )
         config = job.for_evaluation()
         with closing(make_environments(config, 1, seed)) as env:
             rewards, _ = evaluate_policy(model, env, episodes, return_episode_rewards=True)
         return {config.env_id: {REWARD: tuple(np.asarray(rewards, dtype=np.float64).tolist())}}
     if suite is None:
         seeds, how = row_seeds(seed, episodes), job.flight_settings.in_any_task()
-        return {task: _numbers(fly_settings(model, FlightSettings(task=task, **how), seeds)) for task in TASKS}
+        return {
+            task: _numbers(fly_settings(model, FlightSettings(task=task, **how), seeds))
+            for task in TASKS
+        }
     spec, found = ControllerSpec("agent", str(agent)), {}
     for each in suite.scenarios:
         scenario = each.flown_by(spec.own and spec.own.vehicle)
@@ -176,8 +215,12 @@ def _fly(agent: Path, job: TrainingJob, suite: Suite | None, evaluation: Evaluat
 
 def _numbers(flights: Flights) -> dict[str, Numbers]:
     error = np.where(flights.survival, flights.final_error, np.nan)
-    arrival = flights.time_to[min(flights.time_to)] if flights.time_to else np.full(flights.n, np.nan)
-    time = np.where(np.isfinite(flights.sideways), arrival, flights.stabilised)  # who starts at the target has no way to it
+    arrival = (
+        flights.time_to[min(flights.time_to)] if flights.time_to else np.full(flights.n, np.nan)
+    )
+    time = np.where(
+        np.isfinite(flights.sideways), arrival, flights.stabilised
+    )  # who starts at the target has no way to it
     columns = (flights.success, flights.survival, flights.reward, error, time)
     return {
         name: tuple(float(value) if np.isfinite(value) else None for value in column)

@@ -1,8 +1,9 @@
-"""What a sweep trains: settings that all runs share, a grid or a list of those that differ, and the seeds.
+"""What a sweep trains: settings that all runs share, a grid or a list of those that differ, and the
+seeds.
 
-The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted where they lie deeper, to
-lists of values, of which every combination is a configuration, such as ``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``;
-``configurations`` lists some one by one.
+The words are rl-zoo's. Keys at the top hold for every configuration; ``grid`` maps keys, dotted
+where they lie deeper, to lists of values, of which every combination is a configuration, such as
+``grid: {hyperparams.learning_rate: [1e-3, 5e-3]}``; ``configurations`` lists some one by one.
 """
 
 from collections.abc import Mapping
@@ -27,12 +28,22 @@ MAX_RUNS = 10_000
 class Configuration(SettingsOptions, RunOptions):
     """What one training is given, less its seed; what is left out is as for ``train``."""
 
-    name: str | None = Field(default=None, pattern=NAME, description="in tables and folders; made of what differs without it")
+    name: str | None = Field(
+        default=None,
+        pattern=NAME,
+        description="in tables and folders; made of what differs without it",
+    )
     algo: str | None = Field(default=None, description="algorithm of a single run")
     env: str | None = Field(default=None, description="environment id of a single run")
-    conf_file: str | None = Field(default=None, description="settings file, of a single run or of a pipeline")
-    hyperparams: dict[str, Any] = Field(default={}, description="settings to change, such as n_steps: 500")
-    vehicle: str | None = Field(default=None, description="env_kwargs' vehicle, by name or YAML file")
+    conf_file: str | None = Field(
+        default=None, description="settings file, of a single run or of a pipeline"
+    )
+    hyperparams: dict[str, Any] = Field(
+        default={}, description="settings to change, such as n_steps: 500"
+    )
+    vehicle: str | None = Field(
+        default=None, description="env_kwargs' vehicle, by name or YAML file"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -41,7 +52,9 @@ class Configuration(SettingsOptions, RunOptions):
         if not isinstance(data, Mapping):
             return data
         options = {*SettingsOptions.model_fields, *RunOptions.model_fields}
-        return {key: parse_number(value) if key in options else value for key, value in data.items()}
+        return {
+            key: parse_number(value) if key in options else value for key, value in data.items()
+        }
 
     @property
     def given(self) -> dict[str, Any]:
@@ -59,9 +72,15 @@ class Resources(Frozen):
 class Evaluation(Frozen):
     """The fresh episodes on which all agents are compared."""
 
-    suite: str | None = Field(default=None, description="name or YAML file; without it, fresh episodes of both tasks")
-    scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = Field(default=(), description="only these of the suite")
-    episodes: PositiveInt | None = Field(default=None, description="of each scenario; without a suite 240")
+    suite: str | None = Field(
+        default=None, description="name or YAML file; without it, fresh episodes of both tasks"
+    )
+    scenario: Annotated[tuple[str, ...], BeforeValidator(as_list)] = Field(
+        default=(), description="only these of the suite"
+    )
+    episodes: PositiveInt | None = Field(
+        default=None, description="of each scenario; without a suite 240"
+    )
     seed: Seed | None = Field(default=None, description="of the episodes")
 
 
@@ -72,10 +91,16 @@ class SweepSpec(Configuration):
         default=(0,), min_length=1, description="one or a list"
     )
     grid: dict[str, Any] = Field(default={}, description="keys, each with a list of values")
-    configurations: tuple[dict[str, Any], ...] = Field(default=(), description="a list of keys and values each")
-    evaluation: Evaluation = Field(default=Evaluation(), description="what the agents fly in the end")
+    configurations: tuple[dict[str, Any], ...] = Field(
+        default=(), description="a list of keys and values each"
+    )
+    evaluation: Evaluation = Field(
+        default=Evaluation(), description="what the agents fly in the end"
+    )
     resources: Resources = Field(default=Resources(), description="what a run takes")
-    gym_packages: tuple[str, ...] = Field(default=(), description="modules that register further environments")
+    gym_packages: tuple[str, ...] = Field(
+        default=(), description="modules that register further environments"
+    )
 
 
 def load_sweep(source: str | Path) -> SweepSpec:

@@ -20,7 +20,17 @@ ALGORITHMS = {
     "td3": "stable_baselines3.td3.td3:TD3",
 }
 # Set by a training job rather than by the settings of an algorithm.
-_SET_BY_JOB = {"self", "policy", "env", "expert", "policy_kwargs", "verbose", "tensorboard_log", "device", "seed"}
+_SET_BY_JOB = {
+    "self",
+    "policy",
+    "env",
+    "expert",
+    "policy_kwargs",
+    "verbose",
+    "tensorboard_log",
+    "device",
+    "seed",
+}
 
 
 def get_algorithm(name: str) -> type[BaseAlgorithm]:
@@ -34,23 +44,31 @@ def get_algorithm(name: str) -> type[BaseAlgorithm]:
 
 
 def constructor_parameters(algorithm: type[BaseAlgorithm]) -> dict[str, inspect.Parameter]:
-    """What an algorithm's settings may give: its constructor's keywords, less those that a training job sets.
+    """What an algorithm's settings may give: its constructor's keywords, less those that a training
+    job sets.
 
-    The annotation of each is a type; Any where there is none, or where a name in the annotations cannot be resolved.
+    The annotation of each is a type; Any where there is none, or where a name in the annotations
+    cannot be resolved.
     """
     try:
-        types = typing.get_type_hints(algorithm.__init__, localns={"VecEnv": VecEnv})  # a forward reference of GymEnv
+        types = typing.get_type_hints(
+            algorithm.__init__, localns={"VecEnv": VecEnv}
+        )  # a forward reference of GymEnv
     except NameError:
         types = {}
     return {
         name: parameter.replace(annotation=types.get(name, Any))
         for name, parameter in inspect.signature(algorithm.__init__).parameters.items()
-        if name not in _SET_BY_JOB and not name.startswith("_") and parameter.kind is not parameter.VAR_KEYWORD
+        if name not in _SET_BY_JOB
+        and not name.startswith("_")
+        and parameter.kind is not parameter.VAR_KEYWORD
     }
 
 
 def is_off_policy(algorithm: type[BaseAlgorithm]) -> bool:
-    """Whether the algorithm learns from a replay buffer, such as SAC: its rollouts are ``train_freq`` steps long."""
+    """Whether the algorithm learns from a replay buffer, such as SAC: its rollouts are
+    ``train_freq`` steps long.
+    """
     return issubclass(algorithm, OffPolicyAlgorithm)
 
 

@@ -1,7 +1,9 @@
-"""The settings of one training job, from rl-zoo's YAML: one file per algorithm, top keys environment ids.
+"""The settings of one training job, from rl-zoo's YAML: one file per algorithm, top keys
+environment ids.
 
-:class:`TrainingConfig` lists the keys of a job; any other key is a keyword of the algorithm's constructor, where ``lin_1e-3``
-falls linearly to 0 over the training; a learning rate to its n-th part, in the last of n updates.
+:class:`TrainingConfig` lists the keys of a job; any other key is a keyword of the algorithm's
+constructor, where ``lin_1e-3`` falls linearly to 0 over the training; a learning rate to its n-th
+part, in the last of n updates.
 """
 
 from collections.abc import Collection
@@ -9,7 +11,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
 import gymnasium
-from pydantic import BeforeValidator, Field, NonNegativeFloat, PositiveInt, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    NonNegativeFloat,
+    PositiveInt,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from sb3_quad.algorithms.common import LIMITS
 from sb3_quad.base.errors import ConfigError, did_you_mean, unknown
@@ -20,7 +30,12 @@ from sb3_quad.controllers.resolve import DEFAULT_EXPERT
 from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.tasks import TASKS
-from sb3_quad.training.algorithms import constructor_parameters, get_algorithm, is_off_policy, takes_expert
+from sb3_quad.training.algorithms import (
+    constructor_parameters,
+    get_algorithm,
+    is_off_policy,
+    takes_expert,
+)
 from sb3_quad.training.values import BASES, as_list, check, convert, import_class, qualified_classes
 from sb3_quad.vehicles.vehicle import VEHICLES
 
@@ -38,40 +53,75 @@ def _one_of(valid: Collection[str], value: Any, info: ValidationInfo) -> str:
 
 
 Whole: TypeAlias = Annotated[
-    int, Field(lt=2**63), BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name))
+    int,
+    Field(lt=2**63),
+    BeforeValidator(lambda value, info: check(PositiveInt, parse_number(value), info.field_name)),
 ]
-Keywords: TypeAlias = Annotated[dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))]
+Keywords: TypeAlias = Annotated[
+    dict[str, Any], BeforeValidator(lambda value, info: parse_mapping(value, info.field_name))
+]
 Classes: TypeAlias = Annotated[
-    list[tuple[str, dict[str, Any]]], BeforeValidator(lambda value, info: qualified_classes(value, info.field_name))
+    list[tuple[str, dict[str, Any]]],
+    BeforeValidator(lambda value, info: qualified_classes(value, info.field_name)),
 ]
 Tasks: TypeAlias = Annotated[tuple[str, ...], BeforeValidator(as_list)]
 
 
 class TrainingConfig(Frozen):
-    """One job's settings, checked. ``settings`` holds them as given: plain values that YAML can hold.
+    """One job's settings, checked. ``settings`` holds them as given: plain values that YAML can
+    hold.
 
-    Classes are given as ``package.module.Class``, one or a list; with keywords as ``{package.module.Class: {…}}``.
+    Classes are given as ``package.module.Class``, one or a list; with keywords as
+    ``{package.module.Class: {…}}``.
     """
 
     algo: str
     env_id: str
     n_timesteps: Whole = Field(description="timesteps to train on, over all environments")
     n_envs: Whole = Field(default=1, description="environments flown side by side")
-    vec_env: VecEnvKind = Field(description="batch by default for this package's environments, dummy for others")
-    env_kwargs: Keywords = Field(default={}, description="keywords of the environment's constructor")
-    eval_env_kwargs: Keywords = Field(default={}, description="put over env_kwargs in the evaluation's environments")
-    eval_tasks: Tasks = Field(default=(), description="further tasks to evaluate on; the own one decides which model is best")
-    best_by: Literal["success", "survival"] = Field(default="success", description="which share makes a model the best")
+    vec_env: VecEnvKind = Field(
+        description="batch by default for this package's environments, dummy for others"
+    )
+    env_kwargs: Keywords = Field(
+        default={}, description="keywords of the environment's constructor"
+    )
+    eval_env_kwargs: Keywords = Field(
+        default={}, description="put over env_kwargs in the evaluation's environments"
+    )
+    eval_tasks: Tasks = Field(
+        default=(),
+        description="further tasks to evaluate on; the own one decides which model is best",
+    )
+    best_by: Literal["success", "survival"] = Field(
+        default="success", description="which share makes a model the best"
+    )
     policy: str = "MlpPolicy"
-    policy_kwargs: Keywords = Field(default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'")
-    expert: Any = Field(default=None, description="pid, geometric, path/to/model.zip or package.module:factory, to learn from")
+    policy_kwargs: Keywords = Field(
+        default={}, description="mapping, or a string such as 'dict(net_arch=[64, 64])'"
+    )
+    expert: Any = Field(
+        default=None,
+        description="pid, geometric, path/to/model.zip or package.module:factory, to learn from",
+    )
     callback: Classes = Field(default=[], description="callbacks of the training")
-    env_wrapper: Classes = Field(default=[], description="wrappers around each environment, of dummy and subproc")
-    vec_env_wrapper: Classes = Field(default=[], description="wrappers around the vectorised environment")
-    normalize: Literal[False] | None = Field(default=None, description="its statistics would not be part of a model's zip")
-    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(default=None, description="of an off-policy algorithm")
-    noise_std: NonNegativeFloat = Field(default=0.1, description="deviation of that noise, of actions within -1 and 1")
-    hyperparams: dict[str, Any] = Field(description="keywords of the algorithm's constructor, converted")
+    env_wrapper: Classes = Field(
+        default=[], description="wrappers around each environment, of dummy and subproc"
+    )
+    vec_env_wrapper: Classes = Field(
+        default=[], description="wrappers around the vectorised environment"
+    )
+    normalize: Literal[False] | None = Field(
+        default=None, description="its statistics would not be part of a model's zip"
+    )
+    noise_type: Literal["normal", "ornstein-uhlenbeck"] | None = Field(
+        default=None, description="of an off-policy algorithm"
+    )
+    noise_std: NonNegativeFloat = Field(
+        default=0.1, description="deviation of that noise, of actions within -1 and 1"
+    )
+    hyperparams: dict[str, Any] = Field(
+        description="keywords of the algorithm's constructor, converted"
+    )
     settings: dict[str, Any] = Field(repr=False)
 
     @property
@@ -86,7 +136,9 @@ class TrainingConfig(Frozen):
 
     def keyword(self, name: str) -> Any:
         """What the algorithm's constructor is given as ``name``, or its default."""
-        return self.hyperparams.get(name, constructor_parameters(get_algorithm(self.algo))[name].default)
+        return self.hyperparams.get(
+            name, constructor_parameters(get_algorithm(self.algo))[name].default
+        )
 
     @property
     def is_off_policy(self) -> bool:
@@ -95,7 +147,9 @@ class TrainingConfig(Frozen):
 
     @property
     def rollout_steps(self) -> int:
-        """Control steps of each environment between two updates; 1 where ``train_freq`` counts episodes."""
+        """Control steps of each environment between two updates; 1 where ``train_freq`` counts
+        episodes.
+        """
         if not self.is_off_policy:
             return int(self.keyword("n_steps"))
         freq = self.keyword("train_freq")
@@ -103,13 +157,18 @@ class TrainingConfig(Frozen):
         return int(number) if unit == "step" else 1
 
     def shorter_rollout(self) -> dict[str, int]:
-        """The settings that fit a rollout to a budget of less than one, which SB3 would fly whole; none otherwise."""
+        """The settings that fit a rollout to a budget of less than one, which SB3 would fly whole;
+        none otherwise.
+        """
         n_steps = -(-self.n_timesteps // self.n_envs)
         if n_steps >= self.rollout_steps:
             return {}
         if self.is_off_policy:
             return {"train_freq": n_steps}
-        return {"n_steps": n_steps, "batch_size": min(self.keyword("batch_size"), n_steps * self.n_envs)}
+        return {
+            "n_steps": n_steps,
+            "batch_size": min(self.keyword("batch_size"), n_steps * self.n_envs),
+        }
 
     @field_validator("policy", mode="before")
     @classmethod
@@ -120,8 +179,19 @@ class TrainingConfig(Frozen):
     @classmethod
     def _some_units(cls, value: dict[str, Any]) -> dict[str, Any]:
         parts = value.get("net_arch")
-        lists = parts.values() if isinstance(parts, dict) else [parts] if isinstance(parts, list) else []
-        if any(isinstance(units, int) and units < 1 for part in lists if isinstance(part, list) for units in part):
+        lists = (
+            parts.values()
+            if isinstance(parts, dict)
+            else [parts]
+            if isinstance(parts, list)
+            else []
+        )
+        if any(
+            isinstance(units, int) and units < 1
+            for part in lists
+            if isinstance(part, list)
+            for units in part
+        ):
             raise ConfigError(f"net_arch {parts}: every layer has at least 1 unit")
         return value
 
@@ -132,13 +202,19 @@ class TrainingConfig(Frozen):
         if env_id in ENVIRONMENTS:
             for key in value:
                 if key not in FlightSettings.model_fields:
-                    raise ConfigError(unknown(f"keyword of {env_id}", key, FlightSettings.model_fields))
-            FlightSettings().with_changes(**{"task": ENVIRONMENTS[env_id], **info.data.get("env_kwargs", {}), **value})
+                    raise ConfigError(
+                        unknown(f"keyword of {env_id}", key, FlightSettings.model_fields)
+                    )
+            FlightSettings().with_changes(
+                **{"task": ENVIRONMENTS[env_id], **info.data.get("env_kwargs", {}), **value}
+            )
         return value
 
     @field_validator(*BASES)
     @classmethod
-    def _known_classes(cls, value: list[tuple[str, dict[str, Any]]], info: ValidationInfo) -> list[tuple[str, dict[str, Any]]]:
+    def _known_classes(
+        cls, value: list[tuple[str, dict[str, Any]]], info: ValidationInfo
+    ) -> list[tuple[str, dict[str, Any]]]:
         for path, _ in value:
             import_class(path, str(info.field_name))
         return value
@@ -153,11 +229,17 @@ class TrainingConfig(Frozen):
     @model_validator(mode="after")
     def _consistent(self) -> "TrainingConfig":
         if self.vec_env != "batch" and self.n_envs > MAX_SINGLE:
-            raise ConfigError(f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made")
+            raise ConfigError(
+                f"n_envs: {self.n_envs} of vec_env {self.vec_env}, at most {MAX_SINGLE} are made"
+            )
         if self.vec_env == "batch" and self.task is None:
-            raise ConfigError(f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc")
+            raise ConfigError(
+                f"vec_env is batch, but {self.env_id} has no batched form; use dummy or subproc"
+            )
         if self.is_off_policy and self.n_envs > 1 and "episode" in str(self.keyword("train_freq")):
-            raise ConfigError(f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; give steps")
+            raise ConfigError(
+                f"train_freq {self.keyword('train_freq')}: counts episodes, which needs n_envs 1; give steps"
+            )
         if self.noise_type is not None and not self.is_off_policy:
             raise ConfigError(f"noise_type: {self.algo} samples its actions; leave it out")
         if self.expert and not takes_expert(get_algorithm(self.algo)):
@@ -165,27 +247,38 @@ class TrainingConfig(Frozen):
         return self
 
 
-JOB_KEYS = tuple(name for name in TrainingConfig.model_fields if name not in ("algo", "env_id", "hyperparams", "settings"))
+JOB_KEYS = tuple(
+    name
+    for name in TrainingConfig.model_fields
+    if name not in ("algo", "env_id", "hyperparams", "settings")
+)
 
 
 def load_config(
-    algo: str, env_id: str, conf_file: str | Path | None = None, overrides: dict[str, Any] | None = None
+    algo: str,
+    env_id: str,
+    conf_file: str | Path | None = None,
+    overrides: dict[str, Any] | None = None,
 ) -> TrainingConfig:
-    """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for ``env_kwargs``).
+    """The settings of ``env_id`` in a YAML file, with ``overrides`` put over them (into them, for
+    ``env_kwargs``).
 
-    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size`` to no more than that; of
-    an off-policy algorithm ``train_freq``.
+    Where ``n_timesteps`` is less than a rollout, ``n_steps`` is shortened to it, and ``batch_size``
+    to no more than that; of an off-policy algorithm ``train_freq``.
 
-    :param conf_file: path of a file, or the name of one that comes with the package such as ``thesis/dagger.yml``;
-        None for ``<algo>.yml`` of the package.
-    :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that does not fit.
+    :param conf_file: path of a file, or the name of one that comes with the package such as
+        ``thesis/dagger.yml``; None for ``<algo>.yml`` of the package.
+    :raises ConfigError: an unknown algorithm, environment or key, an unreadable file, a value that
+        does not fit.
     """
     get_algorithm(algo)
     check_environment(env_id)
     content, where = SETTINGS.read(conf_file if conf_file is not None else f"{algo}.yml")
     if env_id not in content:
         listed = [str(key) for key in content]
-        raise ConfigError(f"{where}: {unknown('environment in this file', env_id, listed)}; give another with --conf-file")
+        raise ConfigError(
+            f"{where}: {unknown('environment in this file', env_id, listed)}; give another with --conf-file"
+        )
     settings = content[env_id]
     if not isinstance(settings, dict):
         raise ConfigError(f"{where}: {env_id} must hold keys and values, such as 'n_envs: 8'")
@@ -195,11 +288,19 @@ def load_config(
         changes["env_kwargs"] = {**base, **parse_mapping(changes["env_kwargs"], "env_kwargs")}
     config = build_config(algo, env_id, {**settings, **changes}, where, changes)
     shorter = config.shorter_rollout()
-    return build_config(algo, env_id, {**config.settings, **shorter}, where, changes) if shorter else config
+    return (
+        build_config(algo, env_id, {**config.settings, **shorter}, where, changes)
+        if shorter
+        else config
+    )
 
 
 def build_config(
-    algo: str, env_id: str, settings: dict[str, Any], where: str = "settings", changes: Collection[str] = ()
+    algo: str,
+    env_id: str,
+    settings: dict[str, Any],
+    where: str = "settings",
+    changes: Collection[str] = (),
 ) -> TrainingConfig:
     """The checked settings of one job, from a plain mapping.
 
@@ -209,7 +310,10 @@ def build_config(
     """
     parameters = constructor_parameters(get_algorithm(algo))
     check_environment(env_id)
-    settings = {key: with_vehicle_path(value) if key.endswith("env_kwargs") else value for key, value in settings.items()}
+    settings = {
+        key: with_vehicle_path(value) if key.endswith("env_kwargs") else value
+        for key, value in settings.items()
+    }
     if takes_expert(get_algorithm(algo)) and settings.get("expert") is None:
         settings["expert"] = DEFAULT_EXPERT  # so that config.yml names it
 
@@ -218,7 +322,9 @@ def build_config(
 
     for key in settings:
         if key not in JOB_KEYS and key not in parameters:
-            raise ConfigError(f"{source(key)}: {unknown(f'key of {algo}', key, [*JOB_KEYS, *parameters])}")
+            raise ConfigError(
+                f"{source(key)}: {unknown(f'key of {algo}', key, [*JOB_KEYS, *parameters])}"
+            )
     if settings.get("n_timesteps") is None:
         raise ConfigError(f"{where}: n_timesteps is missing; give it there or with -n")
     hyperparams = {
@@ -227,23 +333,32 @@ def build_config(
         if key in parameters
     }
     fields: dict[str, Any] = {"vec_env": "batch" if env_id in ENVIRONMENTS else "dummy"}
-    fields |= {key: value for key, value in settings.items() if key in JOB_KEYS and value is not None}
+    fields |= {
+        key: value for key, value in settings.items() if key in JOB_KEYS and value is not None
+    }
     fields |= {"algo": algo, "env_id": env_id, "hyperparams": hyperparams, "settings": settings}
     return validate(TrainingConfig, fields, source)
 
 
 def with_vehicle_path(value: Any) -> Any:
-    """``env_kwargs`` whose vehicle file, if they name one, can be found from any folder: runs are flown and resumed later."""
+    """``env_kwargs`` whose vehicle file, if they name one, can be found from any folder: runs are
+    flown and resumed later.
+    """
     vehicle = value.get("vehicle") if isinstance(value, dict) else None
     if isinstance(vehicle, (list, tuple)):
-        return {**value, "vehicle": [with_vehicle_path({"vehicle": each})["vehicle"] for each in vehicle]}
+        return {
+            **value,
+            "vehicle": [with_vehicle_path({"vehicle": each})["vehicle"] for each in vehicle],
+        }
     if not isinstance(vehicle, (str, Path)) or not VEHICLES.is_path(vehicle):
         return value
     return {**value, "vehicle": str(Path(vehicle).absolute())}
 
 
 def check_environment(env_id: str) -> None:
-    """:raises ConfigError: an environment that Gymnasium does not know; the message names the nearest."""
+    """:raises ConfigError: an environment that Gymnasium does not know; the message names the
+    nearest.
+    """
     if env_id in gymnasium.registry:
         return
     hint = did_you_mean(env_id, gymnasium.registry)

@@ -1,4 +1,6 @@
-"""The vectorised environment of a job: batched, one process, or one process each; the same learning problem in all."""
+"""The vectorised environment of a job: batched, one process, or one process each; the same learning
+problem in all.
+"""
 
 import importlib
 from collections.abc import Callable
@@ -29,10 +31,14 @@ class _Dummy(RowSeeds, DummyVecEnv):
 
 
 class _Subproc(RowSeeds, SubprocVecEnv):
-    """SB3's ``close`` waits forever for the answer of a worker process that has ended; this one ends the others."""
+    """SB3's ``close`` waits forever for the answer of a worker process that has ended; this one
+    ends the others.
+    """
 
     def close(self) -> None:
-        if not self.closed and (self.waiting or not all(process.is_alive() for process in self.processes)):
+        if not self.closed and (
+            self.waiting or not all(process.is_alive() for process in self.processes)
+        ):
             for process in self.processes:
                 process.terminate()
                 process.join()
@@ -42,12 +48,16 @@ class _Subproc(RowSeeds, SubprocVecEnv):
         super().close()
 
 
-def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False) -> VecEnv:
-    """``n_envs`` environments as the settings describe them; their rows fly by ``row_seeds`` of ``seed``.
+def make_environments(
+    config: TrainingConfig, n_envs: int, seed: int, staggered: bool = False
+) -> VecEnv:
+    """``n_envs`` environments as the settings describe them; their rows fly by ``row_seeds`` of
+    ``seed``.
 
     Each gives ``info["episode"]`` where an episode ends, as SB3's Monitor does.
 
-    :param staggered: whether the first episodes end at different times, as of :class:`QuadcopterVecEnv`.
+    :param staggered: whether the first episodes end at different times, as of
+        :class:`QuadcopterVecEnv`.
     :raises ConfigError: keywords that the environment does not take.
     :raises TrainingError: a worker process that ended.
     """
@@ -55,10 +65,16 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
     try:
         if config.vec_env == "batch":
             if config.env_wrapper:
-                raise ConfigError("env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy")
-            env = QuadcopterVecEnv(n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs})
+                raise ConfigError(
+                    "env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy"
+                )
+            env = QuadcopterVecEnv(
+                n_envs, seed=seed, staggered=staggered, **{"task": config.task, **config.env_kwargs}
+            )
         else:
-            if config.task is not None:  # here, where a worker process could not say what is missing
+            if (
+                config.task is not None
+            ):  # here, where a worker process could not say what is missing
                 importlib.import_module("sb3_quad.base.bullet")
             makers: list[Callable[[], gymnasium.Env[Any, Any]]] = [
                 partial(_make_one, config, row, n_envs if staggered else 1) for row in range(n_envs)
@@ -70,7 +86,9 @@ def make_environments(config: TrainingConfig, n_envs: int, seed: int, staggered:
     except (EOFError, ConnectionError):
         raise TrainingError(WORKER_ENDED) from None
     except (TypeError, ValueError, AssertionError) as error:
-        raise ConfigError(f"{config.env_id}: cannot be made with env_kwargs {config.env_kwargs} ({error})") from error
+        raise ConfigError(
+            f"{config.env_id}: cannot be made with env_kwargs {config.env_kwargs} ({error})"
+        ) from error
     for path, kwargs in config.vec_env_wrapper:
         env = instance(path, "vec_env_wrapper", env, **kwargs)
     return env

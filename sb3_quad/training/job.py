@@ -17,8 +17,15 @@ class TrainingJob(JobOptions):
     config: TrainingConfig = Field(description="the settings")
 
     def for_evaluation(self, **changes: Any) -> TrainingConfig:
-        """The settings with the environments as evaluations have them, and ``changes`` to their keywords."""
-        keywords = {**self.config.env_kwargs, **self.config.eval_env_kwargs, **(self.eval_env_kwargs or {}), **changes}
+        """The settings with the environments as evaluations have them, and ``changes`` to their
+        keywords.
+        """
+        keywords = {
+            **self.config.env_kwargs,
+            **self.config.eval_env_kwargs,
+            **(self.eval_env_kwargs or {}),
+            **changes,
+        }
         return self.config.model_copy(update={"env_kwargs": keywords})
 
     @property
@@ -27,8 +34,14 @@ class TrainingJob(JobOptions):
         return self.for_evaluation().flight_settings
 
     def arguments(self) -> dict[str, Any]:
-        """What args.yml holds: everything but the settings, which config.yml holds; and how evaluations fly."""
-        names = {"algo": self.config.algo, "env": self.config.env_id, "env_kwargs": self.for_evaluation().env_kwargs}
+        """What args.yml holds: everything but the settings, which config.yml holds; and how
+        evaluations fly.
+        """
+        names = {
+            "algo": self.config.algo,
+            "env": self.config.env_id,
+            "env_kwargs": self.for_evaluation().env_kwargs,
+        }
         return {**names, **self.model_dump(exclude={"config"})}
 
 

@@ -1,4 +1,6 @@
-"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, and keys of a sweep's file; cheap to import."""
+"""The options of a training: flags of ``train``, ``tune`` and ``sweep``, and keys of a sweep's
+file; cheap to import.
+"""
 
 from typing import Annotated, Any, Literal
 
@@ -15,7 +17,11 @@ def option(default: Any, description: str, *flags: str, metavar: str | None = "N
 
     :param flags: rl-zoo's short names of it.
     """
-    return Field(default=default, description=description, json_schema_extra={"flags": list(flags), "metavar": metavar})
+    return Field(
+        default=default,
+        description=description,
+        json_schema_extra={"flags": list(flags), "metavar": metavar},
+    )
 
 
 def _check_device(device: str) -> str:
@@ -30,25 +36,45 @@ def _check_device(device: str) -> str:
 class SettingsOptions(Frozen):
     """Keys of a settings file that have a flag of their own; None leaves what the file says."""
 
-    n_timesteps: int | None = option(None, "timesteps, in whole rollouts; fewer than one shorten it", "-n")
+    n_timesteps: int | None = option(
+        None, "timesteps, in whole rollouts; fewer than one shorten it", "-n"
+    )
     n_envs: int | None = option(None, "environments side by side")
-    vec_env: str | None = option(None, "batch (compiled), dummy (PyBullet) or subproc (one process each)", metavar="KIND")
-    expert: str | None = option(None, "pid, geometric, path/to/model.zip or package.module:factory", metavar="SPEC")
-    env_kwargs: dict[str, Any] | None = option(None, "environment keywords, such as noise:0", metavar="K:V")
+    vec_env: str | None = option(
+        None, "batch (compiled), dummy (PyBullet) or subproc (one process each)", metavar="KIND"
+    )
+    expert: str | None = option(
+        None, "pid, geometric, path/to/model.zip or package.module:factory", metavar="SPEC"
+    )
+    env_kwargs: dict[str, Any] | None = option(
+        None, "environment keywords, such as noise:0", metavar="K:V"
+    )
 
 
 class RunOptions(Frozen):
-    """What a training is told beyond its settings, which the configurations of a sweep may differ in."""
+    """What a training is told beyond its settings, which the configurations of a sweep may differ
+    in.
+    """
 
-    eval_env_kwargs: dict[str, Any] | None = option(None, "environment keywords for evaluations only", metavar="K:V")
-    trained_agent: str | None = option(None, "agent to start from: an SB3 zip, a run folder or a name", "-i", metavar="ZIP")
-    n_eval_envs: PositiveInt | None = option(None, "environments of an evaluation (batch: one per episode; else 1)")
-    device: Annotated[str, AfterValidator(_check_device)] = option("cpu", "cpu, cuda or auto", metavar=None)
+    eval_env_kwargs: dict[str, Any] | None = option(
+        None, "environment keywords for evaluations only", metavar="K:V"
+    )
+    trained_agent: str | None = option(
+        None, "agent to start from: an SB3 zip, a run folder or a name", "-i", metavar="ZIP"
+    )
+    n_eval_envs: PositiveInt | None = option(
+        None, "environments of an evaluation (batch: one per episode; else 1)"
+    )
+    device: Annotated[str, AfterValidator(_check_device)] = option(
+        "cpu", "cpu, cuda or auto", metavar=None
+    )
     eval_freq: int = option(250_000, "timesteps between evaluations; below 1: one at the end")
     eval_episodes: int = option(48, "episodes per evaluation; 0: no evaluations")
     save_freq: int = option(-1, "timesteps between checkpoints; below 1: none")
     snapshot_every: NonNegativeFloat = option(
-        60.0, "seconds between snapshots, from which --resume goes on after a crash; 0: none", metavar="SECONDS"
+        60.0,
+        "seconds between snapshots, from which --resume goes on after a crash; 0: none",
+        metavar="SECONDS",
     )
 
 
@@ -62,7 +88,9 @@ class JobOptions(RunOptions):
     verbose: Literal[0, 1, 2] = option(0, "1: SB3's tables, 2: debugging")
     uuid: bool = option(False, "add a UUID to the run folder's name", "-uuid", metavar=None)
     progress: bool = option(False, "progress bar", "-P", metavar=None)
-    track: bool = option(False, "track with Weights & Biases; -tb is runs without one", metavar=None)
+    track: bool = option(
+        False, "track with Weights & Biases; -tb is runs without one", metavar=None
+    )
     wandb_project_name: str = option("sb3", "its project", metavar="NAME")
     wandb_entity: str | None = option(None, "its entity, a user or team", metavar="NAME")
     wandb_group: str | None = option(None, "its group of runs", metavar="NAME")

@@ -1,6 +1,8 @@
-"""Several training jobs in a row, each starting from the agent of the one before: the two stages of the thesis (4.2).
+"""Several training jobs in a row, each starting from the agent of the one before: the two stages of
+the thesis (4.2).
 
-A pipeline's file lists its stages in order, as ``zoo_configs/two_stage.yml`` does; :class:`Stage` says the keys.
+A pipeline's file lists its stages in order, as ``zoo_configs/two_stage.yml`` does; :class:`Stage`
+says the keys.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,7 +13,15 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 import yaml
-from pydantic import Field, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, field_validator, model_validator
+from pydantic import (
+    Field,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    field_validator,
+    model_validator,
+)
 
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
@@ -46,28 +56,51 @@ class Stage(Frozen):
     name: str = Field(min_length=1, description="what the stage is called in tables")
     algo: str = Field(description="as for a single run")
     env: str = Field(description="as for a single run")
-    conf_file: str | None = Field(default=None, description="settings file; <algo>.yml of the package without it")
-    settings: dict[str, Any] = Field(default={}, description="changes to these settings, such as n_timesteps: 5_000_000")
+    conf_file: str | None = Field(
+        default=None, description="settings file; <algo>.yml of the package without it"
+    )
+    settings: dict[str, Any] = Field(
+        default={}, description="changes to these settings, such as n_timesteps: 5_000_000"
+    )
     seed_offset: NonNegativeInt = Field(
-        default=0, description="added to the seed, so that a stage sees other episodes than one before it on the same task"
+        default=0,
+        description="added to the seed, so that a stage sees other episodes than one before it on the same task",
     )
     pass_on: Literal["best", "last"] = Field(
         default="best", description="the best evaluation, as best_by of its settings says"
     )
-    trim: Literal["position", "hover", "arrival"] | None = Field(default=None, description="training.trim, .arrival say how")
-    position_scale: PositiveFloat = Field(default=1.0, description="α, which trim: position makes a part of the agent")
-    leaving_cost: NonNegativeFloat = Field(default=LEFT, description="s that trim: arrival counts for a target left again")
-    trim_env_kwargs: dict[str, Any] = Field(default={}, description="changes to env_kwargs in which trim: arrival counts, too")
-    trims: PositiveInt = Field(default=1, description="how often trim: arrival searches, each time from what it found before")
-    require: Requirement = Field(default=Requirement(), description="the pipeline stops where this is missed")
-    eval_freq: int | None = Field(default=None, description="timesteps between evaluations of this stage")
+    trim: Literal["position", "hover", "arrival"] | None = Field(
+        default=None, description="training.trim, .arrival say how"
+    )
+    position_scale: PositiveFloat = Field(
+        default=1.0, description="α, which trim: position makes a part of the agent"
+    )
+    leaving_cost: NonNegativeFloat = Field(
+        default=LEFT, description="s that trim: arrival counts for a target left again"
+    )
+    trim_env_kwargs: dict[str, Any] = Field(
+        default={}, description="changes to env_kwargs in which trim: arrival counts, too"
+    )
+    trims: PositiveInt = Field(
+        default=1,
+        description="how often trim: arrival searches, each time from what it found before",
+    )
+    require: Requirement = Field(
+        default=Requirement(), description="the pipeline stops where this is missed"
+    )
+    eval_freq: int | None = Field(
+        default=None, description="timesteps between evaluations of this stage"
+    )
     eval_episodes: PositiveInt | None = Field(default=None, description="episodes in each")
 
     @model_validator(mode="after")
     def _of_its_trim(self) -> "Stage":
         for name in ("position_scale", "leaving_cost", "trim_env_kwargs", "trims"):
             trimmed = "position" if name == "position_scale" else "arrival"
-            if getattr(self, name) != type(self).model_fields[name].default and self.trim != trimmed:
+            if (
+                getattr(self, name) != type(self).model_fields[name].default
+                and self.trim != trimmed
+            ):
                 raise ValueError(f"{name} goes with trim: {trimmed}")
         return self
 
@@ -81,7 +114,9 @@ class Pipeline(Frozen):
     @classmethod
     def _of_their_own_names(cls, stages: tuple[Stage, ...]) -> tuple[Stage, ...]:
         if len({stage.name for stage in stages}) < len(stages):
-            raise ValueError(f"{', '.join(stage.name for stage in stages)}: give each a name of its own")
+            raise ValueError(
+                f"{', '.join(stage.name for stage in stages)}: give each a name of its own"
+            )
         return stages
 
 
@@ -110,7 +145,8 @@ class StageResult(NamedTuple):
 class PipelineResult:
     """How a pipeline ended.
 
-    :param stages: by name, all of them, or those before an interruption (then ``exit_code`` is not 0).
+    :param stages: by name, all of them, or those before an interruption (then ``exit_code`` is not
+        0).
     :param job: that of the first stage.
     """
 
@@ -139,11 +175,16 @@ def load_pipeline(conf_file: str | Path) -> Pipeline:
 
 
 def with_settings(pipeline: Pipeline, changes: Mapping[str, Any]) -> Pipeline:
-    """The pipeline with ``changes`` put over the settings of every stage (into them, for ``env_kwargs``)."""
+    """The pipeline with ``changes`` put over the settings of every stage (into them, for
+    ``env_kwargs``).
+    """
     stages = []
     for stage in pipeline.stages:
         settings = {**stage.settings, **changes}
-        parts = [parse_mapping(given.get("env_kwargs"), f"{stage.name}: env_kwargs") for given in (stage.settings, changes)]
+        parts = [
+            parse_mapping(given.get("env_kwargs"), f"{stage.name}: env_kwargs")
+            for given in (stage.settings, changes)
+        ]
         if any(parts):
             settings["env_kwargs"] = with_vehicle_path({**parts[0], **parts[1]})
         stages.append(stage.model_copy(update={"settings": settings}))
@@ -155,23 +196,30 @@ def run_pipeline(
 ) -> PipelineResult:
     """Train the stages one after the other, each from the agent that the one before passed on.
 
-    Their run folders lie where single runs lie; ``<log_folder>/<name>/<name>_<run>/pipeline.yml`` says which they are.
+    Their run folders lie where single runs lie; ``<log_folder>/<name>/<name>_<run>/pipeline.yml``
+    says which they are.
 
-    :param job: arguments of every :class:`TrainingJob`, such as ``seed``; a stage's own ``eval_freq`` and
-        ``eval_episodes`` go before them.
+    :param job: arguments of every :class:`TrainingJob`, such as ``seed``; a stage's own
+        ``eval_freq`` and ``eval_episodes`` go before them.
     :param name: of the pipeline, for its folder.
-    :raises ConfigError: settings that do not fit, named with their stage, before the first one starts.
-    :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was missed.
+    :raises ConfigError: settings that do not fit, named with their stage, before the first one
+        starts.
+    :raises SB3QuadError: as :func:`~sb3_quad.training.trainer.train`; or a requirement that was
+        missed.
     """
     status = Status(stages=pipeline.stages, job=dict(job), runs=())
     jobs = stage_jobs(status, status.job)
     return _train_stages(claim_folder(Path(jobs[0].log_folder) / name, name), status, jobs, report)
 
 
-def resume_pipeline(folder: Path, report: Callable[[str], None] = print, **changes: Any) -> PipelineResult:
-    """Go on with an interrupted or killed pipeline: within the stage that was under way, then with the stages after it.
+def resume_pipeline(
+    folder: Path, report: Callable[[str], None] = print, **changes: Any
+) -> PipelineResult:
+    """Go on with an interrupted or killed pipeline: within the stage that was under way, then with
+    the stages after it.
 
-    :param changes: arguments of the jobs to change, as for :func:`~sb3_quad.training.trainer.resume`.
+    :param changes: arguments of the jobs to change, as for
+        :func:`~sb3_quad.training.trainer.resume`.
     :raises ConfigError: a folder that another process works on, or with a damaged ``pipeline.yml``.
     """
     status = validate(Status, *SETTINGS.read(folder / STATUS_FILE))
@@ -193,8 +241,14 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
                 config.flight_settings.with_changes(**stage.trim_env_kwargs)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
-        if stage.trim in ("position", "hover") and config.task is not None and config.flight_settings.size != OBSERVATION_SIZE:
-            raise ConfigError(f"{where}: trim {stage.trim} is for agents that see the 18 features alone")
+        if (
+            stage.trim in ("position", "hover")
+            and config.task is not None
+            and config.flight_settings.size != OBSERVATION_SIZE
+        ):
+            raise ConfigError(
+                f"{where}: trim {stage.trim} is for agents that see the 18 features alone"
+            )
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
         jobs.append(made.model_copy(update={"seed": (made.seed + stage.seed_offset) % LARGEST}))
@@ -202,7 +256,11 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
 
 
 def _train_stages(
-    folder: Path, status: Status, jobs: list[TrainingJob], report: Callable[[str], None], **changes: Any
+    folder: Path,
+    status: Status,
+    jobs: list[TrainingJob],
+    report: Callable[[str], None],
+    **changes: Any,
 ) -> PipelineResult:
     """Train what is left of the stages. A stage's run folder is noted before its training begins."""
     runs, results = [*status.runs], {}
@@ -213,7 +271,9 @@ def _train_stages(
         write()
 
     def write() -> None:
-        content = status.model_copy(update={"runs": tuple(runs)}).model_dump(mode="json", exclude_defaults=True)
+        content = status.model_copy(update={"runs": tuple(runs)}).model_dump(
+            mode="json", exclude_defaults=True
+        )
         write_text(folder / STATUS_FILE, yaml.safe_dump(content, sort_keys=False))
 
     with locked(folder, "pipeline"), StopSignals(patience=0) as signals:
@@ -234,10 +294,16 @@ def _train_stages(
                     )
                     if trained.exit_code:
                         break
-                    run, timesteps, seconds = trained.run, trained.model.num_timesteps, trained.seconds
+                    run, timesteps, seconds = (
+                        trained.run,
+                        trained.model.num_timesteps,
+                        trained.seconds,
+                    )
                 if signals.received is not None:
                     break
-                agent = str(_trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, job, run))
+                agent = str(
+                    _trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, job, run)
+                )
                 results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
         except KeyboardInterrupt:
             if signals.received is None:
@@ -248,10 +314,14 @@ def _train_stages(
 
 
 def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
-    """The zip that a stage passes on, before it is trimmed; TrainingError if it misses what the stage requires."""
+    """The zip that a stage passes on, before it is trimmed; TrainingError if it misses what the
+    stage requires.
+    """
     if run.evaluations.is_file():
         curve = read_curve(run.path)
-        share, success = (np.nan_to_num(curve.values(name)) for name in (job.config.best_by, "success"))
+        share, success = (
+            np.nan_to_num(curve.values(name)) for name in (job.config.best_by, "success")
+        )
         scores = list(zip(share, curve.reward, success, strict=True))
         _, reward, success = max(scores) if stage.pass_on == "best" else scores[-1]
         wanted = -np.inf if stage.require.mean_reward is None else stage.require.mean_reward
@@ -276,8 +346,13 @@ def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[s
     elif stage.trim == "arrival":
         flown = job.config.flight_settings.with_changes(**stage.trim_env_kwargs)
         seeds = [seed_for("trim", job.seed + i) for i in range(stage.trims)]
-        found = [trim_arrival(model, each, job.flight_settings, flown, stage.leaving_cost) for each in seeds]
-        words = "slow arrivals, failures and losses cost " + "; ".join(f"{a:.2f} s, now {b:.2f} s" for a, b in found)
+        found = [
+            trim_arrival(model, each, job.flight_settings, flown, stage.leaving_cost)
+            for each in seeds
+        ]
+        words = "slow arrivals, failures and losses cost " + "; ".join(
+            f"{a:.2f} s, now {b:.2f} s" for a, b in found
+        )
     else:
         did = trim(model, seed, job.flight_settings, stage.position_scale)
         words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"

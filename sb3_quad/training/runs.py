@@ -37,7 +37,9 @@ class RunFolder:
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
         self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run
         self.config = path / name / "config.yml"  # the settings
-        self.arguments = path / name / "args.yml"  # of the command line; env_kwargs: what the agent is judged with
+        self.arguments = (
+            path / name / "args.yml"
+        )  # of the command line; env_kwargs: what the agent is judged with
         self.command = path / name / "command.txt"  # what was typed
 
     @property
@@ -47,7 +49,9 @@ class RunFolder:
 
     @property
     def not_begun(self) -> bool:
-        """Whether the run ended before its first rollout: it holds neither a snapshot nor any model."""
+        """Whether the run ended before its first rollout: it holds neither a snapshot nor any
+        model.
+        """
         return not self.resume_state.is_file() and not any(self.path.glob("*.zip"))
 
     @property
@@ -68,7 +72,9 @@ class RunFolder:
         names = [entry.name.split("_")[2] for entry in self.path.glob("rl_model_*_steps.zip")]
         steps = [int(name) for name in names if name.isdigit()]
         if not steps:
-            raise ConfigError(f"{self.path}: holds no checkpoint; train with --save-freq to have some")
+            raise ConfigError(
+                f"{self.path}: holds no checkpoint; train with --save-freq to have some"
+            )
         return self.checkpoint(max(steps))
 
     def write_yaml(self, settings: dict[str, Any], arguments: dict[str, Any]) -> None:
@@ -89,9 +95,20 @@ class RunFolder:
 
 
 def made_with() -> dict[str, str]:
-    """The commit of the checkout, with a mark where files differ from it, and the versions of what a run is made with."""
+    """The commit of the checkout, with a mark where files differ from it, and the versions of what
+    a run is made with.
+    """
     checkout = Path(__file__).resolve().parents[2]
-    command = ["git", "-C", str(checkout), "describe", "--always", "--abbrev=40", "--exclude=*", "--dirty= and changes"]
+    command = [
+        "git",
+        "-C",
+        str(checkout),
+        "describe",
+        "--always",
+        "--abbrev=40",
+        "--exclude=*",
+        "--dirty= and changes",
+    ]
     try:
         commit = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
@@ -106,7 +123,8 @@ def file_name(env_id: str) -> str:
 
 
 def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = False) -> RunFolder:
-    """Make the folder of a new run, with the next free number; no other process can get the same one.
+    """Make the folder of a new run, with the next free number; no other process can get the same
+    one.
 
     :param unique: add a UUID to the name, as rl-zoo's ``--uuid`` does.
     :raises ConfigError: a folder that cannot be made.
@@ -116,7 +134,8 @@ def claim_run(log_folder: str | Path, algo: str, env_id: str, unique: bool = Fal
 
 
 def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
-    """Make ``<parent>/<name>_<number>`` with the next free number; no other process can get the same one.
+    """Make ``<parent>/<name>_<number>`` with the next free number; no other process can get the
+    same one.
 
     :raises ConfigError: a folder that cannot be made.
     """
@@ -133,7 +152,10 @@ def claim_folder(parent: Path, name: str, unique: bool = False) -> Path:
 
 def _runs(parent: Path, name: str) -> dict[int, Path]:
     """The folders ``<parent>/<name>_<number>…`` by their numbers."""
-    entries = {entry: entry.name.removeprefix(f"{name}_").split("_")[0] for entry in sorted(parent.glob(f"{name}_*"))}
+    entries = {
+        entry: entry.name.removeprefix(f"{name}_").split("_")[0]
+        for entry in sorted(parent.glob(f"{name}_*"))
+    }
     return {int(number): entry for entry, number in entries.items() if number.isdigit()}
 
 
@@ -164,6 +186,10 @@ def find_run(log_folder: str | Path, algo: str, env_id: str, exp_id: int = 0) ->
     if number in runs:
         return RunFolder(runs[number], name)
     if not runs:
-        raise ConfigError(f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f")
+        raise ConfigError(
+            f"{parent}: there is no run of {env_id}; give another place with --env, --algo or -f"
+        )
     there = ", ".join(entry.name for entry in runs.values())
-    raise ConfigError(f"{parent}: there is no run {name}_{number}; there is {there}; give another with --exp-id")
+    raise ConfigError(
+        f"{parent}: there is no run {name}_{number}; there is {there}; give another with --exp-id"
+    )

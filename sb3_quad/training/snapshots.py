@@ -27,8 +27,13 @@ from sb3_quad.training.algorithms import get_algorithm
 from sb3_quad.training.runs import RunFolder
 
 ENVIRONMENT = "environment."  # before the names of its arrays
-COUNTERS = {"dataset": ("added",), "replay_buffer": ("pos", "full")}  # of what a model may keep: how far it is filled
-LOG = TypeAdapter(dict[str, tuple[float, int, tuple[str, ...]]])  # by name: value, how many it is the mean of, not shown by
+COUNTERS = {
+    "dataset": ("added",),
+    "replay_buffer": ("pos", "full"),
+}  # of what a model may keep: how far it is filled
+LOG = TypeAdapter(
+    dict[str, tuple[float, int, tuple[str, ...]]]
+)  # by name: value, how many it is the mean of, not shown by
 NO_BYTES = np.zeros(0, np.uint8)
 ANY_LENGTH = ("model", "best_model", "random", "log")
 SHARE = 0.03  # of the run's time that snapshots may take
@@ -43,19 +48,23 @@ class Snapshot(NamedTuple):
 
 
 class SnapshotFile(BaseCallback):
-    """Takes a :class:`Snapshot` whenever a rollout starts, and writes that of the first, then one in so many seconds.
+    """Takes a :class:`Snapshot` whenever a rollout starts, and writes that of the first, then one
+    in so many seconds.
 
     Where writing takes long, as it does for a large dataset on a slow disk, fewer are written.
 
     :param every: seconds between two snapshots; 0: only :meth:`write` writes.
     :param report: called with one line if a snapshot cannot be written; the training goes on.
     :param hurry: whether an off-policy algorithm's next snapshot is wanted at once.
-    :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from before that update.
+    :raises TrainingError: parameters that are no longer finite; the snapshot is then the one from
+        before that update.
     """
 
     snapshot: Snapshot | None = None
 
-    def __init__(self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]) -> None:
+    def __init__(
+        self, run: RunFolder, every: float, report: Callable[[str], None], hurry: Callable[[], bool]
+    ) -> None:
         super().__init__()
         self._run, self._every, self._report, self._hurry = run, every, report, hurry
         self._state: Arrays = {}
@@ -63,25 +72,46 @@ class SnapshotFile(BaseCallback):
 
     @property
     def is_fresh(self) -> bool:
-        """Whether the rollout under way is in its first step after the snapshot, so that no buffer holds more than it."""
+        """Whether the rollout under way is in its first step after the snapshot, so that no buffer
+        holds more than it.
+        """
         after = self.num_timesteps - self.training_env.num_envs
-        return not isinstance(self.model, OffPolicyAlgorithm) or self.snapshot is None or self.snapshot.timesteps == after
+        return (
+            not isinstance(self.model, OffPolicyAlgorithm)
+            or self.snapshot is None
+            or self.snapshot.timesteps == after
+        )
 
     def _on_training_start(self) -> None:
-        if self._run.resume_state.is_file():  # the log of a resumed run says what it would have said
-            set_log(self.logger, read_arrays(self._run.resume_state, "log").get("log"), self._run.resume_state)
+        if (
+            self._run.resume_state.is_file()
+        ):  # the log of a resumed run says what it would have said
+            set_log(
+                self.logger,
+                read_arrays(self._run.resume_state, "log").get("log"),
+                self._run.resume_state,
+            )
 
     def _on_step(self) -> bool:
         return True
 
     def _on_rollout_start(self) -> None:
         start = time.monotonic()
-        if isinstance(self.model, OffPolicyAlgorithm) and start < self._taken + PAUSE and not self._hurry():
+        if (
+            isinstance(self.model, OffPolicyAlgorithm)
+            and start < self._taken + PAUSE
+            and not self._hurry()
+        ):
             return
         for name, parameter in self.model.policy.named_parameters():
             if not th.isfinite(parameter).all():
-                raise TrainingError(f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate")
-        self._taken, self.snapshot = start, Snapshot(self.model.num_timesteps, model_bytes(self.model))
+                raise TrainingError(
+                    f"after {self.num_timesteps:,} timesteps {name} is no longer finite; lower learning_rate"
+                )
+        self._taken, self.snapshot = (
+            start,
+            Snapshot(self.model.num_timesteps, model_bytes(self.model)),
+        )
         self._state = self._beside_the_model()
         start = time.monotonic()
         if self._every > 0 and start >= self._next_write:
@@ -92,18 +122,24 @@ class SnapshotFile(BaseCallback):
             self._next_write = start + max(self._every, (time.monotonic() - start) / SHARE)
 
     def _beside_the_model(self) -> Arrays:
-        """Random numbers, environments, how far files have come, and how far the dataset and buffers are filled.
+        """Random numbers, environments, how far files have come, and how far the dataset and
+        buffers are filled.
 
-        What these hold is read when the snapshot is written. A rollout later they hold more, and the oldest of a full one are
-        replaced; the resumed training adds the same rows again before it reads any.
+        What these hold is read when the snapshot is written. A rollout later they hold more, and
+        the oldest of a full one are replaced; the resumed training adds the same rows again before
+        it reads any.
         """
         model: Any = self.model
-        batch: Any = getattr(self.training_env.unwrapped, "batch", None)  # there is none in dummy and subproc
+        batch: Any = getattr(
+            self.training_env.unwrapped, "batch", None
+        )  # there is none in dummy and subproc
         state = random_state() | {"log": log_state(self.logger)}
         state |= _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {})
         episodes, best_model = self._run.episodes, self._run.best_model
         state["episodes"] = np.array(episodes.stat().st_size if episodes.is_file() else 0)
-        state["best_model"] = np.fromfile(best_model, dtype=np.uint8) if best_model.is_file() else NO_BYTES
+        state["best_model"] = (
+            np.fromfile(best_model, dtype=np.uint8) if best_model.is_file() else NO_BYTES
+        )
         return state | _counters(model)
 
     def write(self) -> None:
@@ -123,41 +159,83 @@ class SnapshotFile(BaseCallback):
         write_arrays(self._run.resume_state, **arrays)
 
 
-def load_snapshot(run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any) -> BaseAlgorithm:
-    """The model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``; what came after it is taken back.
+def load_snapshot(
+    run: RunFolder, algo: str, env: VecEnv, device: str, **attributes: Any
+) -> BaseAlgorithm:
+    """The model of a run's snapshot, ready for ``learn(…, reset_num_timesteps=False)``; what came
+    after it is taken back.
 
     :param attributes: given to ``load``: what the zip does not hold, such as ``expert``.
-    :raises ConfigError: a file that is missing or damaged, or of other settings; nothing has been taken back then.
+    :raises ConfigError: a file that is missing or damaged, or of other settings; nothing has been
+        taken back then.
     """
     path = run.resume_state
     if not path.is_file():
-        further = f"; to train its model further use -i {run.result}" if run.result.is_file() else ""
+        further = (
+            f"; to train its model further use -i {run.result}" if run.result.is_file() else ""
+        )
         raise ConfigError(f"run folder {run.path}: holds no interrupted run{further}")
     state, batch = read_arrays(path), getattr(env.unwrapped, "batch", None)
-    environment = {name.removeprefix(ENVIRONMENT): each for name, each in state.items() if name.startswith(ENVIRONMENT)}
+    environment = {
+        name.removeprefix(ENVIRONMENT): each
+        for name, each in state.items()
+        if name.startswith(ENVIRONMENT)
+    }
     algorithm = get_algorithm(algo)
     _check(state, {"model": NO_BYTES}, path)
     zip_file, where = io.BytesIO(state["model"].tobytes()), f"{path}: model"
-    model: Any = load_zip(algorithm, zip_file, where=where, env=env, device=device, force_reset=batch is None, **attributes)
+    model: Any = load_zip(
+        algorithm,
+        zip_file,
+        where=where,
+        env=env,
+        device=device,
+        force_reset=batch is None,
+        **attributes,
+    )
     one = np.array(0)
-    _check(state, {"timesteps": one, "episodes": one, "best_model": NO_BYTES, "log": np.array(""), **random_state()}, path)
+    _check(
+        state,
+        {
+            "timesteps": one,
+            "episodes": one,
+            "best_model": NO_BYTES,
+            "log": np.array(""),
+            **random_state(),
+        },
+        path,
+    )
     _check(state, _with_prefix(ENVIRONMENT, batch.snapshot() if batch is not None else {}), path)
-    _require(batch is not None or not environment, f"{ENVIRONMENT}… is of environments of another kind", path)
+    _require(
+        batch is not None or not environment,
+        f"{ENVIRONMENT}… is of environments of another kind",
+        path,
+    )
     _require(int(state["episodes"]) >= 0, "episodes is negative", path)
     try:
         set_random_state(state)
     except Exception as error:  # what is no state raises what it likes
-        _require(False, f"random and torch are no states of random numbers ({one_line(error)})", path)
+        _require(
+            False, f"random and torch are no states of random numbers ({one_line(error)})", path
+        )
     _require(model.num_timesteps == int(state["timesteps"]), "timesteps is not that of model", path)
     _check(state, _counters(model), path)
     for name, store in _stores(model).items():
         for counter in COUNTERS[name]:
             value = state[f"{name}.{counter}"].item()
-            _require(0 <= value < getattr(store, "buffer_size", np.inf), f"{name}.{counter} is beyond its rows", path)
+            _require(
+                0 <= value < getattr(store, "buffer_size", np.inf),
+                f"{name}.{counter} is beyond its rows",
+                path,
+            )
             setattr(store, counter, value)
         own = _with_prefix(f"{name}.", _filled(store))
         # What was written later than the rest may hold more rows.
-        state |= {each: state[each][: len(rows)] for each, rows in own.items() if each in state and state[each].ndim}
+        state |= {
+            each: state[each][: len(rows)]
+            for each, rows in own.items()
+            if each in state and state[each].ndim
+        }
         _check(state, own, path)
         for each, rows in own.items():
             rows[...] = state[each]
@@ -176,14 +254,19 @@ def _check(state: Arrays, expected: Arrays, path: Path) -> None:
     for name, like in expected.items():
         _require(name in state, f"{name} is missing", path)
         array = state[name]
-        kinds = [(each.dtype.kind, each.ndim) if name in ANY_LENGTH else (each.dtype, each.shape) for each in (array, like)]
+        kinds = [
+            (each.dtype.kind, each.ndim) if name in ANY_LENGTH else (each.dtype, each.shape)
+            for each in (array, like)
+        ]
         found = f"{name} is {array.dtype} of shape {array.shape}, must be {like.dtype} of shape {like.shape}"
         _require(kinds[0] == kinds[1], found, path)
 
 
 def _require(fits: bool, otherwise: str, path: Path) -> None:
     if not fits:
-        raise ConfigError(f"{path}: {otherwise}; it is damaged, or of other settings; -i trains an agent of the run further")
+        raise ConfigError(
+            f"{path}: {otherwise}; it is damaged, or of other settings; -i trains an agent of the run further"
+        )
 
 
 def _with_prefix(prefix: str, arrays: Arrays) -> Arrays:
@@ -192,13 +275,19 @@ def _with_prefix(prefix: str, arrays: Arrays) -> Arrays:
 
 def _stores(model: Any) -> dict[str, Any]:
     """What a model keeps beyond a rollout, by name."""
-    return {name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None}
+    return {
+        name: getattr(model, name) for name in COUNTERS if getattr(model, name, None) is not None
+    }
 
 
 def _counters(model: Any) -> Arrays:
     """How far these are filled."""
     stores = _stores(model)
-    return {f"{name}.{each}": np.array(getattr(stores[name], each)) for name in stores for each in COUNTERS[name]}
+    return {
+        f"{name}.{each}": np.array(getattr(stores[name], each))
+        for name in stores
+        for each in COUNTERS[name]
+    }
 
 
 def _filled(store: Any) -> Arrays:
@@ -208,11 +297,15 @@ def _filled(store: Any) -> Arrays:
     if isinstance(store.observations, dict):
         raise ConfigError("replay buffers of Dict observations are not part of a snapshot")
     rows = store.size() + 1  # the memory-efficient variant keeps the last next observation there
-    return {name: array[:rows] for name, array in vars(store).items() if isinstance(array, np.ndarray)}
+    return {
+        name: array[:rows] for name, array in vars(store).items() if isinstance(array, np.ndarray)
+    }
 
 
 def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:
-    """Let evaluations, best model and episodes be those of the snapshot, so that nothing is there twice."""
+    """Let evaluations, best model and episodes be those of the snapshot, so that nothing is there
+    twice.
+    """
     evaluations = {path: read_arrays(path) for path in run.path.glob("evaluations*.npz")}
     for path, rows in evaluations.items():
         is_table = "timesteps" in rows and len({each.shape[:1] for each in rows.values()}) == 1
@@ -232,9 +325,18 @@ def _take_back(run: RunFolder, state: Arrays, timesteps: int) -> None:
 
 
 def log_state(logger: Logger) -> Any:
-    """What was recorded since the logger's last dump, such as the losses of the latest update, as JSON."""
-    numbers = {name: value for name, value in logger.name_to_value.items() if isinstance(value, (int, float, np.number))}
-    kept = {name: (float(each), logger.name_to_count[name], logger.name_to_excluded[name]) for name, each in numbers.items()}
+    """What was recorded since the logger's last dump, such as the losses of the latest update, as
+    JSON.
+    """
+    numbers = {
+        name: value
+        for name, value in logger.name_to_value.items()
+        if isinstance(value, (int, float, np.number))
+    }
+    kept = {
+        name: (float(each), logger.name_to_count[name], logger.name_to_excluded[name])
+        for name, each in numbers.items()
+    }
     return np.array(json.dumps(kept))
 
 
@@ -253,7 +355,9 @@ def set_log(logger: Logger, state: Any, path: Path) -> None:
 
 
 def random_state() -> Arrays:
-    """The states of the global random number generators of torch, Python and NumPy, which SB3 samples from."""
+    """The states of the global random number generators of torch, Python and NumPy, which SB3
+    samples from.
+    """
     numpy_state: Any = np.random.get_state(legacy=False)  # noqa: NPY002
     numpy_state["state"]["key"] = numpy_state["state"]["key"].tolist()
     text = json.dumps([random.getstate(), numpy_state])

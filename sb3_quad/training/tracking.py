@@ -13,7 +13,11 @@ from sb3_quad.base.files import one_line
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import made_with
 
-METRICS = ("eval/success_rate", "eval/mean_reward", "rollout/ep_rew_mean")  # beside the settings, under HPARAMS
+METRICS = (
+    "eval/success_rate",
+    "eval/mean_reward",
+    "rollout/ep_rew_mean",
+)  # beside the settings, under HPARAMS
 
 
 class HyperparameterLog(BaseCallback):
@@ -21,8 +25,16 @@ class HyperparameterLog(BaseCallback):
 
     def __init__(self, job: TrainingJob) -> None:
         super().__init__()
-        given = {**job.config.settings, "algo": job.config.algo, "env": job.config.env_id, "seed": job.seed}
-        self._shown = {name: value if isinstance(value, (bool, int, float)) else str(value) for name, value in given.items()}
+        given = {
+            **job.config.settings,
+            "algo": job.config.algo,
+            "env": job.config.env_id,
+            "seed": job.seed,
+        }
+        self._shown = {
+            name: value if isinstance(value, (bool, int, float)) else str(value)
+            for name, value in given.items()
+        }
 
     def _on_training_start(self) -> None:
         shown = HParam(self._shown, dict.fromkeys(METRICS, 0.0))
@@ -34,7 +46,8 @@ class HyperparameterLog(BaseCallback):
 
 @contextmanager
 def tracked(job: TrainingJob) -> Iterator[None]:
-    """Where the job is to be tracked, a run of Weights & Biases as rl_zoo3 makes it: it takes what TensorBoard is given.
+    """Where the job is to be tracked, a run of Weights & Biases as rl_zoo3 makes it: it takes what
+    TensorBoard is given.
 
     :raises ConfigError: it cannot begin, for example without a login.
     """

@@ -1,7 +1,9 @@
-"""Runs a training job: from its settings to a run folder with a model, also after a signal or an error.
+"""Runs a training job: from its settings to a run folder with a model, also after a signal or an
+error.
 
-A snapshot of a run lies between two rollouts. Where the environments can be restored (the batched one can), the
-resumed run is bit for bit the one that was not interrupted; elsewhere episodes start anew.
+A snapshot of a run lies between two rollouts. Where the environments can be restored (the batched
+one can), the resumed run is bit for bit the one that was not interrupted; elsewhere episodes start
+anew.
 """
 
 import copy
@@ -74,8 +76,10 @@ def train(
 
     :param report: called with one line for each event.
     :param on_start: called with the run folder before the training begins.
-    :param should_continue: called after each evaluation with its success rate and mean reward; False ends the training.
-    :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model was saved.
+    :param should_continue: called after each evaluation with its success rate and mean reward;
+        False ends the training.
+    :raises SB3QuadError: bad settings; or a training that cannot go on, after the last good model
+        was saved.
     """
     config = job.config
     if job.tensorboard_log is not None:  # before there is a run folder, which would stay empty
@@ -88,33 +92,49 @@ def train(
             with locked(run.path, "run folder"):
                 run.write_yaml(config.settings, job.arguments() | made_with())
                 on_start(run)
-                return _learn(job, run, model, eval_envs, callbacks, signals, report, should_continue)
+                return _learn(
+                    job, run, model, eval_envs, callbacks, signals, report, should_continue
+                )
 
 
 def resume(run_folder: str, report: Report = print, **changes: Any) -> TrainingResult:
-    """Go on with an interrupted or killed run, in its folder: same settings, seed, optimiser, dataset and step count.
+    """Go on with an interrupted or killed run, in its folder: same settings, seed, optimiser,
+    dataset and step count.
 
     A run that has not come to its first rollout is begun; one that is complete gives its result.
 
     :param changes: arguments of the job to change, such as ``progress``.
-    :raises SB3QuadError: a folder without such a run, one that another process trains, or with damaged files; else as
-        :func:`train`.
+    :raises SB3QuadError: a folder without such a run, one that another process trains, or with
+        damaged files; else as :func:`train`.
     """
     run = open_run(run_folder)
     settings, arguments = run.read_yaml()
     if not {"algo", "env"} <= arguments.keys():
         raise ConfigError(f"{run.arguments}: algo or env is missing")
     config = build_config(str(arguments["algo"]), str(arguments["env"]), settings, str(run.config))
-    given = {key: value for key, value in arguments.items() if key not in ("algo", "env", "env_kwargs", *MADE_WITH)}
+    given = {
+        key: value
+        for key, value in arguments.items()
+        if key not in ("algo", "env", "env_kwargs", *MADE_WITH)
+    }
     job = validate(TrainingJob, {**given, **changes, "config": config}, str(run.arguments))
-    with StopSignals() as signals, locked(run.path, "run folder"), _environments(job) as (env, eval_envs):
+    with (
+        StopSignals() as signals,
+        locked(run.path, "run folder"),
+        _environments(job) as (env, eval_envs),
+    ):
         if run.timesteps >= config.n_timesteps:
-            report(f"complete, {run.timesteps:,} timesteps; to train its agent further: -i {run.path}")
+            report(
+                f"complete, {run.timesteps:,} timesteps; to train its agent further: -i {run.path}"
+            )
             return TrainingResult(job, run, load_model(run.model, job.device), trained_seconds(run))
         if run.not_begun:
             model = build_model(job, env)
         else:
-            attributes = _expert(config) | {"tensorboard_log": job.tensorboard_log, "verbose": job.verbose}
+            attributes = _expert(config) | {
+                "tensorboard_log": job.tensorboard_log,
+                "verbose": job.verbose,
+            }
             model = load_snapshot(run, config.algo, env, job.device, **attributes)
             env.seed(seed_for("training", job.seed))  # as in build_model
         report(f"going on after {model.num_timesteps:,} of {config.n_timesteps:,} timesteps")
@@ -131,13 +151,17 @@ def _environments(job: TrainingJob) -> Iterator[tuple[VecEnv, EvalEnvs]]:
     config = job.config
     evaluating: EvalEnvs = {}
     with ExitStack() as stack:
-        made = make_environments(config, config.n_envs, seed_for("training", job.seed), staggered=True)
+        made = make_environments(
+            config, config.n_envs, seed_for("training", job.seed), staggered=True
+        )
         env = stack.enter_context(closing(made))
         if job.eval_episodes > 0:
             n_envs = job.n_eval_envs or (job.eval_episodes if config.vec_env == "batch" else 1)
             for task in (None, *config.eval_tasks):
                 settings = job.for_evaluation() if task is None else job.for_evaluation(task=task)
-                made = make_environments(settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed))
+                made = make_environments(
+                    settings, min(n_envs, job.eval_episodes), seed_for("evaluation", job.seed)
+                )
                 evaluating[task] = stack.enter_context(closing(made))
         yield env, evaluating
 
@@ -156,7 +180,8 @@ def _own_callbacks(config: TrainingConfig) -> list[BaseCallback]:
 def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
     """The algorithm of a job, new, with the policy that it starts from.
 
-    :raises ConfigError: settings that it refuses, or for which this machine has too little memory; an agent that does not fit.
+    :raises ConfigError: settings that it refuses, or for which this machine has too little memory;
+        an agent that does not fit.
     :raises ExpertError: an expert that fails when it is asked for the first time.
     """
     config = job.config
@@ -166,16 +191,25 @@ def build_model(job: TrainingJob, env: VecEnv) -> BaseAlgorithm:
         keywords["action_noise"] = NOISES[config.noise_type](zeros, zeros + config.noise_std)
     if config.policy_kwargs:
         keywords["policy_kwargs"] = config.policy_kwargs
-    keywords |= {"seed": job.seed, "device": job.device, "verbose": job.verbose, "tensorboard_log": job.tensorboard_log}
+    keywords |= {
+        "seed": job.seed,
+        "device": job.device,
+        "verbose": job.verbose,
+        "tensorboard_log": job.tensorboard_log,
+    }
     try:
         model = get_algorithm(config.algo)(config.policy, env, **keywords)
     except SB3QuadError:
         raise
     except MemoryError as error:
         sizes = "n_steps by n_envs, buffer_size or dataset_capacity"
-        raise ConfigError(f"{config.algo}: {sizes} is more than this machine's memory ({one_line(error)})") from None
+        raise ConfigError(
+            f"{config.algo}: {sizes} is more than this machine's memory ({one_line(error)})"
+        ) from None
     except (TypeError, ValueError, AssertionError, RuntimeError) as error:
-        raise ConfigError(f"{config.algo} cannot be made with these settings ({one_line(error)})") from error
+        raise ConfigError(
+            f"{config.algo} cannot be made with these settings ({one_line(error)})"
+        ) from error
     asked: Callable[[], bool] = getattr(model, "will_clone", lambda: "expert" in keywords)
     if asked():  # an expert that fails does so before there is a run folder
         observation: Any = env.reset()
@@ -200,10 +234,19 @@ def _learn(
     should_continue: ShouldContinue = lambda success, reward: True,
 ) -> TrainingResult:
     config = job.config
-    last_good, best = SnapshotFile(run, job.snapshot_every, report, lambda: signals.received is not None), None
-    if config.task is not None and not (config.env_wrapper or config.vec_env_wrapper):  # flights have no wrappers
+    last_good, best = (
+        SnapshotFile(run, job.snapshot_every, report, lambda: signals.received is not None),
+        None,
+    )
+    if config.task is not None and not (
+        config.env_wrapper or config.vec_env_wrapper
+    ):  # flights have no wrappers
         job.flight_settings.write_into(model)
-    callbacks: list[BaseCallback] = [last_good, EpisodeLog(run.episodes, config.env_id), HyperparameterLog(job)]
+    callbacks: list[BaseCallback] = [
+        last_good,
+        EpisodeLog(run.episodes, config.env_id),
+        HyperparameterLog(job),
+    ]
     if eval_envs:
         best = BestModel(
             eval_envs[None],
@@ -223,19 +266,27 @@ def _learn(
     callbacks += own_callbacks
     if job.progress:
         callbacks.append(ProgressBarCallback())
-    callbacks.append(ConvertCallback(lambda local, _: signals.received is None or not last_good.is_fresh))
+    callbacks.append(
+        ConvertCallback(lambda local, _: signals.received is None or not last_good.is_fresh)
+    )
     start = time.perf_counter()
     try:
         try:
             model.learn(
                 config.n_timesteps - model.num_timesteps,
                 callback=callbacks,
-                # An off-policy algorithm counts episodes: about as many as rows end their episodes once.
+                # An off-policy algorithm counts episodes: about as many as rows end their episodes
+                # once.
                 log_interval=job.log_interval * (config.n_envs if config.is_off_policy else 1),
                 tb_log_name=f"{config.algo}_{run.path.name}",
                 reset_num_timesteps=model.num_timesteps == 0,
             )
-            if best is not None and signals.received is None and not best.stopped and best.latest < model.num_timesteps:
+            if (
+                best is not None
+                and signals.received is None
+                and not best.stopped
+                and best.latest < model.num_timesteps
+            ):
                 best.evaluate()  # a callback has ended the training before its time
         finally:
             signals.hold()
@@ -268,7 +319,9 @@ def trained_seconds(run: RunFolder) -> float:
 
 
 def _refuse_removed(run: RunFolder, timesteps: int) -> None:
-    """:raises TrainingError: the run's folder was removed while it trained, and has been made again for the model alone."""
+    """:raises TrainingError: the run's folder was removed while it trained, and has been made again
+    for the model alone.
+    """
     if not run.arguments.is_file():
         raise TrainingError(
             f"run folder {run.path}: was removed while the training wrote to it; the model after {timesteps:,} timesteps is in"
@@ -276,8 +329,12 @@ def _refuse_removed(run: RunFolder, timesteps: int) -> None:
         )
 
 
-def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None, model: BaseAlgorithm) -> None:
-    """Save the last good model; an error of this package's, or of one of its kinds, is raised anew and says where that is."""
+def _save_after(
+    error: BaseException, run: RunFolder, snapshot: Snapshot | None, model: BaseAlgorithm
+) -> None:
+    """Save the last good model; an error of this package's, or of one of its kinds, is raised anew
+    and says where that is.
+    """
     where = ""
     if snapshot is not None:
         write_bytes(run.model, snapshot.model)
@@ -286,5 +343,9 @@ def _save_after(error: BaseException, run: RunFolder, snapshot: Snapshot | None,
         raise type(error)(f"{error}{where}") from error
     if isinstance(error, (EOFError, ConnectionError)):
         raise TrainingError(f"{WORKER_ENDED}{where}") from error
-    if isinstance(error, ValueError) and not all(th.isfinite(each).all() for each in model.policy.parameters()):
-        raise TrainingError(f"the policy's parameters are no longer finite; lower learning_rate{where}") from error
+    if isinstance(error, ValueError) and not all(
+        th.isfinite(each).all() for each in model.policy.parameters()
+    ):
+        raise TrainingError(
+            f"the policy's parameters are no longer finite; lower learning_rate{where}"
+        ) from error

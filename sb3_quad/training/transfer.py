@@ -21,10 +21,11 @@ from sb3_quad.vehicles.vehicle import first_vehicle
 
 
 def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) -> dict[str, Any]:
-    """``changes`` to a settings file, and with them what makes its agent's successor: observation and networks, as in the zip.
+    """``changes`` to a settings file, and with them what makes its agent's successor: observation
+    and networks, as in the zip.
 
-    What ``changes`` give themselves holds. Evaluations fly with the agent's integral, if it has one, as it does; training does
-    without. A zip that says nothing of its flights changes nothing.
+    What ``changes`` give themselves holds. Evaluations fly with the agent's integral, if it has
+    one, as it does; training does without. A zip that says nothing of its flights changes nothing.
 
     :param config: what the file and ``changes`` alone amount to.
     """
@@ -33,31 +34,46 @@ def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) 
         return changes
     if notice := unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle)):
         tell(f"warning: {notice}; --env-kwargs vehicle:… says which")
-    seen = {name: own.observed[name] for name in ("last_action", "history", "observation_mean", "observation_std")}
+    seen = {
+        name: own.observed[name]
+        for name in ("last_action", "history", "observation_mean", "observation_std")
+    }
     flown = {"position_integral": own.observed["position_integral"]}
     given = {**changes, "env_kwargs": {**seen, **changes.get("env_kwargs", {})}}
-    given["eval_env_kwargs"] = {**flown, **config.eval_env_kwargs, **changes.get("eval_env_kwargs", {})}
+    given["eval_env_kwargs"] = {
+        **flown,
+        **config.eval_env_kwargs,
+        **changes.get("eval_env_kwargs", {}),
+    }
     if "policy_kwargs" not in changes and not config.is_off_policy:
         policy: Any = load_model(path).policy
         unit = f"nn.{policy.activation_fn.__name__}"  # as config.yml names it
-        given["policy_kwargs"] = {**config.policy_kwargs, "net_arch": policy.net_arch, "activation_fn": unit}
+        given["policy_kwargs"] = {
+            **config.policy_kwargs,
+            "net_arch": policy.net_arch,
+            "activation_fn": unit,
+        }
     return given
 
 
 def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
-    """Give ``model`` the policy and critic of an SB3 zip, of any algorithm with the same spaces and networks.
+    """Give ``model`` the policy and critic of an SB3 zip, of any algorithm with the same spaces and
+    networks.
 
-    An off-policy ``model`` also takes an agent with other networks, such as DAgger's: its actor is made to imitate that, by
-    :func:`clone_policy`, and its critic stays new. ``model`` then needs its environment.
+    An off-policy ``model`` also takes an agent with other networks, such as DAgger's: its actor is
+    made to imitate that, by :func:`clone_policy`, and its critic stays new. ``model`` then needs
+    its environment.
 
-    ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that holds. The optimiser
-    stays as it is, so a new model starts with a fresh one.
+    ``log_std`` comes from the zip, unless the model's settings give a ``log_std_init``: then that
+    holds. The optimiser stays as it is, so a new model starts with a fresh one.
 
-    :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ; the message names
-        them.
+    :raises ConfigError: a zip that is missing, not complete or not finite, or whose layers differ;
+        the message names them.
     """
     try:
-        _, parameters, _ = load_from_zip_file(path, load_data=False, device="cpu")  # unpickles nothing
+        _, parameters, _ = load_from_zip_file(
+            path, load_data=False, device="cpu"
+        )  # unpickles nothing
         theirs, ours = dict(parameters["policy"]), model.policy.state_dict()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
@@ -78,7 +94,9 @@ def transfer_policy(path: str | Path, model: BaseAlgorithm) -> None:
     except RuntimeError as error:
         what = one_line(error).partition(": ")[2]
         way_out = "train takes them from it unless --conf-file is given"
-        raise ConfigError(f"{path}: environment spaces and policy_kwargs must be the same ({what}); {way_out}") from None
+        raise ConfigError(
+            f"{path}: environment spaces and policy_kwargs must be the same ({what}); {way_out}"
+        ) from None
 
 
 CLONE_ROWS = 20_000  # states that are flown for a clone, at least
@@ -91,13 +109,16 @@ CLONE_LOG_STD = -2.0  # of a SAC actor without log_std_init; its sampled actions
 
 
 def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> float:
-    """Let the actor of ``model``, SAC's or TD3's, imitate ``teacher`` on states that the two of them fly in its environments.
+    """Let the actor of ``model``, SAC's or TD3's, imitate ``teacher`` on states that the two of
+    them fly in its environments.
 
-    A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped: no weights can be copied, so they
-    are fitted, by the squared error of the deterministic actions (an error of their arctanh would be all about the limits).
-    One half of the environments is flown by the teacher, the other by the present clone, as in DAgger: the states that the
-    clone itself gets into are among those it learns from. The deviation of a SAC actor becomes e to the ``log_std_init`` of
-    its ``policy_kwargs`` everywhere, e^-2 without one. The environments are reset afterwards by whoever learns.
+    A squashed Gaussian gives tanh of its mean, a DAgger or PPO agent a mean that is clipped: no
+    weights can be copied, so they are fitted, by the squared error of the deterministic actions (an
+    error of their arctanh would be all about the limits). One half of the environments is flown by
+    the teacher, the other by the present clone, as in DAgger: the states that the clone itself gets
+    into are among those it learns from. The deviation of a SAC actor becomes e to the
+    ``log_std_init`` of its ``policy_kwargs`` everywhere, e^-2 without one. The environments are
+    reset afterwards by whoever learns.
 
     :param teacher: what :class:`~sb3_quad.controllers.controller.Controller` takes.
     :return: root mean squared error of the last 100 steps' actions, of a range of 2.
@@ -109,25 +130,33 @@ def clone_policy(teacher: Any, model: OffPolicyAlgorithm, seed: int = 0) -> floa
     steps = max(CLONE_ROWS // n, CLONE_FLIGHT)
     optimiser = th.optim.Adam(actor.parameters(), lr=CLONE_RATE)
     states: list[Any] = []  # (n, ...) of each step
-    targets: list[Any] = []  # the teacher's actions in them as the actor gives its own, (n, actions)
+    targets: list[
+        Any
+    ] = []  # the teacher's actions in them as the actor gives its own, (n, actions)
     errors: list[float] = []
     observation: Any = env.reset()
     begins = np.ones(n, dtype=np.bool_)
     for step in range(steps):
         labels = expert.labels(observation, begins)
         states.append(observation)
-        targets.append(policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1))  # type: ignore[misc]
+        targets.append(
+            policy.scale_action(labels.reshape(n, *env.action_space.shape)).reshape(n, -1)
+        )  # type: ignore[misc]
         own, _ = model.predict(observation, deterministic=True)
         actions = np.where(flown_by_teacher, labels, own.reshape(n, -1)).reshape(own.shape)
         observation, _, begins, _ = env.step(actions)
         if (step + 1) * CLONE_ROUNDS // steps == step * CLONE_ROUNDS // steps:
             continue
-        inputs, outputs = (th.as_tensor(np.concatenate(part), device=model.device) for part in (states, targets))
+        inputs, outputs = (
+            th.as_tensor(np.concatenate(part), device=model.device) for part in (states, targets)
+        )
         for _ in range(CLONE_STEPS // CLONE_ROUNDS):
             for group in optimiser.param_groups:
                 group["lr"] = CLONE_RATE * max(1.0 - len(errors) / CLONE_STEPS, 0.01)
             rows = th.as_tensor(rng.integers(len(inputs), size=CLONE_BATCH), device=model.device)
-            loss = (policy._predict(inputs[rows], deterministic=True) - outputs[rows]).square().mean()
+            loss = (
+                (policy._predict(inputs[rows], deterministic=True) - outputs[rows]).square().mean()
+            )
             optimiser.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimiser.step()

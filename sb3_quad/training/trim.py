@@ -1,19 +1,24 @@
-"""Trimming an agent, in place: its steady offset from the target is cancelled by its own weights, so its zip stays stock.
+"""Trimming an agent, in place: its steady offset from the target is cancelled by its own weights,
+so its zip stays stock.
 
-:func:`trim` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its target, by the same vector
-wherever the target is. The thesis cancels that in the scaling of the observation (Eq. 3.16): the measured offset goes into the
-position components of μ. To make an agent quicker near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a
-constant, so that both can go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ / (α σ)):
-the agent flies without any wrapper. An α well below 1 costs recoveries and far targets; PPO after it wins them back.
+:func:`trim` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its
+target, by the same vector wherever the target is. The thesis cancels that in the scaling of the
+observation (Eq. 3.16): the measured offset goes into the position components of μ. To make an agent
+quicker near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a constant, so that
+both can go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / α) s / σ + (b - W μ /
+(α σ)): the agent flies without any wrapper. An α well below 1 costs recoveries and far targets; PPO
+after it wins them back.
 
-That fits one heading. :func:`trim_hover` is for agents whose offset turns with the heading: at its target, level and at rest,
-an agent should give hover thrust, and one that was trained by samples gives that but for a hundredth. What its last layer W, b
-must change by, D = [ΔW, Δb], follows in closed form::
+That fits one heading. :func:`trim_hover` is for agents whose offset turns with the heading: at its
+target, level and at rest, an agent should give hover thrust, and one that was trained by samples
+gives that but for a hundredth. What its last layer W, b must change by, D = [ΔW, Δb], follows in
+closed form::
 
     min  mean_ψ |h̄(ψ) D + y(ψ)|² + λ mean_s |h(s) D|²
 
-with h the input of that layer and a 1, h̄(ψ) its mean over the observation noise at the target with heading ψ, y(ψ) the mean
-action there less that of hover, and s the states of flights: a change is cheap where the agent never is.
+with h the input of that layer and a 1, h̄(ψ) its mean over the observation noise at the target with
+heading ψ, y(ψ) the mean action there less that of hover, and s the states of flights: a change is
+cheap where the agent never is.
 """
 
 from typing import Any, NamedTuple
@@ -38,14 +43,18 @@ ROUNDS = 3  # the offset is measured anew after each correction
 STIFFNESS = 0.1  # λ
 N_HEADINGS, N_SAMPLES = 72, 256  # headings, and observations of each with noise of their own
 TASKS = {"state_recovery": 0.5, "recovery_and_tracking": 0.5}
-N_FLIGHTS, STEPS, EVERY = 240, 300, 3  # flights whose states must not see a change: their first 3 s, every third step
+N_FLIGHTS, STEPS, EVERY = (
+    240,
+    300,
+    3,
+)  # flights whose states must not see a change: their first 3 s, every third step
 
 
 class Trim(NamedTuple):
     """What trimming did.
 
-    :param before: size of the steady offset in m; of :func:`trim_hover`, the mean action at the target less that of hover,
-        root mean square over headings and rotors.
+    :param before: size of the steady offset in m; of :func:`trim_hover`, the mean action at the
+        target less that of hover, root mean square over headings and rotors.
     :param after: the same, after it.
     """
 
@@ -53,13 +62,16 @@ class Trim(NamedTuple):
     after: float
 
 
-def trim(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0) -> Trim:
+def trim(
+    model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0
+) -> Trim:
     """Find μ for an agent and fold it into its first layer, and α before it.
 
     :param scale: α.
     :param seed: of the flights that measure it.
     :param settings: vehicle, noise and scaling that the agent flies with.
-    :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not read the 18 features.
+    :raises ConfigError: an agent that crashes on the way to targets, or whose first layer does not
+        read the 18 features.
     """
     own = settings or FlightSettings()
     first_layer(model)
@@ -74,9 +86,13 @@ def trim(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = 
 
 
 def hover_offset(
-    controller: Any, n_flights: int = N_OFFSETS, seed: int = 0, settings: FlightSettings | None = None
+    controller: Any,
+    n_flights: int = N_OFFSETS,
+    seed: int = 0,
+    settings: FlightSettings | None = None,
 ) -> FloatArray:
-    """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking, over the flights that last.
+    """Mean of r - r_T, shape (3,), world frame, m, after 15 s of target tracking, over the flights
+    that last.
 
     :param settings: how it flies; task and episode length are those of this measurement.
     :raises ConfigError: a controller that crashes on the way in more than half of the flights.
@@ -113,10 +129,13 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
 
     :param seed: of the flights and of the observation noise.
     :param settings: vehicle, noise and scaling that the agent flies with.
-    :raises ConfigError: an agent whose last layer is not linear, or that does not read the 18 features.
+    :raises ConfigError: an agent whose last layer is not linear, or that does not read the 18
+        features.
     """
     layer = getattr(model.policy, "action_net", None)
-    reads = model.observation_space.shape == (OBSERVATION_SIZE,) and not hasattr(model.policy, "lstm_actor")
+    reads = model.observation_space.shape == (OBSERVATION_SIZE,) and not hasattr(
+        model.policy, "lstm_actor"
+    )
     if not isinstance(layer, th.nn.Linear) or not reads:
         raise ConfigError("trimming needs an MlpPolicy that reads the 18 features")
     own = settings or FlightSettings()
@@ -127,7 +146,9 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
     flown = _latents(model, np.concatenate(seen.kept[::EVERY]))
     hover = first_vehicle(own.vehicle).hover_action
     with th.no_grad():
-        weights = th.cat([layer.weight, layer.bias[:, None]], dim=1).T.double()  # (inputs + 1, actions)
+        weights = th.cat(
+            [layer.weight, layer.bias[:, None]], dim=1
+        ).T.double()  # (inputs + 1, actions)
         before = at_target @ weights - hover
         metric = at_target.T @ at_target / len(at_target) + STIFFNESS * flown.T @ flown / len(flown)
         metric += 1e-6 * th.eye(len(metric), dtype=metric.dtype)
@@ -143,11 +164,17 @@ def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Lin
 
     :raises ConfigError: it has none.
     """
-    owner = getattr(model.policy, "actor", None) or getattr(model.policy, "mlp_extractor", None)  # an actor: of SAC or TD3
-    found = [getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)]
+    owner = getattr(model.policy, "actor", None) or getattr(
+        model.policy, "mlp_extractor", None
+    )  # an actor: of SAC or TD3
+    found = [
+        getattr(owner, name) for name in ("policy_net", "latent_pi", "mu") if hasattr(owner, name)
+    ]
     layer = next(iter(found[0]), None) if found else None
     if not isinstance(layer, th.nn.Linear) or layer.in_features != size:
-        raise ConfigError(f"trimming needs an MlpPolicy whose first layer reads the {size} features")
+        raise ConfigError(
+            f"trimming needs an MlpPolicy whose first layer reads the {size} features"
+        )
     return layer
 
 
@@ -157,7 +184,13 @@ class _Observations(Hook):
     def __init__(self) -> None:
         self.kept: list[Float32Array] = []
 
-    def before_step(self, state: QuadcopterState, observation: Float32Array, wrench: FloatArray, flying: BoolArray) -> None:
+    def before_step(
+        self,
+        state: QuadcopterState,
+        observation: Float32Array,
+        wrench: FloatArray,
+        flying: BoolArray,
+    ) -> None:
         self.kept.append(observation[flying])
 
 
@@ -176,7 +209,9 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
     heading = np.repeat(np.linspace(0.0, 2.0 * np.pi, N_HEADINGS, endpoint=False), N_SAMPLES)
     features = np.zeros((heading.size, OBSERVATION_SIZE))
     cosine, sine, zero = np.cos(heading), np.sin(heading), np.zeros(heading.size)
-    features[:, GROUPS["rotation"]] = np.stack([cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1], axis=1)
+    features[:, GROUPS["rotation"]] = np.stack(
+        [cosine, sine, zero, -sine, cosine, zero, zero, zero, zero + 1], axis=1
+    )
     mean, std = scaling(settings)
     relative, additive = (level.mean() for level in levels(settings.noise))
     features *= 1.0 + relative * rng.standard_normal(features.shape)
@@ -186,5 +221,9 @@ def _at_target(settings: FlightSettings, rng: np.random.Generator) -> Float32Arr
 
 def scaling(settings: FlightSettings) -> tuple[FloatArray, FloatArray]:
     """μ and σ of Eq. 3.16, (18,) both."""
-    mean = DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
-    return mean, DEFAULT_STD if settings.observation_std is None else np.asarray(settings.observation_std)
+    mean = (
+        DEFAULT_MEAN if settings.observation_mean is None else np.asarray(settings.observation_mean)
+    )
+    return mean, DEFAULT_STD if settings.observation_std is None else np.asarray(
+        settings.observation_std
+    )

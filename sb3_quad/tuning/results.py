@@ -22,7 +22,18 @@ def write_results(search: Search) -> None:
     """
     folder, best = Path(search.job.log_folder), search.best
     rows = list[dict[str, Any]]()
-    head = ["number", "state", "value", SUCCESS, REWARD, "evaluations", "seconds", *search.space.dimensions, RUN, ERROR]
+    head = [
+        "number",
+        "state",
+        "value",
+        SUCCESS,
+        REWARD,
+        "evaluations",
+        "seconds",
+        *search.space.dimensions,
+        RUN,
+        ERROR,
+    ]
     for trial in search.trials():
         own = {
             "number": trial.number,
@@ -31,7 +42,9 @@ def write_results(search: Search) -> None:
             "evaluations": len(trial.intermediate_values),
             "seconds": None if trial.duration is None else round(trial.duration.total_seconds(), 2),
         }
-        error = {ERROR: INTERRUPTED} if trial.state.name == "FAIL" else {}  # of a process that was killed
+        error = (
+            {ERROR: INTERRUPTED} if trial.state.name == "FAIL" else {}
+        )  # of a process that was killed
         rows.append({**error, **trial.user_attrs, **varied(search, trial), **own})
     write_csv(folder / TRIALS, head, rows)
     if best is not None:
@@ -53,7 +66,10 @@ def settings_of(trial: FrozenTrial) -> dict[str, Any]:
 def varied(search: Search, trial: FrozenTrial) -> dict[str, Any]:
     """The settings of a trial that the search varies."""
     settings = settings_of(trial)
-    return {name: current(search.job.config.algo, settings, name) if settings else None for name in search.space.dimensions}
+    return {
+        name: current(search.job.config.algo, settings, name) if settings else None
+        for name in search.space.dimensions
+    }
 
 
 def in_words(search: Search, trial: FrozenTrial) -> str:
@@ -69,7 +85,9 @@ def trial_line(search: Search, trial: FrozenTrial) -> str:
         how = f"failed: {trial.user_attrs.get(ERROR, INTERRUPTED)}"
     else:
         how = f"{STATES[trial.state.name]}, {in_words(search, trial)}"
-    mark = " (best so far)" if search.best is not None and search.best.number == trial.number else ""
+    mark = (
+        " (best so far)" if search.best is not None and search.best.number == trial.number else ""
+    )
     values = " ".join(f"{name}:{value}" for name, value in varied(search, trial).items())
     return f"trial {trial.number} {how}{mark} ({values})"
 

@@ -1,4 +1,6 @@
-"""Layouts: the order of a vehicle's rotors and its body axes, and how those of one vehicle become those of another."""
+"""Layouts: the order of a vehicle's rotors and its body axes, and how those of one vehicle become
+those of another.
+"""
 
 import itertools
 import math
@@ -10,8 +12,12 @@ import numpy.typing as npt
 
 from sb3_quad.base.arrays import FloatArray
 
-TOLERANCE = math.radians(20.0)  # by which rotors in the same place may differ, seen from the centre of mass
-_SLACK = math.radians(1.0)  # of angles that are taken for equal, since published positions are rounded
+TOLERANCE = math.radians(
+    20.0
+)  # by which rotors in the same place may differ, seen from the centre of mass
+_SLACK = math.radians(
+    1.0
+)  # of angles that are taken for equal, since published positions are rounded
 
 
 class Turn(NamedTuple):
@@ -37,9 +43,13 @@ class Turn(NamedTuple):
 
 
 def find_turn(
-    ours: npt.ArrayLike, our_directions: Sequence[int], theirs: npt.ArrayLike, their_directions: Sequence[int]
+    ours: npt.ArrayLike,
+    our_directions: Sequence[int],
+    theirs: npt.ArrayLike,
+    their_directions: Sequence[int],
 ) -> Turn | None:
-    """The turn that brings rotors to where others are, each to one with the same sign of its yaw moment; None: there is none.
+    """The turn that brings rotors to where others are, each to one with the same sign of its yaw
+    moment; None: there is none.
 
     Of turns that fit equally well it is the smallest.
 
@@ -57,4 +67,8 @@ def find_turn(
         found.append((misfit, Turn(eighth if abs(angle - eighth) < _SLACK else angle, order)))
     least = min(misfit for misfit, _ in found)
     fitting = [turn for misfit, turn in found if misfit < least + _SLACK]
-    return min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle)) if least < TOLERANCE else None
+    return (
+        min(fitting, key=lambda turn: (round(abs(turn.angle), 6), -turn.angle))
+        if least < TOLERANCE
+        else None
+    )

@@ -1,4 +1,6 @@
-"""Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files that hold them."""
+"""Vehicles: the validated parameters of one quadcopter, their derived values, and the YAML files
+that hold them.
+"""
 
 import math
 from collections.abc import Mapping
@@ -18,18 +20,32 @@ from sb3_quad.vehicles.layout import Turn, find_turn
 
 VEHICLES = YamlFolder("vehicle", "sb3_quad.vehicles")
 MAX_SUBSTEPS = 1000  # physics steps in a control step
-INACCURACY = 1.05  # of published moments of inertia: what the largest may be by the sum of the other two
+INACCURACY = (
+    1.05  # of published moments of inertia: what the largest may be by the sum of the other two
+)
 MAX_PHYSICS_STEP = 0.0025  # s, for which the compiled rotation is exact
 PerRotor = tuple[tuple[float, float], tuple[float, float], tuple[float, float], tuple[float, float]]
 
-# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of an array (parameters, n).
+# What the compiled kernel needs of a vehicle, in the order of Vehicle.parameters(); a row each of
+# an array (parameters, n).
 PARAMETER_NAMES = (
-    *("mass", "ixx", "iyy", "izz", "thrust_coefficient", "motor_gain_up", "motor_gain_down", "exact_motors"),
+    *(
+        "mass",
+        "ixx",
+        "iyy",
+        "izz",
+        "thrust_coefficient",
+        "motor_gain_up",
+        "motor_gain_down",
+        "exact_motors",
+    ),
     *("gravity", "drag_x", "drag_y", "drag_z"),
     *("hover_thrust", "thrust_middle", "thrust_half_range", "collision_radius", "delay"),
     *(f"{axis}_arm_{rotor}" for axis in ("roll", "pitch", "yaw") for rotor in range(4)),
 )
-NAME = r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
+NAME = (
+    r"^[^/\\<>\p{C}]{1,100}$"  # is part of file names, and of what reports and exported files say
+)
 Limits = tuple[NonNegativeFloat, PositiveFloat]
 MOTOR_GAINS = ("motor_gain_up", "motor_gain_down")
 _FOUND = ("geometric_gains", "time_optimal")  # for a vehicle
@@ -37,24 +53,30 @@ LIMITS = ("thrust_limits", "rotor_thrust_limits", "rotor_speed_limits")
 
 
 class Vehicle(Frozen):
-    """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that follow from them.
+    """The parameters of one quadcopter (specification table; thesis 4.1.1) and the values that
+    follow from them.
 
-    The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover thrusts,
-    ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. These become ``thrust_limits``, which a copy with another
-    mass keeps, and are None. ``motor_gain`` stands for ``motor_gain_up`` and ``motor_gain_down`` where both are the same.
+    The rotors' limits may be given as they are published: instead of ``thrust_limits``, in hover
+    thrusts, ``rotor_thrust_limits`` in N or ``rotor_speed_limits`` in rad/s. These become
+    ``thrust_limits``, which a copy with another mass keeps, and are None. ``motor_gain`` stands for
+    ``motor_gain_up`` and ``motor_gain_down`` where both are the same.
 
-    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises :class:`ConfigError`
-    through :func:`load_vehicle`, pydantic's ``ValidationError`` when built directly.
+    Frozen: ``vehicle.model_copy(update={"mass": 2.0})`` makes another, validated as well. Raises
+    :class:`ConfigError` through :func:`load_vehicle`, pydantic's ``ValidationError`` when built
+    directly.
     """
 
     name: str = Field(
-        pattern=NAME, description="what the vehicle is called; up to 100 characters, none of / \\ < > or control"
+        pattern=NAME,
+        description="what the vehicle is called; up to 100 characters, none of / \\ < > or control",
     )
     mass: PositiveFloat = Field(description="m, kg")
     inertia: tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         description="Ixx, Iyy, Izz of the diagonal inertia, kg m^2"
     )
-    rotor_positions: PerRotor = Field(description="x, y of each rotor in the body frame (x forward, y left), m")
+    rotor_positions: PerRotor = Field(
+        description="x, y of each rotor in the body frame (x forward, y left), m"
+    )
     rotor_directions: tuple[int, int, int, int] = Field(
         description="sign of the yaw moment of each rotor: two of 1, two of -1"
     )
@@ -67,20 +89,35 @@ class Vehicle(Frozen):
         description="euler: Eq. 4.1 as printed, thrust of the new speed; exact: the speed's exponential, thrust of its middle",
     )
     drag: tuple[NonNegativeFloat, NonNegativeFloat, NonNegativeFloat] = Field(
-        default=(0.0, 0.0, 0.0), description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)"
+        default=(0.0, 0.0, 0.0),
+        description="d of the drag -d (v - wind) along each body axis, N s/m (Faessler et al. 2018)",
     )
     gravity: PositiveFloat = Field(default=9.81, description="g, m/s^2")
     thrust_limits: Limits = Field(
-        default=(0.0, 0.0), description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)"
+        default=(0.0, 0.0),
+        description="least and greatest rotor thrust in hover thrusts m g / 4 (Eq. 3.18)",
     )
-    rotor_thrust_limits: Limits | None = Field(default=None, exclude=True, description="the same in N")
-    rotor_speed_limits: Limits | None = Field(default=None, exclude=True, description="the same as rotor speeds, rad/s")
-    physics_step: PositiveFloat = Field(default=0.0025, le=MAX_PHYSICS_STEP, description="s; at most 0.0025")
-    control_step: PositiveFloat = Field(default=0.01, description="s; a whole number of physics steps")
-    delay: int = Field(default=1, ge=0, le=100, description="control steps from a command to its effect")
-    collision_radius: PositiveFloat = Field(description="radius of the collision sphere at the centre of mass, m")
+    rotor_thrust_limits: Limits | None = Field(
+        default=None, exclude=True, description="the same in N"
+    )
+    rotor_speed_limits: Limits | None = Field(
+        default=None, exclude=True, description="the same as rotor speeds, rad/s"
+    )
+    physics_step: PositiveFloat = Field(
+        default=0.0025, le=MAX_PHYSICS_STEP, description="s; at most 0.0025"
+    )
+    control_step: PositiveFloat = Field(
+        default=0.01, description="s; a whole number of physics steps"
+    )
+    delay: int = Field(
+        default=1, ge=0, le=100, description="control steps from a command to its effect"
+    )
+    collision_radius: PositiveFloat = Field(
+        description="radius of the collision sphere at the centre of mass, m"
+    )
     geometric_gains: GeometricGains | None = Field(
-        default=None, description="gains of the geometric expert, found for this vehicle; without them it derives its own"
+        default=None,
+        description="gains of the geometric expert, found for this vehicle; without them it derives its own",
     )
     time_optimal: dict[PositiveFloat, PositiveFloat] | None = Field(
         default=None,
@@ -101,7 +138,11 @@ class Vehicle(Frozen):
     @model_validator(mode="after")
     def _limits_as_published(self) -> "Vehicle":
         """``rotor_thrust_limits`` or ``rotor_speed_limits`` as ``thrust_limits`` (F = kF ω²)."""
-        given = [name for name in LIMITS if name in self.model_fields_set and getattr(self, name) is not None]
+        given = [
+            name
+            for name in LIMITS
+            if name in self.model_fields_set and getattr(self, name) is not None
+        ]
         if len(given) != 1:
             raise ValueError(f"{' and '.join(given or LIMITS)}: give exactly one of them")
         low, high = getattr(self, given[0])
@@ -110,7 +151,10 @@ class Vehicle(Frozen):
                 raise ValueError(f"{given[0]} [{low:g}, {high:g}]: must rise")
             if given[0] == "rotor_speed_limits":
                 low, high = self.thrust_coefficient * low**2, self.thrust_coefficient * high**2
-            own = {"thrust_limits": (low / self.hover_thrust, high / self.hover_thrust), given[0]: None}
+            own = {
+                "thrust_limits": (low / self.hover_thrust, high / self.hover_thrust),
+                given[0]: None,
+            }
             for name, value in own.items():
                 object.__setattr__(self, name, value)
         return self
@@ -120,9 +164,13 @@ class Vehicle(Frozen):
         low, high = self.thrust_limits
         if not low < 1.0 < high:
             limits = f"thrust_limits [{low:.4g}, {high:.4g}] for a mass of {self.mass:g} kg"
-            raise CannotHover(f"{limits}: hover (1.0) must lie between them, or it cannot hover; is the mass in kg?")
+            raise CannotHover(
+                f"{limits}: hover (1.0) must lie between them, or it cannot hover; is the mass in kg?"
+            )
         if sorted(self.rotor_directions) != [-1, -1, 1, 1]:
-            raise ValueError(f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1")
+            raise ValueError(
+                f"rotor_directions {list(self.rotor_directions)}: must be two of 1 and two of -1"
+            )
         if self.largest_moment > INACCURACY:
             raise ValueError(f"inertia {list(self.inertia)}: {self.inertia_fault}")
         substeps = self.control_step / self.physics_step
@@ -133,35 +181,49 @@ class Vehicle(Frozen):
             )
         gain = max(self.motor_gain_up, self.motor_gain_down)
         if gain * self.physics_step > 1.0:
-            raise ValueError(f"motor_gain {gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)")
+            raise ValueError(
+                f"motor_gain {gain}: times physics_step it may not exceed 1 (Eq. 4.1 would overshoot)"
+            )
         mixer = self.mixer
         if abs(np.linalg.det(mixer)) < 1e-12:
-            raise ValueError("rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently")
+            raise ValueError(
+                "rotor_positions: these rotors cannot give thrust, roll, pitch and yaw independently"
+            )
         if not np.allclose(mixer[1:].sum(axis=1), 0.0, atol=1e-9):
             raise ValueError(
                 "rotor_positions: equal thrusts must give no moment (rotors symmetrical about the centre of mass)"
             )
         return self
 
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> "Vehicle":
+    def model_copy(
+        self, *, update: Mapping[str, Any] | None = None, deep: bool = False
+    ) -> "Vehicle":
         """Another vehicle that differs in ``update``; unlike pydantic's own, it is validated.
 
-        ``geometric_gains`` and ``time_optimal`` were found for this vehicle: one that differs in more than its name and its
-        gains has none, unless ``update`` brings some.
+        ``geometric_gains`` and ``time_optimal`` were found for this vehicle: one that differs in
+        more than its name and its gains has none, unless ``update`` brings some.
         """
         changes = dict(update or {})
         if changes.keys() - {"name", "geometric_gains"}:
             changes = {**dict.fromkeys(_FOUND), **changes}
         replaced = {*MOTOR_GAINS} if "motor_gain" in changes else set()
-        own = self.model_dump(exclude=replaced | {"thrust_limits"} if changes.keys() & {*LIMITS} else replaced)
+        own = self.model_dump(
+            exclude=replaced | {"thrust_limits"} if changes.keys() & {*LIMITS} else replaced
+        )
         return Vehicle.model_validate({**own, **changes})
 
     def turn_to(self, other: "Vehicle") -> Turn:
-        """The turn of the body axes, and the order of the rotors, by which each is where ``other`` has it.
+        """The turn of the body axes, and the order of the rotors, by which each is where ``other``
+        has it.
 
         :raises ConfigError: there is none.
         """
-        turn = find_turn(self.rotor_positions, self.rotor_directions, other.rotor_positions, other.rotor_directions)
+        turn = find_turn(
+            self.rotor_positions,
+            self.rotor_directions,
+            other.rotor_positions,
+            other.rotor_directions,
+        )
         if turn is None:
             raise ConfigError(
                 f"rotor_layout: no turn brings the rotors of {self.name} to where those of {other.name} are, directions "
@@ -170,13 +232,14 @@ class Vehicle(Frozen):
         return turn
 
     def in_layout_of(self, other: "Vehicle") -> "Vehicle":
-        """The same vehicle, its body axes turned about z and its rotors renumbered: each is where ``other`` has it.
+        """The same vehicle, its body axes turned about z and its rotors renumbered: each is where
+        ``other`` has it.
 
-        A policy knows one order of the rotors. So it can fly vehicles that number theirs in another way, or whose rotors form
-        a plus instead of an X.
+        A policy knows one order of the rotors. So it can fly vehicles that number theirs in another
+        way, or whose rotors form a plus instead of an X.
 
-        :raises ConfigError: no turn brings its rotors there; or it would turn axes of different moments of inertia, off which
-            there are products of inertia.
+        :raises ConfigError: no turn brings its rotors there; or it would turn axes of different
+            moments of inertia, off which there are products of inertia.
         """
         turn = self.turn_to(other)
         if turn == Turn():
@@ -207,10 +270,13 @@ class Vehicle(Frozen):
     def mixer(self) -> FloatArray:
         """[ΣF; Mx; My; Mz] = mixer · F, shape (4, 4), from rotor thrusts in N.
 
-        Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and pitch.
+        Eq. 2.7 prints this for a plus layout; ITM's rotors form an X, so that each acts on roll and
+        pitch.
         """
         x, y = np.array(self.rotor_positions).T
-        return np.stack([np.ones(4), y, -x, self.moment_thrust_ratio * np.array(self.rotor_directions)])
+        return np.stack(
+            [np.ones(4), y, -x, self.moment_thrust_ratio * np.array(self.rotor_directions)]
+        )
 
     @property
     def mixer_inverse(self) -> FloatArray:
@@ -240,7 +306,9 @@ class Vehicle(Frozen):
 
     @property
     def command_lag(self) -> float:
-        """τ, from a command to its thrust, s: delay, half the control step it is held for, and the motors' time constant."""
+        """τ, from a command to its thrust, s: delay, half the control step it is held for, and the
+        motors' time constant.
+        """
         return (self.delay + 0.5) * self.control_step + self.motor_time_constant
 
     @property
@@ -251,12 +319,16 @@ class Vehicle(Frozen):
     @property
     def greatest_moments(self) -> FloatArray:
         """(3,), N m, about roll, pitch and yaw; the other axes and the thrust left to themselves."""
-        low, high = self.thrust_range  # equal thrusts give no moment: what counts is how far each can go from the middle
+        low, high = (
+            self.thrust_range
+        )  # equal thrusts give no moment: what counts is how far each can go from the middle
         return np.asarray(np.abs(self.mixer[1:]).sum(axis=1) * (high - low) / 2)
 
     @property
     def gyration_ratios(self) -> FloatArray:
-        """(3,), radii of gyration √(I/m) by the arm length; above 1 the mass would lie beyond the rotors."""
+        """(3,), radii of gyration √(I/m) by the arm length; above 1 the mass would lie beyond the
+        rotors.
+        """
         return np.asarray(np.sqrt(np.array(self.inertia) / self.mass) / self.arm_length)
 
     @property
@@ -287,7 +359,9 @@ class Vehicle(Frozen):
         return round(self.control_step / self.physics_step)
 
     def thrust_to_action(self, thrust: FloatArray) -> FloatArray:
-        """Actions in [-1, 1] from rotor thrusts in N, any shape; the inverse of Eq. 3.18 (not clipped)."""
+        """Actions in [-1, 1] from rotor thrusts in N, any shape; the inverse of Eq. 3.18 (not
+        clipped).
+        """
         low, high = self.thrust_range
         return (thrust - (high + low) / 2) / ((high - low) / 2)
 
@@ -297,28 +371,47 @@ class Vehicle(Frozen):
         return (high + low) / 2 + (high - low) / 2 * np.clip(action, -1.0, 1.0)
 
     def parameters(self) -> FloatArray:
-        """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of ``PARAMETER_NAMES``."""
+        """What the compiled kernel needs, shape (len(PARAMETER_NAMES),), in the order of
+        ``PARAMETER_NAMES``.
+        """
         low, high = self.thrust_range
         motors = self.motor_gain_up, self.motor_gain_down, self.motor_integration == "exact"
-        head = (self.mass, *self.inertia, self.thrust_coefficient, *motors, self.gravity, *self.drag)
-        tail = (self.hover_thrust, (high + low) / 2, (high - low) / 2, self.collision_radius, self.delay)
+        head = (
+            self.mass,
+            *self.inertia,
+            self.thrust_coefficient,
+            *motors,
+            self.gravity,
+            *self.drag,
+        )
+        tail = (
+            self.hover_thrust,
+            (high + low) / 2,
+            (high - low) / 2,
+            self.collision_radius,
+            self.delay,
+        )
         return np.array([*head, *tail, *self.mixer[1:].ravel()], dtype=np.float64)
 
 
 def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     """A vehicle by name (``"itm"``), by the path of a YAML file, or as it is.
 
-    An inertia of a user's file that no rigid body has, but within ``INACCURACY``, is said once on stderr.
+    An inertia of a user's file that no rigid body has, but within ``INACCURACY``, is said once on
+    stderr.
 
     :raises CannotHover: the only fault of the file is that hover is not between the rotors' limits.
-    :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown, missing or out of range.
+    :raises ConfigError: an unknown name, a missing or unreadable file, or a key that is unknown,
+        missing or out of range.
     """
     if isinstance(source, Vehicle):
         return source
     data, where = VEHICLES.read(source if isinstance(source, Path) else str(source))
     vehicle = validate(Vehicle, data, where)
     if vehicle.inertia_fault and VEHICLES.is_path(source):
-        tell(f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; it is flown as it is")
+        tell(
+            f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; it is flown as it is"
+        )
     return vehicle
 
 

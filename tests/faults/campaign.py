@@ -1,9 +1,11 @@
-"""Kills commands at random moments, lets them go on, and compares what they leave with what undisturbed ones leave.
+"""Kills commands at random moments, lets them go on, and compares what they leave with what
+undisturbed ones leave.
 
     python tests/faults/campaign.py FOLDER KILLS [SEED]
 
-Prints a line for each kill that cost something, and in the end how many there were. Exit code 1 if any did. Commands run in
-forks of this process, which has imported everything and has no threads: a kill may then hit their first millisecond.
+Prints a line for each kill that cost something, and in the end how many there were. Exit code 1 if
+any did. Commands run in forks of this process, which has imported everything and has no threads: a
+kill may then hit their first millisecond.
 """
 
 import csv
@@ -50,8 +52,16 @@ OFF_POLICY = {
     "buffer_size": 2000,
     "batch_size": 64,
 }
-SETTINGS = {"dagger": DAGGER, "tune": {**DAGGER, "n_timesteps": 4000}, "sac": OFF_POLICY, "sac_bc": OFF_POLICY}
-MARKS = {"pipeline": "pipeline.yml", "sweep": "plan.json"}  # what a folder has that somebody goes on with; a run */args.yml
+SETTINGS = {
+    "dagger": DAGGER,
+    "tune": {**DAGGER, "n_timesteps": 4000},
+    "sac": OFF_POLICY,
+    "sac_bc": OFF_POLICY,
+}
+MARKS = {
+    "pipeline": "pipeline.yml",
+    "sweep": "plan.json",
+}  # what a folder has that somebody goes on with; a run */args.yml
 NUMBERED = r"(Quad[A-Za-z]+-v0|pipeline|sweep)_\d+"
 SUITE = """
 name: one
@@ -61,7 +71,9 @@ scenarios:
 """
 SWEEP = {
     **{key: DAGGER[key] for key in ("n_timesteps", "n_envs", "env_kwargs")},
-    "hyperparams": {key: DAGGER[key] for key in DAGGER if key not in ("n_timesteps", "n_envs", "env_kwargs")},
+    "hyperparams": {
+        key: DAGGER[key] for key in DAGGER if key not in ("n_timesteps", "n_envs", "env_kwargs")
+    },
     "name": "sweep",
     "conf_file": "nominal/dagger.yml",
     "algo": "dagger",
@@ -98,7 +110,16 @@ def command(kind: str, folder: Path) -> list[str]:
     folder.mkdir(exist_ok=True)
     if kind == "evaluate":
         settings.write_text(SUITE)
-        return ["evaluate", "pid", "geometric", "itm-recovery", "--suite", str(settings), "-o", str(logs / kind / "out")]
+        return [
+            "evaluate",
+            "pid",
+            "geometric",
+            "itm-recovery",
+            "--suite",
+            str(settings),
+            "-o",
+            str(logs / kind / "out"),
+        ]
     small = {"QuadTargetTracking-v0": SETTINGS.get(kind, TINY)}
     settings.write_text(yaml.safe_dump({"stages": STAGES} if kind == "pipeline" else small))
     if kind == "sweep":
@@ -108,15 +129,33 @@ def command(kind: str, folder: Path) -> list[str]:
     if kind == "tune":
         space = folder / "space.yml"
         space.write_text("learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}\n")
-        more += ["--search-space", str(space), "--storage", str(folder / "study.log"), "--max-total-trials", "3"]
+        more += [
+            "--search-space",
+            str(space),
+            "--storage",
+            str(folder / "study.log"),
+            "--max-total-trials",
+            "3",
+        ]
         return ["tune", "--algo", "dagger", *more, "--eval-episodes", "4", "--n-evaluations", "2"]
     single = [] if kind == "pipeline" else ["--algo", kind, "--env", "QuadTargetTracking-v0"]
-    often = ["--eval-freq", "1500", "--eval-episodes", "4", "--save-freq", "4000", "--snapshot-every", "0.2"]
+    often = [
+        "--eval-freq",
+        "1500",
+        "--eval-episodes",
+        "4",
+        "--save-freq",
+        "4000",
+        "--snapshot-every",
+        "0.2",
+    ]
     return ["train", *single, *more, *often]
 
 
 def forked(arguments: list[str], log: Path, folder: str | Path = ".", seconds: int = 0) -> int:
-    """The process of a command that begins in ``folder``, reads nothing, and is ended after so many seconds, if any."""
+    """The process of a command that begins in ``folder``, reads nothing, and is ended after so many
+    seconds, if any.
+    """
     child = os.fork()
     if child > 0:
         return child
@@ -151,8 +190,12 @@ def run(arguments: list[str], log: Path, kill_after: float | None = None) -> int
 
 
 def again(kind: str, folder: Path) -> list[str]:
-    """What a user types after a kill: ``--resume``, or the same command if there is nothing to go on with yet."""
-    begun = {"pipeline": "pipeline/*/pipeline.yml", "sweep": "sweep/*/plan.json"}.get(kind, f"{kind}/*/*/args.yml")
+    """What a user types after a kill: ``--resume``, or the same command if there is nothing to go
+    on with yet.
+    """
+    begun = {"pipeline": "pipeline/*/pipeline.yml", "sweep": "sweep/*/plan.json"}.get(
+        kind, f"{kind}/*/*/args.yml"
+    )
     found = sorted(folder.glob(f"logs/{begun}"))
     if not found:
         return command(kind, folder)
@@ -161,33 +204,54 @@ def again(kind: str, folder: Path) -> list[str]:
 
 
 def never_began(path: Path) -> bool:
-    """Whether a file is in a folder of a command that was killed before it had written its settings; it is nobody's."""
+    """Whether a file is in a folder of a command that was killed before it had written its
+    settings; it is nobody's.
+    """
     folders = [each for each in path.parents if re.fullmatch(NUMBERED, each.name)]
-    return not all(any(each.glob(MARKS.get(each.name.rpartition("_")[0], "*/args.yml"))) for each in folders)
+    return not all(
+        any(each.glob(MARKS.get(each.name.rpartition("_")[0], "*/args.yml"))) for each in folders
+    )
 
 
 def outcome(folder: Path) -> dict[str, object]:
-    """What a command has left, by file: weights of agents, all arrays and numbers but seconds and dates; only names else.
+    """What a command has left, by file: weights of agents, all arrays and numbers but seconds and
+    dates; only names else.
 
     Of a search: settings and values of its trials that were finished, in their order.
     """
     found: dict[str, object] = {}
-    tables = sorted(folder.glob("logs/tune/*/*/trials.csv"), key=lambda path: path.stat().st_mtime_ns)
+    tables = sorted(
+        folder.glob("logs/tune/*/*/trials.csv"), key=lambda path: path.stat().st_mtime_ns
+    )
     if tables:  # the runs of killed trials are there beside those that were tried again
         rows = csv.DictReader(tables[-1].read_text().splitlines())
-        return {"trials": [(row["learning_rate"], row["value"]) for row in rows if row["state"] == "COMPLETE"]}
+        return {
+            "trials": [
+                (row["learning_rate"], row["value"]) for row in rows if row["state"] == "COMPLETE"
+            ]
+        }
     for path in sorted(folder.glob("logs/*/*/**/*")):
         if never_began(path):
             continue
         name = re.sub(rf"(?<=/){NUMBERED}(?=/|$)", r"\1", str(path.relative_to(folder)))
         if path.suffix == ".zip":
-            found[name] = {key: each.tolist() for key, each in load_from_zip_file(path, device="cpu")[1]["policy"].items()}
+            found[name] = {
+                key: each.tolist()
+                for key, each in load_from_zip_file(path, device="cpu")[1]["policy"].items()
+            }
         elif path.suffix == ".npz":
             with np.load(path) as file:
-                found[name] = {key: (file[key].dtype.str, file[key].tobytes()) for key in file.files if key != "seconds"}
+                found[name] = {
+                    key: (file[key].dtype.str, file[key].tobytes())
+                    for key in file.files
+                    if key != "seconds"
+                }
         elif path.name in ("0.monitor.csv", "episodes.csv"):
             timed = path.name == "0.monitor.csv"
-            found[name] = [line.split(",")[: 2 if timed else None] for line in path.read_text().splitlines()[timed:]]
+            found[name] = [
+                line.split(",")[: 2 if timed else None]
+                for line in path.read_text().splitlines()[timed:]
+            ]
         elif path.name == "results.json":
             found[name] = re.sub(r'"(seconds|date)": [^,}\n]+', "", path.read_text())
         elif path.is_file():
@@ -215,7 +279,9 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
         kind, trial = RUNS[trial % len(RUNS)], trial + 1
         if kind not in whole:
             place, start = folder / f"whole_{kind}", time.monotonic()
-            assert run(command(kind, place), folder / "whole.txt") == 0, (folder / "whole.txt").read_text()
+            assert run(command(kind, place), folder / "whole.txt") == 0, (
+                folder / "whole.txt"
+            ).read_text()
             seconds[kind], whole[kind] = time.monotonic() - start, outcome(place)
         place = folder / f"{trial}_{kind}"
         arguments, log, code = command(kind, place), folder / f"{trial}.txt", None
@@ -231,11 +297,17 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
         if code is None:
             code = run(arguments, log)
         ours = outcome(place)
-        differing = sorted(name for name in ours | whole[kind] if ours.get(name, 0) != whole[kind].get(name, 0))
+        differing = sorted(
+            name for name in ours | whole[kind] if ours.get(name, 0) != whole[kind].get(name, 0)
+        )
         if code != 0 or differing:
             failed += 1
-            print(f"{place.name}: exit code {code}, differing: {differing}; {log.read_text()[-600:]}")
-    print(f"{done} kills of {', '.join(f'{kind} {count}' for kind, count in kills_of.items())}; {failed} cost something")
+            print(
+                f"{place.name}: exit code {code}, differing: {differing}; {log.read_text()[-600:]}"
+            )
+    print(
+        f"{done} kills of {', '.join(f'{kind} {count}' for kind, count in kills_of.items())}; {failed} cost something"
+    )
     return failed
 
 

@@ -2,9 +2,10 @@
 
     python tests/faults/inputs.py FOLDER COUNT [SEED]
 
-Of all cases ``COUNT`` are tried, drawn by the seed; ``all`` tries all. A case must end within ``SECONDS`` with an exit code of
-0, 1 or 2, without a traceback, without a message that no check foresaw, within ``MEMORY``, and must write nothing outside its
-folder nor run what it is given. Prints a line for each case that does not. Exit code 1 if any did.
+Of all cases ``COUNT`` are tried, drawn by the seed; ``all`` tries all. A case must end within
+``SECONDS`` with an exit code of 0, 1 or 2, without a traceback, without a message that no check
+foresaw, within ``MEMORY``, and must write nothing outside its folder nor run what it is given.
+Prints a line for each case that does not. Exit code 1 if any did.
 """
 
 import argparse
@@ -33,17 +34,73 @@ from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 SECONDS, MEMORY = 60.0, 3 * 2**30  # bytes; the imports take half a GB
 OUTSIDE = "../escaped"
 TEXTS = [  # as arguments; values that are only large are those of the corpus
-    *("", " ", "-1", "0", "nan", "inf", "1e400", "1e-400", "0x10", "1,2", "a:b", "a:b:c", "[[", "{a: b}", "(1, 2)", "lin_x"),
+    *(
+        "",
+        " ",
+        "-1",
+        "0",
+        "nan",
+        "inf",
+        "1e400",
+        "1e-400",
+        "0x10",
+        "1,2",
+        "a:b",
+        "a:b:c",
+        "[[",
+        "{a: b}",
+        "(1, 2)",
+        "lin_x",
+    ),
     *(".", "no/such/file", "x" * 5000, "\udcff", "ü<b>", "None", "os.system", "os:system"),
-    *("!!python/object/apply:os.system ['touch escaped']", "__import__('os').system('touch escaped')", "-", "--", "a=b=c"),
+    *(
+        "!!python/object/apply:os.system ['touch escaped']",
+        "__import__('os').system('touch escaped')",
+        "-",
+        "--",
+        "a=b=c",
+    ),
 ]
 VALUES: list[Any] = [  # in YAML
-    *(None, True, "", "x", "nan", -1, 0, 0.5, float("nan"), float("inf"), 10**30, [], [[]], [None], {}, {"a": "b"}, {1: 2}),
-    *("os.system", {"os.system": {}}, "lin_x", "../escaped", "__import__('os').system('touch escaped')"),
+    *(
+        None,
+        True,
+        "",
+        "x",
+        "nan",
+        -1,
+        0,
+        0.5,
+        float("nan"),
+        float("inf"),
+        10**30,
+        [],
+        [[]],
+        [None],
+        {},
+        {"a": "b"},
+        {1: 2},
+    ),
+    *(
+        "os.system",
+        {"os.system": {}},
+        "lin_x",
+        "../escaped",
+        "__import__('os').system('touch escaped')",
+    ),
     *("x" * 5000, "\x00", [1, 2], [1, 2, 3], ["a"] * 4, [float("nan")] * 3, {"name": {"name": {}}}),
 ]
-SUITE = {"name": "one", "scenarios": [{"name": "near", "target": {"distance": 1.0}, "duration": 2.0, "episodes": 2}]}
-SETTINGS = {"n_timesteps": 20, "n_envs": 2, "n_steps": 10, "batch_size": 20, "policy_kwargs": {"net_arch": [4]}}
+SUITE = {
+    "name": "one",
+    "scenarios": [{"name": "near", "target": {"distance": 1.0}, "duration": 2.0, "episodes": 2}],
+}
+SETTINGS = {
+    "n_timesteps": 20,
+    "n_envs": 2,
+    "n_steps": 10,
+    "batch_size": 20,
+    "policy_kwargs": {"net_arch": [4]},
+}
 BASES = {
     "benchmark": "--no-training --seconds 0.001 --sizes 2 --n-envs 1",
     "check-vehicle": "itm -n 1",
@@ -65,7 +122,9 @@ def cases() -> list[Case]:
     found: list[Case] = []
     files = {"settings.yml": _yaml({"QuadTargetTracking-v0": SETTINGS}), "suite.yaml": _yaml(SUITE)}
     files["sweep.yaml"] = _yaml({"algo": "dagger", "env": "QuadTargetTracking-v0", "seed": [0, 1]})
-    subparsers: Any = next(each for each in make_parser()._actions if isinstance(each, argparse._SubParsersAction))
+    subparsers: Any = next(
+        each for each in make_parser()._actions if isinstance(each, argparse._SubParsersAction)
+    )
     assert {*COMMANDS} == {*BASES}
     for command, base in BASES.items():
         for action in subparsers.choices[command]._actions:
@@ -74,26 +133,39 @@ def cases() -> list[Case]:
             paths = action.metavar in ("FILE", "FOLDER", "DIR", "PATH", "WHERE", "AGENT")
             for text in [*TEXTS, *([] if paths else [OUTSIDE])]:
                 given = (
-                    [*base.split(), action.option_strings[-1], text] if action.option_strings else [text, *base.split()[1:]]
+                    [*base.split(), action.option_strings[-1], text]
+                    if action.option_strings
+                    else [text, *base.split()[1:]]
                 )
                 found.append((f"{command} {action.dest}", [command, *given], files))
     dagger = ["train", *BASES["train"].split()]
     keys = sorted(
-        {*TrainingConfig.model_fields, *constructor_parameters(DAgger)} - {"algo", "env_id", "settings", "hyperparams"}
+        {*TrainingConfig.model_fields, *constructor_parameters(DAgger)}
+        - {"algo", "env_id", "settings", "hyperparams"}
     )
     for key, value in itertools.product(keys, VALUES):
         settings = {"QuadTargetTracking-v0": {**SETTINGS, key: value}}
         found.append((f"settings {key}", dagger, {**files, "settings.yml": _yaml(settings)}))
     for key, value in itertools.product(Task.model_fields, VALUES):
-        settings = {"QuadTargetTracking-v0": {**SETTINGS, "env_kwargs": {"task_kwargs": {key: value}}}}
+        settings = {
+            "QuadTargetTracking-v0": {**SETTINGS, "env_kwargs": {"task_kwargs": {key: value}}}
+        }
         found.append((f"task {key}", dagger, {**files, "settings.yml": _yaml(settings)}))
     itm = load_vehicle("itm").model_dump(mode="json", exclude_none=True)
     for key, value in itertools.product(Vehicle.model_fields, VALUES):
-        found.append((f"vehicle {key}", ["check-vehicle", "v.yaml", "-n", "1"], {"v.yaml": _yaml({**itm, key: value})}))
+        found.append(
+            (
+                f"vehicle {key}",
+                ["check-vehicle", "v.yaml", "-n", "1"],
+                {"v.yaml": _yaml({**itm, key: value})},
+            )
+        )
     evaluate = ["evaluate", *BASES["evaluate"].split()]
     for key, value in itertools.product(Scenario.model_fields, VALUES):
         scenario = {**SUITE["scenarios"][0], key: value}
-        found.append((f"scenario {key}", evaluate, {"suite.yaml": _yaml({**SUITE, "scenarios": [scenario]})}))
+        found.append(
+            (f"scenario {key}", evaluate, {"suite.yaml": _yaml({**SUITE, "scenarios": [scenario]})})
+        )
     return found
 
 
@@ -147,4 +219,7 @@ def campaign(folder: Path, count: int | None, seed: int) -> int:
 if __name__ == "__main__":
     target, asked, *more = sys.argv[1:]
     sb3_quad.cli.closing.FRESH_EPISODES = sb3_quad.cli.closing.PIPELINE_EPISODES = 2
-    sys.exit(campaign(Path(target), None if asked == "all" else int(asked), int(more[0]) if more else 0) > 0)
+    sys.exit(
+        campaign(Path(target), None if asked == "all" else int(asked), int(more[0]) if more else 0)
+        > 0
+    )

@@ -1,8 +1,10 @@
-"""Sweeps whose driver or node is killed at a random moment; each must end with all runs and the table of the undisturbed one.
+"""Sweeps whose driver or node is killed at a random moment; each must end with all runs and the
+table of the undisturbed one.
 
 python tests/faults/sweep_campaign.py driver --sweeps 10 --folder campaign
-python tests/faults/sweep_campaign.py node --sweeps 10 --folder campaign      # with Ray: two nodes on this machine
-python tests/faults/sweep_campaign.py speed --folder campaign                 # 12 runs one by one, and two at a time
+python tests/faults/sweep_campaign.py node --sweeps 10 --folder campaign      # with Ray: two nodes
+on this machine python tests/faults/sweep_campaign.py speed --folder campaign                 # 12
+runs one by one, and two at a time
 """
 
 import argparse
@@ -16,9 +18,26 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
-NET = {"n_steps": 100, "batch_size": 200, "gradient_steps": 20, "n_epochs": 1, "policy_kwargs": {"net_arch": [16]}}
-SWEEP = {"algo": "dagger", "env": "QuadStateRecovery-v0", "n_envs": 8, "eval_episodes": 0, "hyperparams": NET}
-ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "RAY_worker_niceness": "0"}
+NET = {
+    "n_steps": 100,
+    "batch_size": 200,
+    "gradient_steps": 20,
+    "n_epochs": 1,
+    "policy_kwargs": {"net_arch": [16]},
+}
+SWEEP = {
+    "algo": "dagger",
+    "env": "QuadStateRecovery-v0",
+    "n_envs": 8,
+    "eval_episodes": 0,
+    "hyperparams": NET,
+}
+ENVIRONMENT = {
+    **os.environ,
+    "PYTHONPATH": str(ROOT),
+    "OMP_NUM_THREADS": "1",
+    "RAY_worker_niceness": "0",
+}
 
 
 def start(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
@@ -42,7 +61,9 @@ def table(folder: Path, number: int) -> str:
 
 def main() -> None:
     """Run a campaign, and print a line for each sweep."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("kind", choices=("driver", "node", "speed"))
     parser.add_argument("--sweeps", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0, help="of the moments")
@@ -53,7 +74,12 @@ def main() -> None:
     folder: Path = options.folder / options.kind
     folder.mkdir(parents=True)
     count = 12 if options.kind == "speed" else 6
-    spec = {**SWEEP, "seed": list(range(count)), "n_timesteps": options.timesteps, "evaluation": {"episodes": 8}}
+    spec = {
+        **SWEEP,
+        "seed": list(range(count)),
+        "n_timesteps": options.timesteps,
+        "evaluation": {"episodes": 8},
+    }
     (folder / "sweep.yaml").write_text(json.dumps(spec))
     print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
     if options.kind == "speed":
@@ -61,27 +87,43 @@ def main() -> None:
         both = timed(folder, "sweep.yaml", "--workers", "2", "--executor", options.executor)
         (folder / "one.yaml").write_text(json.dumps({**spec, "seed": [0], "n_timesteps": 100}))
         begin = timed(folder, "one.yaml", "--workers", "1", "--executor", options.executor)
-        print(f"one by one {alone:.1f} s, two at a time {both:.1f} s, start-up {begin:.1f} s; load {os.getloadavg()[0]:.1f}")
+        print(
+            f"one by one {alone:.1f} s, two at a time {both:.1f} s, start-up {begin:.1f} s; load {os.getloadavg()[0]:.1f}"
+        )
         return
     seconds = timed(folder, "sweep.yaml", "--workers", "2")
     whole, moments, kept, first = table(folder, 1), random.Random(options.seed), 0, 2
     if options.kind == "node":
         seconds, on_nodes = node(folder, 2, None)
         if on_nodes != whole:
-            sys.exit("the undisturbed sweep on two nodes has another table than that on this machine")
+            sys.exit(
+                "the undisturbed sweep on two nodes has another table than that on this machine"
+            )
         first = 3
     for number in range(options.sweeps):
         moment = moments.uniform(0.1, 0.9) * seconds
-        found = driver(folder, number + first, moment) if options.kind == "driver" else node(folder, number + first, moment)[1]
+        found = (
+            driver(folder, number + first, moment)
+            if options.kind == "driver"
+            else node(folder, number + first, moment)[1]
+        )
         same = found == whole
         kept += same
-        print(f"sweep {number + 1}: killed after {moment:.1f} s: {'the same table' if same else 'ANOTHER TABLE'}", flush=True)
-    print(f"{kept} of {options.sweeps} end with all runs and the same table; load {os.getloadavg()[0]:.1f}")
+        print(
+            f"sweep {number + 1}: killed after {moment:.1f} s: {'the same table' if same else 'ANOTHER TABLE'}",
+            flush=True,
+        )
+    print(
+        f"{kept} of {options.sweeps} end with all runs and the same table; load {os.getloadavg()[0]:.1f}"
+    )
 
 
 def driver(folder: Path, number: int, moment: float) -> str:
     """The table of a sweep whose driver is killed, then resumed."""
-    process, place = start(folder, "sweep.yaml", "--workers", "2"), folder / f"logs/sweep/sweep_{number}"
+    process, place = (
+        start(folder, "sweep.yaml", "--workers", "2"),
+        folder / f"logs/sweep/sweep_{number}",
+    )
     end = time.monotonic() + moment
     while time.monotonic() < end or not (place / "plan.json").is_file():
         time.sleep(0.05)
@@ -96,11 +138,20 @@ def node(folder: Path, number: int, moment: float | None) -> tuple[float, str]:
     import ray
     from ray.cluster_utils import Cluster
 
-    settings = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 1000, "health_check_failure_threshold": 3}
-    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": settings})
+    settings = {
+        "health_check_initial_delay_ms": 0,
+        "health_check_period_ms": 1000,
+        "health_check_failure_threshold": 3,
+    }
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 1, "_system_config": settings}
+    )
     lost = cluster.add_node(num_cpus=1)
     try:
-        begin, process = time.monotonic(), start(folder, "sweep.yaml", "--executor", "ray", "--address", cluster.address)
+        begin, process = (
+            time.monotonic(),
+            start(folder, "sweep.yaml", "--executor", "ray", "--address", cluster.address),
+        )
         if moment is not None:
             time.sleep(moment)
             cluster.remove_node(lost, allow_graceful=False)

@@ -21,7 +21,9 @@ CORPUS = yaml.safe_load(Path(__file__).with_name("corpus.yaml").read_text(encodi
 
 
 def write(path, content):
-    """A text, or one of ``{begin, repeat, times, end}``; an .npz of ``{arrays}``; a zip of empty files."""
+    """A text, or one of ``{begin, repeat, times, end}``; an .npz of ``{arrays}``; a zip of empty
+    files.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     if isinstance(content, str):
         path.write_text(content, encoding="utf-8")
@@ -54,15 +56,23 @@ def here(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", CORPUS)
 def test_bad_input_is_one_line_and_leaves_nothing_behind(name, here, capsys):
-    case = CORPUS[name] if isinstance(CORPUS[name], dict) else dict(zip(("command", "says"), CORPUS[name], strict=True))
+    case = (
+        CORPUS[name]
+        if isinstance(CORPUS[name], dict)
+        else dict(zip(("command", "says"), CORPUS[name], strict=True))
+    )
     for file, content in case.get("files", {}).items():
         write(here / file, content)
     before = files(here)
     code = main([part.format(digits="1" * 5000) for part in shlex.split(case["command"])])
     lines = capsys.readouterr().err.splitlines()
     assert code == case.get("code", 2), lines
-    assert lines and lines[-1].startswith(case.get("begins", "error: ")) and case["says"] in lines[-1]
-    assert not any("Traceback" in line or "python -X dev" in line for line in lines)  # somebody foresaw it
+    assert (
+        lines and lines[-1].startswith(case.get("begins", "error: ")) and case["says"] in lines[-1]
+    )
+    assert not any(
+        "Traceback" in line or "python -X dev" in line for line in lines
+    )  # somebody foresaw it
     assert files(here) - before == set()
 
 
@@ -70,8 +80,14 @@ def test_bad_input_is_one_line_and_leaves_nothing_behind(name, here, capsys):
     ("raised", "says"),
     [
         (SystemExit(0), "SystemExit: 0 ("),
-        (OSError(errno.ENOSPC, "No space left on device", "run/0.monitor.csv"), "run/0.monitor.csv: No space left on device"),
-        (ZeroDivisionError("in a callback"), "ZeroDivisionError: in a callback (test_bad_input.py, line"),
+        (
+            OSError(errno.ENOSPC, "No space left on device", "run/0.monitor.csv"),
+            "run/0.monitor.csv: No space left on device",
+        ),
+        (
+            ZeroDivisionError("in a callback"),
+            "ZeroDivisionError: in a callback (test_bad_input.py, line",
+        ),
     ],
 )
 def test_what_no_check_foresees_is_a_line_too(raised, says, monkeypatch, capsys):
@@ -103,7 +119,9 @@ def test_an_interrupt_while_modules_are_imported_leaves_at_once():
 
 def test_an_agent_whose_parameters_are_not_finite_is_refused(here, capsys):
     agent = PPO("MlpPolicy", QuadcopterVecEnv(1), device="cpu")
-    agent.policy.action_net.bias.data[0] = float("inf")  # SB3 clips the action, so that it looks sound
+    agent.policy.action_net.bias.data[0] = float(
+        "inf"
+    )  # SB3 clips the action, so that it looks sound
     agent.save("agent.zip")
     assert main(["enjoy", "agent.zip", "--no-render"]) == 2
     assert "agent.zip: action_net.bias is not finite" in capsys.readouterr().err

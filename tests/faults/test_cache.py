@@ -20,21 +20,42 @@ print(rotation_rows(1.0, 0.0, 0.0, 0.0)[0], sum(rotation_rows.stats.cache_hits.v
 
 @pytest.mark.slow
 def test_a_read_only_installation_without_a_home_says_that_it_compiles_at_every_start(tmp_path):
-    """Its folders for compiled code cannot be made, for the superuser either: plain files have their names."""
+    """Its folders for compiled code cannot be made, for the superuser either: plain files have
+    their names.
+    """
     for name in ("sb3_quad", "envs", "callbacks", "zoo_configs"):
         shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
     for package in [path.parent for path in tmp_path.rglob("__init__.py")]:
         (package / "__pycache__").write_text("")
 
     def started(**environment):
-        inherited = {key: value for key, value in os.environ.items() if not key.startswith(("NUMBA", "XDG", "PYTHON"))}
-        environment = {**inherited, "HOME": "/dev/null", "PYTHONDONTWRITEBYTECODE": "1", **environment}
+        inherited = {
+            key: value
+            for key, value in os.environ.items()
+            if not key.startswith(("NUMBA", "XDG", "PYTHON"))
+        }
+        environment = {
+            **inherited,
+            "HOME": "/dev/null",
+            "PYTHONDONTWRITEBYTECODE": "1",
+            **environment,
+        }
         command = [sys.executable, "-c", CODE]
-        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+        done = subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+        )
         assert done.returncode == 0, done.stderr
         return done.stdout, done.stderr.splitlines()
 
     result, said = started()
-    assert result == "(1.0, 0.0, 0.0) 0\n" and len(said) == 1 and "cannot be kept" in said[0] and "NUMBA_CACHE_DIR" in said[0]
+    assert (
+        result == "(1.0, 0.0, 0.0) 0\n"
+        and len(said) == 1
+        and "cannot be kept" in said[0]
+        and "NUMBA_CACHE_DIR" in said[0]
+    )
     for hits in (0, 1):
-        assert started(NUMBA_CACHE_DIR=str(tmp_path / "better")) == (f"(1.0, 0.0, 0.0) {hits}\n", [])
+        assert started(NUMBA_CACHE_DIR=str(tmp_path / "better")) == (
+            f"(1.0, 0.0, 0.0) {hits}\n",
+            [],
+        )

@@ -1,4 +1,6 @@
-"""Samples of what ``campaign.py`` and ``inputs.py`` try; SB3_QUAD_KILLS and SB3_QUAD_INPUTS ask for more."""
+"""Samples of what ``campaign.py`` and ``inputs.py`` try; SB3_QUAD_KILLS and SB3_QUAD_INPUTS ask for
+more.
+"""
 
 import os
 import subprocess
@@ -15,7 +17,9 @@ def ends_well(*arguments):
     root = FOLDER.parents[1]
     variables = {**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, *map(str, arguments)]
-    result = subprocess.run(command, capture_output=True, text=True, check=False, env=variables, cwd=root)
+    result = subprocess.run(
+        command, capture_output=True, text=True, check=False, env=variables, cwd=root
+    )
     assert result.returncode == 0, result.stdout + result.stderr
 
 

@@ -1,4 +1,6 @@
-"""Files of a search, an evaluation and a published policy: full disks, interrupts and two processes at once cost nothing."""
+"""Files of a search, an evaluation and a published policy: full disks, interrupts and two processes
+at once cost nothing.
+"""
 
 import csv
 import errno
@@ -30,12 +32,18 @@ def test_a_file_that_is_no_journal_keeps_its_last_line(tmp_path):
     assert path.read_text() == "buy milk"
 
 
-@pytest.mark.parametrize(("process", "dead"), [(os.getpid(), False), (2**22 + 1, True)], ids=("this process", "no process"))
+@pytest.mark.parametrize(
+    ("process", "dead"),
+    [(os.getpid(), False), (2**22 + 1, True)],
+    ids=("this process", "no process"),
+)
 def test_trials_without_a_process_are_tried_again(tmp_path, process, dead):
     study = open_study("search", tmp_path / "study.log")
     study.ask().set_user_attr(OWNER, [platform.node(), process])
     retry_dead_trials(study)
-    assert [trial.state.name for trial in study.trials] == (["FAIL", "WAITING"] if dead else ["RUNNING"])
+    assert [trial.state.name for trial in study.trials] == (
+        ["FAIL", "WAITING"] if dead else ["RUNNING"]
+    )
 
 
 def test_a_trial_that_is_tried_again_moves_no_later_one(tmp_path):
@@ -50,7 +58,9 @@ def test_a_trial_that_is_tried_again_moves_no_later_one(tmp_path):
 
 
 class KilledAtSecond(BaseCallback):
-    """Kills this process outright in the second training that it is part of, once it has the environment variable KILL."""
+    """Kills this process outright in the second training that it is part of, once it has the
+    environment variable KILL.
+    """
 
     made = 0
 
@@ -69,12 +79,26 @@ def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypa
     settings = "n_timesteps: 32, n_steps: 32, batch_size: 32, callback: test_folders.KilledAtSecond"
     (tmp_path / "small.yml").write_text(f"Pendulum-v1: {{{settings}}}\n")
     (tmp_path / "space.yml").write_text("gamma: {low: 0.5, high: 1.0}\n")
-    command = ["tune", "--algo", "ppo", "--env", "Pendulum-v1", "--conf-file", "small.yml", "--search-space", "space.yml"]
-    command += shlex.split("--eval-episodes 1 --n-evaluations 1 --no-progress --storage study.log --sampler random")
+    command = [
+        "tune",
+        "--algo",
+        "ppo",
+        "--env",
+        "Pendulum-v1",
+        "--conf-file",
+        "small.yml",
+        "--search-space",
+        "space.yml",
+    ]
+    command += shlex.split(
+        "--eval-episodes 1 --n-evaluations 1 --no-progress --storage study.log --sampler random"
+    )
     here = Path(__file__).parent
     path = os.pathsep.join(map(str, (here.parents[1], here.parents[1] / "examples", here)))
     environment = {**os.environ, "KILL": "yes", "PYTHONPATH": path}
-    killed = subprocess.run([sys.executable, "-m", "sb3_quad.cli", *command], env=environment, check=False)
+    killed = subprocess.run(
+        [sys.executable, "-m", "sb3_quad.cli", *command], env=environment, check=False
+    )
     assert killed.returncode == -signal.SIGKILL
     assert main([*command, "--max-total-trials", "2"]) == 0
     with (tmp_path / "logs/tune/ppo/Pendulum-v1_2/trials.csv").open(encoding="utf-8") as file:
@@ -95,18 +119,42 @@ def hover(vehicle):
 def meanwhile(vehicle):
     """Another evaluation into the same folder, while this one is under way."""
     if not codes:
-        codes.append(main(["evaluate", "other=test_folders:hover", "--suite", "suite.yaml", "-o", "out", "--no-report"]))
+        codes.append(
+            main(
+                [
+                    "evaluate",
+                    "other=test_folders:hover",
+                    "--suite",
+                    "suite.yaml",
+                    "-o",
+                    "out",
+                    "--no-report",
+                ]
+            )
+        )
     return hover(vehicle)
 
 
-def test_of_two_evaluations_into_a_folder_at_once_neither_loses_its_results(tmp_path, monkeypatch, capsys):
+def test_of_two_evaluations_into_a_folder_at_once_neither_loses_its_results(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "suite.yaml").write_text(SUITE)
     codes.clear()
-    command = ["evaluate", "first=test_folders:meanwhile", "--suite", "suite.yaml", "-o", "out", "--no-report"]
+    command = [
+        "evaluate",
+        "first=test_folders:meanwhile",
+        "--suite",
+        "suite.yaml",
+        "-o",
+        "out",
+        "--no-report",
+    ]
     codes.append(main(command))
     there = {entry.controller for entry in load_results("out").entries}
-    assert there == {name for name, code in zip(("other", "first"), codes, strict=True) if code == 0}
+    assert there == {
+        name for name, code in zip(("other", "first"), codes, strict=True) if code == 0
+    }
     refused = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
     assert len(refused) == codes.count(2) and all("another process" in line for line in refused)
 

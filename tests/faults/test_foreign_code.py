@@ -1,4 +1,6 @@
-"""What comes from strangers, zips, run folders and settings, runs nothing of theirs: each would leave a file named MARK."""
+"""What comes from strangers, zips, run folders and settings, runs nothing of theirs: each would
+leave a file named MARK.
+"""
 
 import base64
 import io
@@ -53,7 +55,12 @@ PICKLES = {
     "protocol 0": pickle.dumps(FOREIGN, 0),
     "within others": pickle.dumps([{"a": (1, FOREIGN)}]),
     "eval": pickle.dumps(Calls(eval, f"open({str(MARK)!r}, 'w')")),
-    "a dotted name": b"\x80\x04" + text("torch") + text("serialization.os.system") + b"\x93" + text(COMMAND) + b"\x85R.",
+    "a dotted name": b"\x80\x04"
+    + text("torch")
+    + text("serialization.os.system")
+    + b"\x93"
+    + text(COMMAND)
+    + b"\x85R.",
     "names from the memo": b"\x80\x04"
     + text("os")
     + b"\x940"
@@ -63,16 +70,28 @@ PICKLES = {
     + b"\x85R.",
     "a pickle within": pickle.dumps(Calls(pickle.loads, pickle.dumps(FOREIGN))),
     "SB3's wrapper of pickles": pickle.dumps(CloudpickleWrapper(FOREIGN)),
-    "a function by value": cloudpickle.dumps(Calls(eval("lambda name: open(name, 'w')"), str(MARK))),
+    "a function by value": cloudpickle.dumps(
+        Calls(eval("lambda name: open(name, 'w')"), str(MARK))
+    ),
     "NumPy's loader": pickle.dumps(Calls(np.load, "foreign.npy", None, True)),
 }
 
 
 def changed(name: str, hook: tuple[str, str]) -> bytes:
-    """Sets an attribute of a class, by which each is taken for a subclass of it; then SB3's own wrapper of pickles."""
+    """Sets an attribute of a class, by which each is taken for a subclass of it; then SB3's own
+    wrapper of pickles.
+    """
     state = b"N}" + text("__subclasshook__") + text(hook[0]) + text(hook[1]) + b"\x93s\x86"
     wrapper = pickle.dumps(CloudpickleWrapper(FOREIGN), 4)[11:]  # without its own PROTO and FRAME
-    return b"\x80\x04" + text("stable_baselines3.common.buffers") + text(name) + b"\x93" + state + b"b0" + wrapper
+    return (
+        b"\x80\x04"
+        + text("stable_baselines3.common.buffers")
+        + text(name)
+        + b"\x93"
+        + state
+        + b"b0"
+        + wrapper
+    )
 
 
 CHANGED = {  # not to be read by pickle here: the change would stay
@@ -88,8 +107,12 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def foreign_zip(key: str, source: Path = AGENT, path: str = "foreign.zip", content: bytes = PICKLES["os.system"]) -> str:
-    """A copy of an agent's zip, in which a pickle is put; as an attribute of the model, or as a file of weights."""
+def foreign_zip(
+    key: str, source: Path = AGENT, path: str = "foreign.zip", content: bytes = PICKLES["os.system"]
+) -> str:
+    """A copy of an agent's zip, in which a pickle is put; as an attribute of the model, or as a
+    file of weights.
+    """
     with zipfile.ZipFile(source) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     if key.endswith(".pth"):
@@ -113,7 +136,9 @@ def same_actions(*models) -> bool:
 @pytest.mark.parametrize("name", PICKLES)
 def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
     np.save("foreign.npy", np.array([FOREIGN], object), allow_pickle=True)
-    with pytest.raises(ConfigError, match=r"^here names \S+\.\S+, which may run anything; .* --trust"):
+    with pytest.raises(
+        ConfigError, match=r"^here names \S+\.\S+, which may run anything; .* --trust"
+    ):
         unpickle(base64.b64encode(PICKLES[name]).decode(), "here")
     assert not MARK.exists()
     pickle.loads(PICKLES[name])
@@ -122,9 +147,15 @@ def test_a_pickle_that_calls_what_no_agent_needs_is_refused(name):
 
 @pytest.mark.parametrize("content", CHANGED.values(), ids=CHANGED)
 def test_no_class_is_changed(content, capsys, dagger_run):
-    with pytest.raises(ConfigError, match=r"here (names \S+BaseBuffer|is not what Stable-Baselines3 pickles).* --trust"):
+    with pytest.raises(
+        ConfigError,
+        match=r"here (names \S+BaseBuffer|is not what Stable-Baselines3 pickles).* --trust",
+    ):
         unpickle(base64.b64encode(content).decode(), "here")
-    assert main(["enjoy", foreign_zip("policy_kwargs", content=content), "--no-render", "-n", "1"]) == 2
+    assert (
+        main(["enjoy", foreign_zip("policy_kwargs", content=content), "--no-render", "-n", "1"])
+        == 2
+    )
     foreign_zip("lr_schedule", dagger_run / "QuadStateRecovery-v0.zip", content=content)
     model = np.fromfile("foreign.zip", dtype=np.uint8)
     np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=model)
@@ -139,7 +170,10 @@ def test_no_class_is_changed(content, capsys, dagger_run):
     [
         ("evaluate foreign.zip --suite quick --episodes 1 --no-report", "policy_kwargs"),
         pytest.param(
-            *("evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2", "policy_kwargs"),
+            *(
+                "evaluate foreign.zip pid --suite quick --episodes 1 --no-report --workers 2",
+                "policy_kwargs",
+            ),
             marks=pytest.mark.slow,
         ),
         ("enjoy foreign.zip --no-render -n 1", "action_space"),
@@ -155,14 +189,20 @@ def test_no_command_runs_what_a_zip_holds(command, key, capsys):
     lines = [line for line in capsys.readouterr().err.splitlines() if "foreign.zip: " in line]
     assert lines
     for line in lines:
-        assert key == "policy.pth" or (f"its {key} names posix.system" in line and "--trust" in line)
+        assert key == "policy.pth" or (
+            f"its {key} names posix.system" in line and "--trust" in line
+        )
     assert not MARK.exists()
 
 
 @pytest.mark.parametrize("key", ["learning_rate", "policy_class", "clip_range", "anything"])
 def test_a_run_folder_that_is_resumed_runs_nothing(key, capsys, dagger_run):
     content = Path(foreign_zip(key, dagger_run / "QuadStateRecovery-v0.zip")).read_bytes()
-    np.savez(dagger_run / "resume.npz", timesteps=np.array(5), model=np.frombuffer(content, dtype=np.uint8))
+    np.savez(
+        dagger_run / "resume.npz",
+        timesteps=np.array(5),
+        model=np.frombuffer(content, dtype=np.uint8),
+    )
     assert main(["train", "--resume", str(dagger_run)]) == 2
     assert f"its {key} names posix.system, which may run anything" in capsys.readouterr().err
     assert not MARK.exists()
@@ -177,7 +217,9 @@ def test_trust_goes_on_and_ends_with_the_command(capsys):
     assert not MARK.exists()
 
 
-@pytest.mark.parametrize("key", ["learning_rate", "lr_schedule", "clip_range", "ep_info_buffer", "expert"])
+@pytest.mark.parametrize(
+    "key", ["learning_rate", "lr_schedule", "clip_range", "ep_info_buffer", "expert"]
+)
 def test_what_flying_does_not_need_is_not_even_read(key):
     agent, whole = load_model(foreign_zip(key)), load_model(AGENT)
     assert not MARK.exists()
@@ -188,10 +230,22 @@ def test_what_flying_does_not_need_is_not_even_read(key):
 def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
     off_policy = algorithm in (SAC, TD3, DDPG, DQN)
     kwargs = {"buffer_size": 200} if off_policy else {"n_steps": 16}
-    kwargs |= {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))} if algorithm in (SAC, TD3, DDPG) else {}
-    kwargs |= {"policy_kwargs": {"net_arch": [8], "activation_fn": torch.nn.ELU, "optimizer_class": torch.optim.SGD}}
+    kwargs |= (
+        {"action_noise": NormalActionNoise(np.zeros(1), np.ones(1))}
+        if algorithm in (SAC, TD3, DDPG)
+        else {}
+    )
+    kwargs |= {
+        "policy_kwargs": {
+            "net_arch": [8],
+            "activation_fn": torch.nn.ELU,
+            "optimizer_class": torch.optim.SGD,
+        }
+    }
     env = "CartPole-v1" if algorithm is DQN else "Pendulum-v1"
-    model = algorithm("MlpPolicy", env, learning_rate=lambda progress: 1e-3 * progress, **kwargs).learn(32)
+    model = algorithm(
+        "MlpPolicy", env, learning_rate=lambda progress: 1e-3 * progress, **kwargs
+    ).learn(32)
     model.save("agent.zip")
     again = load_model("agent.zip")
     assert type(again) is algorithm
@@ -200,7 +254,9 @@ def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
         load_zip(algorithm, "agent.zip")
     model.learning_rate = model.lr_schedule = LinearSchedule(1e-3, 0.0, 1.0)
     model.save("agent.zip")
-    assert load_zip(algorithm, "agent.zip", device="cpu").lr_schedule(0.5) == 5e-4  # all of it, as for going on
+    assert (
+        load_zip(algorithm, "agent.zip", device="cpu").lr_schedule(0.5) == 5e-4
+    )  # all of it, as for going on
 
 
 @pytest.mark.parametrize(
@@ -208,7 +264,10 @@ def test_agents_of_sb3_fly_whatever_their_schedules_are(algorithm):
     [
         ("callback", {"os.makedirs": {"name": str(MARK)}}),
         ("callback", {"gymnasium.Wrapper": {"env": 1}}),
-        ("callback", [{"stable_baselines3.common.callbacks.EventCallback": None}, {"pathlib.Path": {}}]),
+        (
+            "callback",
+            [{"stable_baselines3.common.callbacks.EventCallback": None}, {"pathlib.Path": {}}],
+        ),
         ("vec_env_wrapper", {"os.makedirs": {"exist_ok": True}}),
         ("vec_env_wrapper", "builtins.print"),
         ("env_wrapper", "os.mkdir"),
@@ -235,7 +294,18 @@ def test_settings_call_only_classes_of_the_right_kind(key, entry, way, capsys):
 
 
 @pytest.mark.parametrize(
-    "name", ["../outside", "a/b", "a\\b", "*/ int x; /*", "<script>", "two\nlines", "\x1b[2J", "", "a" * 101]
+    "name",
+    [
+        "../outside",
+        "a/b",
+        "a\\b",
+        "*/ int x; /*",
+        "<script>",
+        "two\nlines",
+        "\x1b[2J",
+        "",
+        "a" * 101,
+    ],
 )
 def test_a_vehicle_s_name_is_a_name(name, capsys, here, monkeypatch):
     own = here / "own"
@@ -260,7 +330,9 @@ def zip_with(changes: dict) -> str:
     with zipfile.ZipFile(AGENT) as archive, zipfile.ZipFile("foreign.zip", "w") as copy:
         for name in archive.namelist():
             content = archive.read(name)
-            copy.writestr(name, json.dumps(json.loads(content) | changes) if name == "data" else content)
+            copy.writestr(
+                name, json.dumps(json.loads(content) | changes) if name == "data" else content
+            )
     return "foreign.zip"
 
 
@@ -273,7 +345,9 @@ def test_a_zip_opens_no_file_of_this_machine(key, source, capsys):
     foreign = zip_with({"flight_settings": settings | {name: {inner: source} if inner else source}})
     assert main(["enjoy", foreign, "--no-render", "-n", "1"]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: foreign.zip: flight_settings: " + (f"{name}: " if name != "vehicle" else ""))
+    assert line.startswith(
+        "error: foreign.zip: flight_settings: " + (f"{name}: " if name != "vehicle" else "")
+    )
 
 
 def test_a_zip_names_what_comes_with_the_package():
@@ -283,7 +357,9 @@ def test_a_zip_names_what_comes_with_the_package():
 
 
 def test_a_zip_imports_nothing(monkeypatch):
-    """SB3 makes the environment that a zip names, and Gymnasium imports a module that stands before its colon."""
+    """SB3 makes the environment that a zip names, and Gymnasium imports a module that stands before
+    its colon.
+    """
     Path("foreign_module.py").write_text(f"open({str(MARK)!r}, 'w')")
     monkeypatch.syspath_prepend(".")
     foreign = zip_with({"env": "foreign_module:Foreign-v0", "expert": "foreign_module:factory"})

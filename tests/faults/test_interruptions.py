@@ -1,4 +1,6 @@
-"""Whatever ends a training, it goes on from its snapshot to the same agent, and its files say nothing twice."""
+"""Whatever ends a training, it goes on from its snapshot to the same agent, and its files say
+nothing twice.
+"""
 
 import shutil
 import signal
@@ -53,7 +55,9 @@ def fail():
 
 
 def job(folder, at=1000, **changes):
-    config = build_config("dagger", ENV, {**SMALL, "callback": {"test_interruptions.Trouble": {"at": at}}})
+    config = build_config(
+        "dagger", ENV, {**SMALL, "callback": {"test_interruptions.Trouble": {"at": at}}}
+    )
     more = {"eval_freq": 400, "eval_episodes": 4, "snapshot_every": 1e-9, **changes}
     return TrainingJob(config=config, log_folder=str(folder), **more)
 
@@ -78,15 +82,23 @@ def the_same(run, whole):
     same = all(torch.equal(ours[name], theirs[name]) for name in theirs)
     with np.load(run.evaluations) as first, np.load(whole.evaluations) as second:
         same &= {*first} == {*second} and "train/bc_loss" in first
-        same &= all(np.array_equal(first[name], second[name], equal_nan=True) for name in {*first} - {"seconds"})
-    episodes = [[line.split(",")[:2] for line in each.episodes.read_text().splitlines()[1:]] for each in (run, whole)]
+        same &= all(
+            np.array_equal(first[name], second[name], equal_nan=True)
+            for name in {*first} - {"seconds"}
+        )
+    episodes = [
+        [line.split(",")[:2] for line in each.episodes.read_text().splitlines()[1:]]
+        for each in (run, whole)
+    ]
     files = [sorted(path.name for path in each.path.rglob("*")) for each in (run, whole)]
     return same and episodes[0] == episodes[1] and files[0] == files[1]
 
 
 @pytest.fixture
 def broken(tmp_path):
-    """A run folder in which training raised an error, after evaluations and episodes that its snapshot does not know."""
+    """A run folder in which training raised an error, after evaluations and episodes that its
+    snapshot does not know.
+    """
     Trouble.what = fail
     with pytest.raises(RuntimeError):
         train(job(tmp_path), quiet)
@@ -110,13 +122,19 @@ def test_the_seconds_of_the_episodes_go_on(broken):
     state = dict(np.load(broken / "resume.npz"))
     lines[-1] = ",".join([*lines[-1].split(",")[:2], str(seconds), "False"])
     (broken / "0.monitor.csv").write_text("\n".join(lines) + "\n")
-    np.savez(broken / "resume.npz", **{**state, "episodes": (broken / "0.monitor.csv").stat().st_size})
+    np.savez(
+        broken / "resume.npz", **{**state, "episodes": (broken / "0.monitor.csv").stat().st_size}
+    )
     run = resume(str(broken), quiet).run
-    after = [float(line.split(",")[2]) for line in run.episodes.read_text().splitlines()[len(lines) :]]
+    after = [
+        float(line.split(",")[2]) for line in run.episodes.read_text().splitlines()[len(lines) :]
+    ]
     assert after and min(after) >= seconds
 
 
-def test_without_room_for_the_snapshot_the_model_is_saved_and_the_snapshot_before_is_kept(tmp_path, whole, monkeypatch):
+def test_without_room_for_the_snapshot_the_model_is_saved_and_the_snapshot_before_is_kept(
+    tmp_path, whole, monkeypatch
+):
     def full(path, **arrays):
         raise ConfigError(f"{path}: cannot be written (No space left on device)")
 
@@ -125,7 +143,9 @@ def test_without_room_for_the_snapshot_the_model_is_saved_and_the_snapshot_befor
         signal.raise_signal(signal.SIGTERM)
 
     Trouble.what = fill_the_disk
-    with pytest.raises(ConfigError, match=r"resume\.npz.*No space.*after 800 timesteps: model saved to"):
+    with pytest.raises(
+        ConfigError, match=r"resume\.npz.*No space.*after 800 timesteps: model saved to"
+    ):
         train(job(tmp_path), quiet)
     path = tmp_path / "dagger" / f"{ENV}_1"
     assert PPO.load(path / f"{ENV}.zip").num_timesteps == 800
@@ -157,7 +177,9 @@ def test_no_further_signal_interrupts_a_save_under_way(tmp_path, whole, monkeypa
     assert the_same(resume(str(result.run.path), quiet).run, whole)
 
 
-def test_two_signals_within_the_update_leave_the_dataset_of_the_snapshot(tmp_path, whole, monkeypatch):
+def test_two_signals_within_the_update_leave_the_dataset_of_the_snapshot(
+    tmp_path, whole, monkeypatch
+):
     update, rollouts = DAgger.train, []
 
     def interrupted(self):
@@ -194,7 +216,10 @@ def test_a_run_folder_that_is_removed_costs_what_was_in_it_and_no_more(tmp_path,
 
     Trouble.what = remove
     steps = 800 if pressed else 1600
-    with pytest.raises(TrainingError, match=rf"{run.name}: was removed .* the model after {steps:,} timesteps is in"):
+    with pytest.raises(
+        TrainingError,
+        match=rf"{run.name}: was removed .* the model after {steps:,} timesteps is in",
+    ):
         train(job(tmp_path), quiet)
     assert PPO.load(run / f"{ENV}.zip").num_timesteps == steps
 

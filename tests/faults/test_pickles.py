@@ -1,4 +1,5 @@
-"""Generated pickles, of all opcodes and all names: whatever they hold, nothing outside of the result changes.
+"""Generated pickles, of all opcodes and all names: whatever they hold, nothing outside of the
+result changes.
 
 SB3_QUAD_PICKLES asks for more of them.
 """
@@ -33,12 +34,48 @@ KNOWN = [
     ("sb3_contrib.common.recurrent.policies", "RecurrentActorCriticPolicy"),
 ]
 FOREIGN = [
-    *(("os", "system"), ("builtins", "getattr"), ("builtins", "setattr"), ("builtins", "bool"), ("builtins", "exec")),
-    *(("canary", "touched"), ("canary", "Touched"), ("numpy", "load"), ("stable_baselines3.common.buffers", "BaseBuffer")),
+    *(
+        ("os", "system"),
+        ("builtins", "getattr"),
+        ("builtins", "setattr"),
+        ("builtins", "bool"),
+        ("builtins", "exec"),
+    ),
+    *(
+        ("canary", "touched"),
+        ("canary", "Touched"),
+        ("numpy", "load"),
+        ("stable_baselines3.common.buffers", "BaseBuffer"),
+    ),
     ("stable_baselines3.common.vec_env.base_vec_env", "CloudpickleWrapper"),
 ]
-ATTRIBUTES = ["__subclasshook__", "__setstate__", "__class__", "__init__", "low", "dtype", "_shape", "start", "_mu", "x"]
-WORDS = [*ATTRIBUTES, "f4", "i8", "?", "O", "V8", "|", "<", "C", "PCG64", "step", "echo > ran", "os"]
+ATTRIBUTES = [
+    "__subclasshook__",
+    "__setstate__",
+    "__class__",
+    "__init__",
+    "low",
+    "dtype",
+    "_shape",
+    "start",
+    "_mu",
+    "x",
+]
+WORDS = [
+    *ATTRIBUTES,
+    "f4",
+    "i8",
+    "?",
+    "O",
+    "V8",
+    "|",
+    "<",
+    "C",
+    "PCG64",
+    "step",
+    "echo > ran",
+    "os",
+]
 NEW, CALL, CHANGE = b"\x81", b"R", b"b"
 
 
@@ -49,7 +86,11 @@ def text(value: str) -> bytes:
 def real_pickles() -> list[bytes]:
     with zipfile.ZipFile(pretrained("itm-imitation")) as archive:
         entries = json.loads(archive.read("data")).values()
-    found = [base64.b64decode(each[":serialized:"]) for each in entries if isinstance(each, dict) and ":serialized:" in each]
+    found = [
+        base64.b64decode(each[":serialized:"])
+        for each in entries
+        if isinstance(each, dict) and ":serialized:" in each
+    ]
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(2), np.ones(2)), 2)
     arrays = (
         np.ones((2, 2)).T,
@@ -74,7 +115,9 @@ REAL = real_pickles()
 
 def shown(value: object) -> str:
     generator = getattr(value, "_np_random", None)
-    return repr((value, generator and generator.bit_generator.state, getattr(value, "maxlen", None)))
+    return repr(
+        (value, generator and generator.bit_generator.state, getattr(value, "maxlen", None))
+    )
 
 
 @pytest.mark.parametrize("content", REAL)
@@ -95,9 +138,15 @@ class Writer:
             return b"\x80\x04" + self.value(0) + b"."
         content = self.rng.choice(REAL)
         for _ in range(self.rng.randint(1, 3)):
-            places = [place for _, _, place in pickletools.genops(content)] if self.rng.random() < 0.8 else range(len(content))
+            places = (
+                [place for _, _, place in pickletools.genops(content)]
+                if self.rng.random() < 0.8
+                else range(len(content))
+            )
             first, after = sorted(self.rng.choices(places, k=2))
-            piece = self.rng.choice((self.value(1), self.value(1) + b"0", self.raw(), content[first:after], b""))
+            piece = self.rng.choice(
+                (self.value(1), self.value(1) + b"0", self.raw(), content[first:after], b"")
+            )
             content = content[:first] + piece + content[self.rng.choice((first, first, after)) :]
             try:
                 list(pickletools.genops(content))
@@ -107,12 +156,26 @@ class Writer:
 
     def value(self, depth: int) -> bytes:
         """What leaves one object on the stack, as a rule."""
-        simple, nested = (self.constant, self.word, self.a_name, self.raw), (self.items, self.made, self.made, self.changed)
-        return self.rng.choice(simple if depth > 4 or self.rng.random() < 0.3 else nested)(depth + 1)
+        simple, nested = (
+            (self.constant, self.word, self.a_name, self.raw),
+            (self.items, self.made, self.made, self.changed),
+        )
+        return self.rng.choice(simple if depth > 4 or self.rng.random() < 0.3 else nested)(
+            depth + 1
+        )
 
     def constant(self, depth: int = 0) -> bytes:
         return self.rng.choice(
-            (b"N", b"\x88", b"\x89", b"K\x01", b"J\xff\xff\xff\xff", b"G@\x00\0\0\0\0\0\0", b"C\x04abcd", b")")
+            (
+                b"N",
+                b"\x88",
+                b"\x89",
+                b"K\x01",
+                b"J\xff\xff\xff\xff",
+                b"G@\x00\0\0\0\0\0\0",
+                b"C\x04abcd",
+                b")",
+            )
         )
 
     def word(self, depth: int = 0) -> bytes:
@@ -128,9 +191,18 @@ class Writer:
     def raw(self, depth: int = 0) -> bytes:
         """Any opcode, with an argument that it takes."""
         opcode = self.rng.choice(pickletools.opcodes)
-        size, one = opcode.arg.n if opcode.arg else 0, b"\1\0\0\0"  # sizes below 0 say where the length stands
+        size, one = (
+            opcode.arg.n if opcode.arg else 0,
+            b"\1\0\0\0",
+        )  # sizes below 0 say where the length stands
         lines = b"os\nsystem\n" if opcode.name in ("GLOBAL", "INST") else b"1\n"
-        argument = {-1: lines, -2: b"\1a", -3: one + b"a", -4: one + b"a", -5: one + b"\0\0\0\0a"}.get(size, b"\0" * size)
+        argument = {
+            -1: lines,
+            -2: b"\1a",
+            -3: one + b"a",
+            -4: one + b"a",
+            -5: one + b"\0\0\0\0a",
+        }.get(size, b"\0" * size)
         return opcode.code.encode("latin-1") + argument
 
     def tuple(self, depth: int) -> bytes:
@@ -138,43 +210,72 @@ class Writer:
 
     def items(self, depth: int) -> bytes:
         many = b"".join(self.value(depth + 1) for _ in range(self.rng.randint(0, 2)))
-        return self.rng.choice((self.tuple(depth), b"](" + many + b"e", b"\x8f(" + many + b"\x90", self.state(depth)))
+        return self.rng.choice(
+            (self.tuple(depth), b"](" + many + b"e", b"\x8f(" + many + b"\x90", self.state(depth))
+        )
 
     def state(self, depth: int) -> bytes:
-        pairs = b"".join(text(self.rng.choice(ATTRIBUTES)) + self.value(depth + 1) for _ in range(self.rng.randint(0, 3)))
+        pairs = b"".join(
+            text(self.rng.choice(ATTRIBUTES)) + self.value(depth + 1)
+            for _ in range(self.rng.randint(0, 3))
+        )
         return b"}(" + pairs + b"u"
 
     def made(self, depth: int) -> bytes:
         names, arguments, how = self.rng.choice(
             (
                 (own._WITH_ATTRIBUTES, b")", NEW),
-                (own._FUNCTIONS, self.rng.choice((b")", self.tuple(depth), self.word() + b"\x89\x88\x87")), CALL),
-                (KNOWN + FOREIGN, self.rng.choice((b")", self.tuple(depth))), self.rng.choice((NEW, CALL))),
+                (
+                    own._FUNCTIONS,
+                    self.rng.choice((b")", self.tuple(depth), self.word() + b"\x89\x88\x87")),
+                    CALL,
+                ),
+                (
+                    KNOWN + FOREIGN,
+                    self.rng.choice((b")", self.tuple(depth))),
+                    self.rng.choice((NEW, CALL)),
+                ),
             )
         )
         return self.name(names) + arguments + how
 
     def changed(self, depth: int) -> bytes:
-        """An object, or what is none, that is given a state: of its attributes or, as Python has it, of slots."""
-        state = self.rng.choice((self.state(depth), b"N" + self.state(depth) + b"\x86", self.tuple(depth)))
+        """An object, or what is none, that is given a state: of its attributes or, as Python has
+        it, of slots.
+        """
+        state = self.rng.choice(
+            (self.state(depth), b"N" + self.state(depth) + b"\x86", self.tuple(depth))
+        )
         return (
-            self.rng.choice((self.made(depth), self.made(depth), self.a_name(), self.value(depth))) + b"\x94" + state + CHANGE
+            self.rng.choice((self.made(depth), self.made(depth), self.a_name(), self.value(depth)))
+            + b"\x94"
+            + state
+            + CHANGE
         )
 
 
 def contents(value: object) -> list[object]:
-    return [*value.values()] if type(value) is dict else [*value] if type(value) in (list, set, tuple) else []
+    return (
+        [*value.values()]
+        if type(value) is dict
+        else [*value]
+        if type(value) in (list, set, tuple)
+        else []
+    )
 
 
 class World:
-    """The attributes of all classes that pickles may name, of those above them and of their modules; what containers hold."""
+    """The attributes of all classes that pickles may name, of those above them and of their
+    modules; what containers hold.
+    """
 
     def __init__(self) -> None:
         kinds = {kind for each in (*own._CLASSES.values(), *own._CHANGES) for kind in each.__mro__}
         names = {kind.__module__ for kind in kinds} | {module for module, _ in KNOWN}
         owners = [own, *kinds, *(sys.modules[name] for name in names if name in sys.modules)]
         self.before = [
-            (vars(owner), {name: (value, contents(value)) for name, value in vars(owner).items()}) for owner in owners
+            (vars(owner), {name: (value, contents(value)) for name, value in vars(owner).items()})
+            for owner in owners
         ]
         self.modules, self.environment = [*sys.modules], dict(os.environ)
 
@@ -183,7 +284,9 @@ class World:
             if now.keys() - {"__warningregistry__"} != before.keys() - {"__warningregistry__"}:
                 return False
             for name, (value, held) in before.items():
-                if now[name] is not value or (held and [*map(id, contents(value))] != [*map(id, held)]):
+                if now[name] is not value or (
+                    held and [*map(id, contents(value))] != [*map(id, held)]
+                ):
                     return False
         return [*sys.modules] == self.modules and dict(os.environ) == self.environment
 
@@ -207,7 +310,10 @@ def touch(*_: object, **__: object) -> None:
 def test_nothing_outside_of_the_result_changes(tmp_path, monkeypatch):
     global EVENTS
     canary = types.ModuleType("canary")
-    canary.touched, canary.Touched = touch, type("Touched", (), {"__setstate__": touch, "__new__": touch})
+    canary.touched, canary.Touched = (
+        touch,
+        type("Touched", (), {"__setstate__": touch, "__new__": touch}),
+    )
     monkeypatch.setitem(sys.modules, "canary", canary)
     monkeypatch.chdir(tmp_path)
     world, read = World(), 0

@@ -1,4 +1,6 @@
-"""Snapshots, of a batch and of a run: what does not fit is refused, in one line, and nothing is lost."""
+"""Snapshots, of a batch and of a run: what does not fit is refused, in one line, and nothing is
+lost.
+"""
 
 import re
 
@@ -39,19 +41,36 @@ def test_arrays_that_compiled_code_would_misread_are_refused(name, wrong, says):
         np.testing.assert_array_equal(array, before[key])
 
 
-SETTINGS = {"n_timesteps": 600, "n_envs": 4, "policy_kwargs": {"net_arch": [8]}, "env_kwargs": {"max_episode_steps": 20}}
+SETTINGS = {
+    "n_timesteps": 600,
+    "n_envs": 4,
+    "policy_kwargs": {"net_arch": [8]},
+    "env_kwargs": {"max_episode_steps": 20},
+}
 ROLLOUTS = {
     "dagger": {"n_steps": 25, "batch_size": 50, "dataset_capacity": 150},
-    "sac_bc": {"train_freq": 25, "learning_starts": 50, "batch_size": 16, "buffer_size": 400, "gradient_steps": 1},
+    "sac_bc": {
+        "train_freq": 25,
+        "learning_starts": 50,
+        "batch_size": 16,
+        "buffer_size": 400,
+        "gradient_steps": 1,
+    },
 }
 
 
 @pytest.fixture(scope="module", params=ROLLOUTS)
 def broken(request, tmp_path_factory):
-    """A run that an error ended, with a snapshot, evaluations, a best model and episodes; and its settings."""
-    config = build_config(request.param, "QuadTargetTracking-v0", SETTINGS | ROLLOUTS[request.param])
+    """A run that an error ended, with a snapshot, evaluations, a best model and episodes; and its
+    settings.
+    """
+    config = build_config(
+        request.param, "QuadTargetTracking-v0", SETTINGS | ROLLOUTS[request.param]
+    )
     folder, calls = tmp_path_factory.mktemp("logs"), []
-    job = TrainingJob(config=config, log_folder=str(folder), eval_freq=100, eval_episodes=2, snapshot_every=1e-9)
+    job = TrainingJob(
+        config=config, log_folder=str(folder), eval_freq=100, eval_episodes=2, snapshot_every=1e-9
+    )
 
     def fail_the_third_time(success, reward):
         calls.append(success)
@@ -69,11 +88,17 @@ def broken(request, tmp_path_factory):
 
 @pytest.fixture
 def resuming(broken):
-    """Writes arrays as the run's snapshot, and says what loading that raises; no other file may have changed."""
+    """Writes arrays as the run's snapshot, and says what loading that raises; no other file may
+    have changed.
+    """
     run, config = broken
     env = make_environments(config, config.n_envs, 0)
     whole = run.resume_state.read_bytes()
-    files = {path: path.read_bytes() for path in run.path.rglob("*") if path.is_file() and path != run.resume_state}
+    files = {
+        path: path.read_bytes()
+        for path in run.path.rglob("*")
+        if path.is_file() and path != run.resume_state
+    }
 
     def load(state):
         np.savez(run.resume_state, **state)
@@ -91,14 +116,23 @@ WRONG = {
     "missing": lambda name, array: None,
     "of another type": lambda name, array: np.zeros(array.shape, np.complex64),
     "of another shape": lambda name, array: np.stack([array, array]),
-    "shorter": lambda name, array: array[:-1] if array.size and array.ndim and name != "best_model" else array[None],
+    "shorter": lambda name, array: (
+        array[:-1] if array.size and array.ndim and name != "best_model" else array[None]
+    ),
 }
 
 
 @pytest.mark.parametrize("change", WRONG.values(), ids=WRONG)
 def test_each_entry_of_a_snapshot_must_fit(change, broken, resuming):
     state = dict(np.load(broken[0].resume_state))
-    assert {"environment.state", "best_model", "episodes", "timesteps", "torch", "random"} < state.keys()
+    assert {
+        "environment.state",
+        "best_model",
+        "episodes",
+        "timesteps",
+        "torch",
+        "random",
+    } < state.keys()
     assert any(name.startswith(("dataset.", "replay_buffer.")) for name in state)
     assert state["best_model"].size and state["timesteps"] > 0
     for name, array in state.items():
@@ -106,7 +140,8 @@ def test_each_entry_of_a_snapshot_must_fit(change, broken, resuming):
             continue
         changed = change(name, array)
         message = resuming(
-            {key: each for key, each in state.items() if key != name} | ({} if changed is None else {name: changed})
+            {key: each for key, each in state.items() if key != name}
+            | ({} if changed is None else {name: changed})
         )
         assert re.match(rf"{re.escape(str(broken[0].resume_state))}: {name}\b", message), message
         assert "\n" not in message
@@ -145,7 +180,9 @@ def test_rows_that_a_buffer_had_more_when_it_was_written_are_left_out(broken):
         if name.startswith("replay_buffer.") and array.ndim
     }
     np.savez(run.resume_state, **{**state, **more})
-    model = load_snapshot(run, config.algo, make_environments(config, config.n_envs, 0), "cpu", expert=None)
+    model = load_snapshot(
+        run, config.algo, make_environments(config, config.n_envs, 0), "cpu", expert=None
+    )
     for name in more:
         rows = getattr(model.replay_buffer, name.partition(".")[2])[: len(state[name])]
         np.testing.assert_array_equal(rows, state[name])

@@ -1,4 +1,6 @@
-"""Threads and interrupts: a step is done whole or not begun, and no memory is written that is not the step's own."""
+"""Threads and interrupts: a step is done whole or not begun, and no memory is written that is not
+the step's own.
+"""
 
 import multiprocessing
 import subprocess
@@ -10,8 +12,8 @@ import pytest
 
 from sb3_quad.simulation.batch import QuadcopterBatch
 
-# After every interrupt a batch flies on as one whose steps are not interrupted. A timer interrupts at any moment of a step;
-# more threads than cores make workers late.
+# After every interrupt a batch flies on as one whose steps are not interrupted. A timer interrupts
+# at any moment of a step; more threads than cores make workers late.
 INTERRUPTED = """
 import random, signal, sys
 import numpy as np
@@ -65,7 +67,9 @@ def from_threads(call, n=4):
 
 @pytest.mark.slow
 def test_interrupted_steps_leave_nothing_behind():
-    done = subprocess.run([sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
 
 
@@ -93,7 +97,9 @@ def test_a_forked_child_can_step():
     env.reset()
     actions = np.zeros((300, 4), np.float32)
     env.step(actions)
-    child = multiprocessing.get_context("fork").Process(target=from_threads, args=(lambda: env.step(actions), 1))
+    child = multiprocessing.get_context("fork").Process(
+        target=from_threads, args=(lambda: env.step(actions), 1)
+    )
     child.start()
     child.join(30)
     alive = child.is_alive()

@@ -1,4 +1,6 @@
-"""Processes that end, or cannot be waited for: no command hangs, none is left behind, and the others go on."""
+"""Processes that end, or cannot be waited for: no command hangs, none is left behind, and the
+others go on.
+"""
 
 import os
 import signal
@@ -20,7 +22,9 @@ SUITE = "name: one\nsource: paper\nscenarios: [{name: near, target: {distance: 1
 
 
 class KillLastWorker(BaseCallback):
-    """Kills the last process of the environments, as the kernel does where memory ends, and notes all of them."""
+    """Kills the last process of the environments, as the kernel does where memory ends, and notes
+    all of them.
+    """
 
     processes = ()
 
@@ -37,11 +41,37 @@ def test_a_training_whose_worker_dies_ends_saves_and_leaves_none_behind(tmp_path
     (tmp_path / "settings.yml").write_text(
         "Pendulum-v1: {n_steps: 10, batch_size: 30, n_envs: 3, callback: test_workers.KillLastWorker}"
     )
-    command = ["train", "--algo", "ppo", "--env", "Pendulum-v1", "--vec-env", "subproc", "-n", "6000", "-f", str(tmp_path)]
-    assert main([*command, "--conf-file", str(tmp_path / "settings.yml"), "--eval-episodes", "0", "--no-progress"]) == 2
+    command = [
+        "train",
+        "--algo",
+        "ppo",
+        "--env",
+        "Pendulum-v1",
+        "--vec-env",
+        "subproc",
+        "-n",
+        "6000",
+        "-f",
+        str(tmp_path),
+    ]
+    assert (
+        main(
+            [
+                *command,
+                "--conf-file",
+                str(tmp_path / "settings.yml"),
+                "--eval-episodes",
+                "0",
+                "--no-progress",
+            ]
+        )
+        == 2
+    )
     assert "worker process of the environments ended" in capsys.readouterr().err.splitlines()[-1]
     assert (tmp_path / "ppo" / "Pendulum-v1_1" / "Pendulum-v1.zip").is_file()
-    assert len(KillLastWorker.processes) == 3 and not any(process.is_alive() for process in KillLastWorker.processes)
+    assert len(KillLastWorker.processes) == 3 and not any(
+        process.is_alive() for process in KillLastWorker.processes
+    )
 
 
 def hover(vehicle):
@@ -74,22 +104,61 @@ def test_evaluations_that_would_never_end_say_why(tmp_path, capsys):
     (tmp_path / "settings.yml").write_text(
         "Pendulum-v1: {n_steps: 10, batch_size: 10, vec_env: dummy, env_wrapper: test_workers.DropsInfo}"
     )
-    command = ["train", "--algo", "ppo", "--env", "Pendulum-v1", "-n", "20", "-f", str(tmp_path), "--eval-freq", "10"]
-    assert main([*command, "--conf-file", str(tmp_path / "settings.yml"), "--eval-episodes", "1", "--no-progress"]) == 2
+    command = [
+        "train",
+        "--algo",
+        "ppo",
+        "--env",
+        "Pendulum-v1",
+        "-n",
+        "20",
+        "-f",
+        str(tmp_path),
+        "--eval-freq",
+        "10",
+    ]
+    assert (
+        main(
+            [
+                *command,
+                "--conf-file",
+                str(tmp_path / "settings.yml"),
+                "--eval-episodes",
+                "1",
+                "--no-progress",
+            ]
+        )
+        == 2
+    )
     assert "info['episode']" in capsys.readouterr().err.splitlines()[-1]
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_controller_that_ends_its_process_is_a_failure_and_the_others_fly(tmp_path, monkeypatch, capsys, workers):
+def test_a_controller_that_ends_its_process_is_a_failure_and_the_others_fly(
+    tmp_path, monkeypatch, capsys, workers
+):
     monkeypatch.chdir(tmp_path)
     Path("suite.yaml").write_text(SUITE)
-    bad = {"exits": "failed with SystemExit: 0"} | ({"crashes": "worker process ended"} if workers > 1 else {})
+    bad = {"exits": "failed with SystemExit: 0"} | (
+        {"crashes": "worker process ended"} if workers > 1 else {}
+    )
     names = [f"{name}=test_workers:{name}" for name in (*bad, "hover")]
-    command = ["evaluate", *names, "also=test_workers:hover", "--suite", "suite.yaml", "-o", "out", "--no-report"]
+    command = [
+        "evaluate",
+        *names,
+        "also=test_workers:hover",
+        "--suite",
+        "suite.yaml",
+        "-o",
+        "out",
+        "--no-report",
+    ]
     assert main([*command, "--workers", str(workers)]) == 1
     assert {entry.controller for entry in load_results("out").entries} == {"hover", "also"}
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("failed: ")]
-    assert {name for line in lines for name, message in bad.items() if name in line and message in line} == {*bad}
+    assert {
+        name for line in lines for name, message in bad.items() if name in line and message in line
+    } == {*bad}
 
 
 @pytest.mark.slow
@@ -97,9 +166,21 @@ def test_a_controller_that_ends_its_process_is_a_failure_and_the_others_fly(tmp_
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
 def test_workers_end_with_the_evaluation_that_started_them(tmp_path, number):
     (tmp_path / "suite.yaml").write_text(SUITE)
-    command = [sys.executable, "-m", "sb3_quad.cli", "evaluate", "a=test_workers:waits", "b=test_workers:waits"]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)])}
-    process = subprocess.Popen([*command, "--suite", "suite.yaml", "--workers", "2"], cwd=tmp_path, env=environment)
+    command = [
+        sys.executable,
+        "-m",
+        "sb3_quad.cli",
+        "evaluate",
+        "a=test_workers:waits",
+        "b=test_workers:waits",
+    ]
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(ROOT), str(Path(__file__).parent)]),
+    }
+    process = subprocess.Popen(
+        [*command, "--suite", "suite.yaml", "--workers", "2"], cwd=tmp_path, env=environment
+    )
     try:
         wait_for(lambda: len(list(tmp_path.glob("*.pid"))) == 2)
     finally:

@@ -1,1 +1,3 @@
-"""Settings for one vehicle in still air, from the geometric expert: agents that see the 18 features alone."""
+"""Settings for one vehicle in still air, from the geometric expert: agents that see the 18 features
+alone.
+"""

@@ -1,1 +1,3 @@
-"""The shipped agent for random worlds, `itm-robust`: larger, and trained for longer, than the default."""
+"""The shipped agent for random worlds, `itm-robust`: larger, and trained for longer, than the
+default.
+"""

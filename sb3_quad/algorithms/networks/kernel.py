@@ -1,8 +1,10 @@
-"""Multilayer perceptrons, forward and backward, compiled: blocks of rows go through all layers while they are in the cache.
+"""Multilayer perceptrons, forward and backward, compiled: blocks of rows go through all layers
+while they are in the cache.
 
-A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over rows is a vector loop.
-Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a row: weights (outputs, inputs), then biases.
-A chunk is a number of blocks; whichever thread computes it, its sums are the same.
+A block holds ``ROWS`` rows of the mini-batch side by side, (width, ROWS), so that every loop over
+rows is a vector loop. Widths are padded to multiples of 4 with zeros. A layer's parameters lie in a
+row: weights (outputs, inputs), then biases. A chunk is a number of blocks; whichever thread
+computes it, its sums are the same.
 """
 
 from typing import NamedTuple
@@ -14,7 +16,9 @@ from sb3_quad.algorithms.networks.losses import actor_loss, auxiliary_loss, crit
 from sb3_quad.base.arrays import Float32Array, IntArray
 from sb3_quad.simulation.compiled import compiled
 
-ROWS = 256  # of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes with it
+# Of a block: long loops, and yet a layer of 64 in half a megabyte of cache with all that goes
+# with it
+ROWS = 256
 LINEAR, TANH, RELU = range(3)
 _0, _1, _2, _3, _4 = (np.uint64(number) for number in range(5))
 _TILE = np.uint64(16)  # inputs at once: their rows stay in the first cache
@@ -40,12 +44,20 @@ class Layers(NamedTuple):
 @compiled(fastmath=_FAST)
 def _multiply(w, x, h):
     """h = w x; w (rows, columns), x (columns, ROWS), h (rows, ROWS)."""
-    rows, columns = uint64(w.shape[0]), uint64(w.shape[1])  # unsigned: Python's indices from the end would cost a third
+    rows, columns = (
+        uint64(w.shape[0]),
+        uint64(w.shape[1]),
+    )  # unsigned: Python's indices from the end would cost a third
     for tile in range(_0, columns, _TILE):
         for j in range(_0, rows, _2):
             for k in range(tile, min(columns, tile + _TILE), _4):
                 a0, a1, a2, a3 = w[j, k], w[j, k + _1], w[j, k + _2], w[j, k + _3]
-                b0, b1, b2, b3 = w[j + _1, k], w[j + _1, k + _1], w[j + _1, k + _2], w[j + _1, k + _3]
+                b0, b1, b2, b3 = (
+                    w[j + _1, k],
+                    w[j + _1, k + _1],
+                    w[j + _1, k + _2],
+                    w[j + _1, k + _3],
+                )
                 if k == _0:
                     for i in range(ROWS):
                         x0, x1, x2, x3 = x[k, i], x[k + _1, i], x[k + _2, i], x[k + _3, i]
@@ -86,7 +98,9 @@ def _add_products(g, x, dw):
 
 @compiled(fastmath=_FAST)
 def _activate(h, bias, kind):
-    """h = f(h + bias), (rows, ROWS). tanh is the quotient of polynomials that Eigen uses, exact to 4e-7."""
+    """h = f(h + bias), (rows, ROWS). tanh is the quotient of polynomials that Eigen uses, exact to
+    4e-7.
+    """
     for j in range(h.shape[0]):
         b = bias[j]
         if kind == TANH:
@@ -115,7 +129,9 @@ def _activate(h, bias, kind):
 
 @compiled(fastmath=_FAST)
 def _undo_activation(g, h, kind, db):
-    """g = g f'(x), by h = f(x), both (rows, ROWS); db (rows,) += its sums over the rows of the mini-batch."""
+    """g = g f'(x), by h = f(x), both (rows, ROWS); db (rows,) += its sums over the rows of the
+    mini-batch.
+    """
     for j in range(g.shape[0]):
         total = float32(0.0)
         for i in range(ROWS):
@@ -138,7 +154,9 @@ def _touch(rows, index, first, count):
 
 @compiled
 def _load(rows, index, first, count, h):
-    """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block (width, ROWS), zeros around them."""
+    """Gather ``count`` rows of (m, size), from ``first`` on in ``index``, into a block (width,
+    ROWS), zeros around them.
+    """
     h[0, 0] = _touch(rows, index, first, count)
     for k in range(h.shape[0]):
         for i in range(count if k < rows.shape[1] else 0, ROWS):
@@ -157,13 +175,19 @@ def _layer(scratch, at, width):
 
 @compiled
 def _forward(scratch, x, index, first, count, layers):
-    """Compute all layers of a block, which lie behind one another, the inputs first; returns where the outputs begin."""
+    """Compute all layers of a block, which lie behind one another, the inputs first; returns where
+    the outputs begin.
+    """
     widths, kinds, parameters, _ = layers
     _load(x, index, first, count, _layer(scratch, 0, widths[0]))
     at = place = 0
     for layer in range(1, len(widths)):
         rows, columns = widths[layer], widths[layer - 1]
-        before, at, middle = _layer(scratch, at, columns), at + columns * ROWS, place + rows * columns
+        before, at, middle = (
+            _layer(scratch, at, columns),
+            at + columns * ROWS,
+            place + rows * columns,
+        )
         h = _layer(scratch, at, rows)
         _multiply(parameters[place:middle].reshape(rows, columns), before, h)
         _activate(h, parameters[middle : middle + rows], kinds[layer - 1])
@@ -175,8 +199,8 @@ def _forward(scratch, x, index, first, count, layers):
 def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, terms):
     """Add to ``sums`` the gradient by the parameters of a block whose outputs begin at ``at``.
 
-    The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns. That of the auxiliary loss,
-    an actor's, is added on the way.
+    The outputs' gradient lies behind the layers; from there on, two layers' gradients take turns.
+    That of the auxiliary loss, an actor's, is added on the way.
     """
     widths, kinds, _, transposed = layers
     here, there, place = widths.sum() * ROWS, (widths.sum() + widths.max()) * ROWS, len(sums)
@@ -189,7 +213,9 @@ def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, 
         _undo_activation(g, h, kinds[layer - 1], sums[middle : middle + rows])
         _add_products(g, _layer(scratch, at, columns), sums[place:middle].reshape(rows, columns))
         if layer > 1:
-            _multiply(transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns))
+            _multiply(
+                transposed[place:middle].reshape(columns, rows), g, _layer(scratch, there, columns)
+            )
             if a > 0 and layer - 1 == loss.aux_layer:
                 hidden, its = _layer(scratch, at, columns), _layer(scratch, there, columns)
                 auxiliary_loss(hidden, index, first, count, targets, loss, a, its, terms)
@@ -198,10 +224,11 @@ def _backward(scratch, at, layers, sums, index, first, count, targets, loss, a, 
 
 @compiled
 def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
-    """The outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs), into ``out``, for some of all ``chunks``.
+    """The outputs (b, outputs) for the rows ``index`` (b,) of x (m, inputs), into ``out``, for some
+    of all ``chunks``.
 
-    :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of all layers, and
-        twice for the widest layer's gradients.
+    :param scratch: a thread's own memory, aligned to cache lines: ``ROWS`` numbers for each unit of
+        all layers, and twice for the widest layer's gradients.
     :param layers: :class:`Layers`.
     """
     n = len(index)
@@ -217,8 +244,11 @@ def forward(first_chunk, last_chunk, chunks, scratch, layers, x, index, out):
 
 
 @compiled
-def gradient(first_chunk, last_chunk, chunks, scratch, layers, x, index, targets, loss, log_std, sums, terms):
-    """The gradient of a loss (:mod:`.losses`) by all parameters; a block stays in the cache for its way forth and back.
+def gradient(
+    first_chunk, last_chunk, chunks, scratch, layers, x, index, targets, loss, log_std, sums, terms
+):
+    """The gradient of a loss (:mod:`.losses`) by all parameters; a block stays in the cache for its
+    way forth and back.
 
     As :func:`forward`, and:
 
@@ -241,7 +271,30 @@ def gradient(first_chunk, last_chunk, chunks, scratch, layers, x, index, targets
             g[:, :] = 0.0
             g[0, 0] = 0.0 * _touch(targets, index, first, count)
             if len(log_std) > 0:
-                actor_loss(y, index, first, count, targets, loss, log_std, g, sums[chunk, size:], terms[chunk])
+                actor_loss(
+                    y,
+                    index,
+                    first,
+                    count,
+                    targets,
+                    loss,
+                    log_std,
+                    g,
+                    sums[chunk, size:],
+                    terms[chunk],
+                )
             else:
                 critic_loss(y, index, first, count, targets, loss, g, terms[chunk])
-            _backward(scratch, at, layers, sums[chunk, :size], index, first, count, targets, loss, len(log_std), terms[chunk])
+            _backward(
+                scratch,
+                at,
+                layers,
+                sums[chunk, :size],
+                index,
+                first,
+                count,
+                targets,
+                loss,
+                len(log_std),
+                terms[chunk],
+            )

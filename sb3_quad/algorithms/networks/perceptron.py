@@ -1,4 +1,6 @@
-"""A multilayer perceptron and its gradients, computed by :mod:`.kernel` on as many threads as PyTorch had."""
+"""A multilayer perceptron and its gradients, computed by :mod:`.kernel` on as many threads as
+PyTorch had.
+"""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -13,12 +15,16 @@ from sb3_quad.algorithms.networks.kernel import LINEAR, RELU, ROWS, TANH, Layers
 from sb3_quad.algorithms.networks.losses import TERMS, Loss
 from sb3_quad.base.arrays import Float32Array, FloatArray, IntArray
 
-CHUNKS = 16  # at most, of a mini-batch: their sums are added up, so the number of threads changes no bit
+CHUNKS = (
+    16  # at most, of a mini-batch: their sums are added up, so the number of threads changes no bit
+)
 WORTHWHILE = 4  # blocks; fewer are done before another thread has woken
 PARTS = 4  # of a mini-batch for each thread: one that is held up does fewer of them
 CACHE_LINE = 64  # bytes; vectors that straddle two take a third longer
 _ACTIVATIONS = {nn.Tanh: TANH, nn.ReLU: RELU}
-_TYPES = tuple(Loss.__annotations__.values())  # of its fields: an int where a float is meant would be compiled anew
+_TYPES = tuple(
+    Loss.__annotations__.values()
+)  # of its fields: an int where a float is meant would be compiled anew
 _NONE = np.empty(0)
 
 
@@ -34,25 +40,44 @@ class Perceptron:
         sizes = [self._layers[0].in_features, *(each.out_features for each in self._layers)]
         self._widths = np.array([-(-size // 4) * 4 for size in sizes])
         self._size = int((self._widths[1:] * (self._widths[:-1] + 1)).sum())
-        self._packed = np.zeros((2, self._size), np.float32)  # with the weights as they are, and transposed
-        self._copies: list[tuple[Float32Array, Float32Array]] = []  # from PyTorch's memory into these
+        self._packed = np.zeros(
+            (2, self._size), np.float32
+        )  # with the weights as they are, and transposed
+        self._copies: list[
+            tuple[Float32Array, Float32Array]
+        ] = []  # from PyTorch's memory into these
         for layer, at, rows, columns in self._places():
-            weight, bias, middle = layer.weight.detach().numpy(), layer.bias.detach().numpy(), at + rows * columns
-            plain, transposed = self._packed[0, at:middle].reshape(rows, -1), self._packed[1, at:middle].reshape(columns, -1)
+            weight, bias, middle = (
+                layer.weight.detach().numpy(),
+                layer.bias.detach().numpy(),
+                at + rows * columns,
+            )
+            plain, transposed = (
+                self._packed[0, at:middle].reshape(rows, -1),
+                self._packed[1, at:middle].reshape(columns, -1),
+            )
             self._copies.append((plain[: weight.shape[0], : weight.shape[1]], weight))
             self._copies.append((transposed[: weight.shape[1], : weight.shape[0]], weight.T))
             self._copies.append((self._packed[:, middle : middle + len(bias)], bias))
 
     @staticmethod
     def fits(modules: Sequence[nn.Module]) -> bool:
-        """Whether these are linear layers and activations in turn, in float32 on the CPU, without hooks."""
+        """Whether these are linear layers and activations in turn, in float32 on the CPU, without
+        hooks.
+        """
         linear = modules[::2]
         return (
             len(modules) % 2 == 1
             and all(type(each) is nn.Linear and each.bias is not None for each in linear)
-            and all(each.weight.dtype == th.float32 and each.weight.device.type == "cpu" for each in linear)
+            and all(
+                each.weight.dtype == th.float32 and each.weight.device.type == "cpu"
+                for each in linear
+            )
             and all(type(each) in _ACTIVATIONS for each in modules[1::2])
-            and not any(each._forward_hooks or each._forward_pre_hooks or each._backward_hooks for each in modules)
+            and not any(
+                each._forward_hooks or each._forward_pre_hooks or each._backward_hooks
+                for each in modules
+            )
         )
 
     def __call__(self, x: Float32Array) -> Float32Array:
@@ -62,22 +87,33 @@ class Perceptron:
         return out
 
     def gradient(
-        self, x: Float32Array, index: IntArray, targets: Float32Array, loss: Loss, log_std: th.Tensor | None = None
+        self,
+        x: Float32Array,
+        index: IntArray,
+        targets: Float32Array,
+        loss: Loss,
+        log_std: th.Tensor | None = None,
     ) -> FloatArray:
-        """Set the gradient of a loss over the rows ``index`` of x and ``targets`` as ``.grad`` of all parameters.
+        """Set the gradient of a loss over the rows ``index`` of x and ``targets`` as ``.grad`` of
+        all parameters.
 
         :param log_std: of an actor, (a,); its gradient is set, too.
         :return: the terms of the loss, sums over the rows.
         """
         stds = _NONE if log_std is None else log_std.detach().double().numpy()
         chunks = _chunks(len(index))
-        sums, terms = np.empty((chunks, self._size + len(stds)), np.float32), np.empty((chunks, TERMS))
+        sums, terms = (
+            np.empty((chunks, self._size + len(stds)), np.float32),
+            np.empty((chunks, TERMS)),
+        )
         typed = Loss(*(kind(value) for kind, value in zip(_TYPES, loss, strict=True)))
         self._compute(gradient, len(index), x, index, targets, typed, stds, sums, terms)
         total = th.from_numpy(sums.sum(axis=0))
         for layer, at, rows, columns in self._places():
             middle = at + rows * columns
-            of_weights = total[at:middle].view(rows, columns)[: layer.out_features, : layer.in_features]
+            of_weights = total[at:middle].view(rows, columns)[
+                : layer.out_features, : layer.in_features
+            ]
             layer.weight.grad = of_weights.contiguous()
             layer.bias.grad = total[middle : middle + layer.out_features]
         if log_std is not None:
@@ -92,18 +128,24 @@ class Perceptron:
     def _places(self) -> Iterator[tuple[Any, int, int, int]]:
         """Of each layer where its parameters begin, and its padded outputs and inputs."""
         at = 0
-        for layer, columns, rows in zip(self._layers, self._widths.tolist(), self._widths[1:].tolist(), strict=False):
+        for layer, columns, rows in zip(
+            self._layers, self._widths.tolist(), self._widths[1:].tolist(), strict=False
+        ):
             yield layer, at, rows, columns
             at += rows * (columns + 1)
 
     def _compute(self, function: Callable[..., None], n: int, *arguments: Any) -> None:
-        """Call a function of :mod:`.kernel` for all chunks of n rows, on several threads where that is worthwhile."""
+        """Call a function of :mod:`.kernel` for all chunks of n rows, on several threads where that
+        is worthwhile.
+        """
         for there, here in self._copies:
             there[...] = here
         layers = Layers(self._widths, self._kinds, *self._packed)
         chunks, threads = _chunks(n), _threads if n > (WORTHWHILE - 1) * ROWS else 1
         size = -(-chunks // (PARTS * threads)) if threads > 1 else chunks
-        firsts = iter(range(0, chunks, size))  # each part is taken by one thread: `next` holds Python's lock
+        firsts = iter(
+            range(0, chunks, size)
+        )  # each part is taken by one thread: `next` holds Python's lock
 
         def work() -> None:
             scratch = _aligned(int(self._widths.sum() + 2 * self._widths.max()) * ROWS)
@@ -113,7 +155,9 @@ class Perceptron:
         helpers = [_pool.submit(work) for _ in range(threads - 1)] if _pool is not None else []
         work()
         for helper in helpers:
-            if not helper.cancel():  # one that has not begun is not waited for: its core is busy with something else
+            if (
+                not helper.cancel()
+            ):  # one that has not begun is not waited for: its core is busy with something else
                 helper.result()
 
 
@@ -132,10 +176,11 @@ _pool: ThreadPoolExecutor | None = None  # of the others
 
 
 def use_one_torch_thread() -> None:
-    """From now on PyTorch has one thread, and as many as it had share the work of every :class:`Perceptron`.
+    """From now on PyTorch has one thread, and as many as it had share the work of every
+    :class:`Perceptron`.
 
-    PyTorch's own threads wait for one another at every operation: on a machine that does something else beside they are up to
-    ten times slower than one.
+    PyTorch's own threads wait for one another at every operation: on a machine that does something
+    else beside they are up to ten times slower than one.
     """
     global _threads, _pool
     if _threads == 1 and th.get_num_threads() > 1:

@@ -1,7 +1,9 @@
-"""Write a page in which quadcopters fly under several controllers side by side: throw them, push them, move the target.
+"""Write a page in which quadcopters fly under several controllers side by side: throw them, push
+them, move the target.
 
-It is one file that needs no network and no other program than a browser. Weights, vehicles and a small simulation of the
-package's physics are in it. Other agents can be dropped onto the page as zips.
+It is one file that needs no network and no other program than a browser. Weights, vehicles and a
+small simulation of the package's physics are in it. Other agents can be dropped onto the page as
+zips.
 
 examples:
   sb3-quad demo                                                     PID, geometric, and agents of the package
@@ -10,8 +12,9 @@ examples:
   sb3-quad demo new=agent.zip old=path/to/agent.zip -o compare.html
   sb3-quad demo pid geometric any-quadcopter --vehicle my_vehicle.yaml
 
-A controller is pid, geometric, an agent of the package such as itm-recovery, the path of an SB3 zip, or a run folder;
-name=… labels it. All fly the same vehicle, at first the first agent's; the page also has those of the package.
+A controller is pid, geometric, an agent of the package such as itm-recovery, the path of an SB3
+zip, or a run folder; name=… labels it. All fly the same vehicle, at first the first agent's; the
+page also has those of the package.
 """
 
 import argparse
@@ -22,9 +25,18 @@ from sb3_quad.cli.parser import Parser, add_common
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("agents", nargs="*", metavar="AGENT", help="who flies (pid, geometric, and agents that come with the package)")
+    add(
+        "agents",
+        nargs="*",
+        metavar="AGENT",
+        help="who flies (pid, geometric, and agents that come with the package)",
+    )
     add("-o", "--output", default="demo.html", metavar="FILE", help="the page (demo.html)")
-    add("--vehicle", metavar="VEHICLE", help="name or YAML file of the vehicle at first (the first agent's)")
+    add(
+        "--vehicle",
+        metavar="VEHICLE",
+        help="name or YAML file of the vehicle at first (the first agent's)",
+    )
     add_common(parser, "trust", "overwrite")
 
 
@@ -42,6 +54,8 @@ def run(options: argparse.Namespace) -> int:
         warn(spec.notice(vehicle))
     write_text(options.output, page)
     if rounded:
-        print(f"weights of {' and '.join(rounded)} are rounded to half precision, to keep the page small")
+        print(
+            f"weights of {' and '.join(rounded)} are rounded to half precision, to keep the page small"
+        )
     print(f"saved {options.output} ({len(page.encode())} bytes); open it in a browser")
     return 0

@@ -1,4 +1,5 @@
-"""Fly controllers through scenarios, side by side on the same episodes; tables, results.json and episodes.csv.
+"""Fly controllers through scenarios, side by side on the same episodes; tables, results.json and
+episodes.csv.
 
 controllers:
   pid, geometric          the experts
@@ -16,7 +17,8 @@ examples:
   sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
 
-A folder holds the results of one command: give all controllers at once. The same command goes on where it was interrupted.
+A folder holds the results of one command: give all controllers at once. The same command goes on
+where it was interrupted.
 """
 
 import argparse
@@ -31,12 +33,32 @@ DEFAULT_FOLDER = "evaluations"
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
     add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
-    add("--suite", default="thesis", metavar="SUITE", help="thesis (default), robustness, wind, quadcopters, quick or a file")
+    add(
+        "--suite",
+        default="thesis",
+        metavar="SUITE",
+        help="thesis (default), robustness, wind, quadcopters, quick or a file",
+    )
     add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
-    add("--scenario", nargs="+", default=[], metavar="NAME", help="only these scenarios of the suite")
-    add("--episodes", type=whole, metavar="N", help="episodes per scenario, instead of its own number")
+    add(
+        "--scenario",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="only these scenarios of the suite",
+    )
+    add(
+        "--episodes",
+        type=whole,
+        metavar="N",
+        help="episodes per scenario, instead of its own number",
+    )
     add("--seed", type=whole, metavar="N", help="seed of each scenario, instead of its own")
-    add("--vehicle", metavar="V", help="vehicle for all, by name or YAML file (each agent's own, where the suite names none)")
+    add(
+        "--vehicle",
+        metavar="V",
+        help="vehicle for all, by name or YAML file (each agent's own, where the suite names none)",
+    )
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
     add("--overwrite", action="store_true", help="remove the results that the folder holds")
@@ -53,20 +75,31 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.evaluation.metric_tables import overview
     from sb3_quad.evaluation.scenarios.load import load_suite
 
-    suite = load_suite(options.suite).with_changes(options.scenario, options.episodes, options.seed, options.vehicle)
+    suite = load_suite(options.suite).with_changes(
+        options.scenario, options.episodes, options.seed, options.vehicle
+    )
     controllers = parse_controllers(options.controllers)
     folder = options.output or f"{DEFAULT_FOLDER}/{suite.name}"
     start = time.perf_counter()
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
         how = options.backend, options.workers, options.overwrite
-        results = evaluate(suite, controllers, folder, *how, show, warn, options.executor, options.address)
-    asked, flown = {spec.label for spec in controllers}, {entry.controller for entry in results.entries}
+        results = evaluate(
+            suite, controllers, folder, *how, show, warn, options.executor, options.address
+        )
+    asked, flown = (
+        {spec.label for spec in controllers},
+        {entry.controller for entry in results.entries},
+    )
     if asked & flown:
         labels = [spec.label for spec in controllers if spec.label in flown]
-        console().print(overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), labels))
+        console().print(
+            overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), labels)
+        )
     if flown:
-        print(f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
+        print(
+            f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/"
+        )
     if options.report and flown:
         report(folder, overwrite=True)
     failures = [failure for failure in results.failures if failure.controller in asked]

@@ -1,9 +1,11 @@
-"""Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or speeds out.
+"""Write a trained policy as ONNX, TorchScript or a C header: physical units in, rotor thrusts or
+speeds out.
 
-The file takes 18 numbers in physical units: position relative to the target, m, world frame; rotation matrix
-world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It returns the command for each rotor.
-Scaling and clipping are built in. The file is checked against the policy on 10,000 observations before it is written.
-A policy that sees earlier frames, its last action or the position integral takes a state beside them, and returns the next.
+The file takes 18 numbers in physical units: position relative to the target, m, world frame;
+rotation matrix world to body, row by row; velocity, m/s, and body rates, rad/s, body frame. It
+returns the command for each rotor. Scaling and clipping are built in. The file is checked against
+the policy on 10,000 observations before it is written. A policy that sees earlier frames, its last
+action or the position integral takes a state beside them, and returns the next.
 
 examples:
   sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --format onnx
@@ -11,7 +13,8 @@ examples:
   sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml
 
-ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. A C header needs a C compiler to check it.
+ONNX needs onnx and onnxruntime: pip install '.[export]' from a clone. A C header needs a C compiler
+to check it.
 """
 
 import argparse
@@ -30,9 +33,22 @@ def add_arguments(parser: Parser) -> None:
     add("--format", required=True, metavar="FORMAT", help="onnx, torchscript or c")
     file = "file to write, or a folder for it (here, named as the zip, .onnx, .pt or .h)"
     add("-o", metavar="FILE", dest="file", help=file)
-    add("--output", default="thrusts", metavar="KIND", help="what it gives: thrusts (N, default) or speeds (rad/s)")
-    add("--vehicle", metavar="VEHICLE", help="name or YAML file (the one that the zip or its run folder says)")
-    add("--name", metavar="NAME", help="name the C function NAME_policy (the file's name without its ending)")
+    add(
+        "--output",
+        default="thrusts",
+        metavar="KIND",
+        help="what it gives: thrusts (N, default) or speeds (rad/s)",
+    )
+    add(
+        "--vehicle",
+        metavar="VEHICLE",
+        help="name or YAML file (the one that the zip or its run folder says)",
+    )
+    add(
+        "--name",
+        metavar="NAME",
+        help="name the C function NAME_policy (the file's name without its ending)",
+    )
     add_common(parser, "trust", "overwrite")
 
 
@@ -57,8 +73,19 @@ def run(options: argparse.Namespace) -> int:
         warn(ControllerSpec(model.stem, str(model)).notice(options.vehicle))
     exported = export_policy(model, options.format, options.output, options.vehicle, name=name)
     write_bytes(file, exported.content)
-    print(f"settings: {exported.settings or 'neither in the zip nor beside it; assumed: itm, the scaling of Table A.2'}")
-    for key in ("vehicle", "scaling", "network", "observation", "state", "result", "rotors", "check"):
+    print(
+        f"settings: {exported.settings or 'neither in the zip nor beside it; assumed: itm, the scaling of Table A.2'}"
+    )
+    for key in (
+        "vehicle",
+        "scaling",
+        "network",
+        "observation",
+        "state",
+        "result",
+        "rotors",
+        "check",
+    ):
         if key in exported.metadata:
             print(f"{key}: {exported.metadata[key]}")
     print(f"saved {file} ({len(exported.content)} bytes)")

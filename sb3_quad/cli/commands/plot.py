@@ -1,4 +1,5 @@
-"""Draw learning curves: success, reward and losses over timesteps and wall-clock time, with mean and range over seeds.
+"""Draw learning curves: success, reward and losses over timesteps and wall-clock time, with mean
+and range over seeds.
 
 examples:
   sb3-quad plot logs/ppo_bc/QuadStateRecovery-v0_1
@@ -22,24 +23,53 @@ THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}  # its sc
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("groups", nargs="+", metavar="RUN", help="a run folder, or NAME=PATTERN: an agent's name and its runs; quote a *")
+    add(
+        "groups",
+        nargs="+",
+        metavar="RUN",
+        help="a run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
+    )
     lines = "horizontal lines: success in %%, reward"
-    add("--line", action="append", default=[], type=_line, metavar="NAME:SUCCESS:REWARD", help=lines)
+    add(
+        "--line", action="append", default=[], type=_line, metavar="NAME:SUCCESS:REWARD", help=lines
+    )
     thesis = f"draw what the thesis prints of {', '.join(THESIS)} as horizontal lines"
     add("--thesis", choices=[*THESIS], metavar="TASK", help=thesis)
-    add("--show", nargs="+", choices=PANELS, default=[], metavar="PANEL", help=f"of {', '.join(PANELS)} (success reward)")
-    add("--task", help="show the evaluations on this one of the runs' eval_tasks instead of on their own task")
+    add(
+        "--show",
+        nargs="+",
+        choices=PANELS,
+        default=[],
+        metavar="PANEL",
+        help=f"of {', '.join(PANELS)} (success reward)",
+    )
+    add(
+        "--task",
+        help="show the evaluations on this one of the runs' eval_tasks instead of on their own task",
+    )
     add("--title", default="", help="title of the picture")
-    add("-o", "--output", default="curves.png", metavar="FILE", help="picture to write: .png, .svg or .pdf (curves.png)")
+    add(
+        "-o",
+        "--output",
+        default="curves.png",
+        metavar="FILE",
+        help="picture to write: .png, .svg or .pdf (curves.png)",
+    )
     add_common(parser, "overwrite")
 
 
 def _line(text: str) -> tuple[str, dict[str, float]]:
     try:
         name, success, reward = text.split(":")
-        return name, {"success": float(success) / 100, "survival": float(success) / 100, "reward": float(reward)}
+        return name, {
+            "success": float(success) / 100,
+            "survival": float(success) / 100,
+            "reward": float(reward),
+        }
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1") from None
+        raise argparse.ArgumentTypeError(
+            f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1"
+        ) from None
 
 
 def run(options: argparse.Namespace) -> int:
@@ -52,20 +82,30 @@ def run(options: argparse.Namespace) -> int:
     groups: dict[str, Any] = {}
     for text in options.groups:
         bare = Path(text).is_dir() or "=" not in text
-        name, _, pattern = ("/".join(Path(text).parts[-2:]), "", text) if bare else text.partition("=")
+        name, _, pattern = (
+            ("/".join(Path(text).parts[-2:]), "", text) if bare else text.partition("=")
+        )
         folders = [pattern] if Path(pattern).is_dir() else sorted(glob.glob(pattern))
         if not name or not folders:
-            raise ConfigError(f"{text!r}: no such folder; give run folders, or NAME=PATTERN such as 'RL-agent=logs/ppo_bc/*'")
+            raise ConfigError(
+                f"{text!r}: no such folder; give run folders, or NAME=PATTERN such as 'RL-agent=logs/ppo_bc/*'"
+            )
         if name in groups:
-            raise ConfigError(f"{name!r}: two are called so; give NAME=PATTERN with names of their own")
+            raise ConfigError(
+                f"{name!r}: two are called so; give NAME=PATTERN with names of their own"
+            )
         groups[name] = [read_curve(folder, options.task) for folder in folders]
     kind = Path(options.output).suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
         raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
     lines = {}
     if options.thesis:  # its success is our survival
-        for name, reference in load_suite("thesis").scenario(THESIS[options.thesis]).reference.items():
-            lines[f"thesis: {name}"] = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
+        for name, reference in (
+            load_suite("thesis").scenario(THESIS[options.thesis]).reference.items()
+        ):
+            lines[f"thesis: {name}"] = reference.model_dump(
+                include={"survival", "reward"}, exclude_none=True
+            )
     show = options.show or (["survival", "reward"] if options.thesis else [])
     curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
     refuse_existing(options.output, options.overwrite)

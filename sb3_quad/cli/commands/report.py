@@ -1,4 +1,5 @@
-"""Make report.html from a results folder of evaluate: tables and plots; one file that needs no network.
+"""Make report.html from a results folder of evaluate: tables and plots; one file that needs no
+network.
 
 examples:
   sb3-quad report evaluations/thesis

@@ -9,7 +9,8 @@ examples:
   sb3-quad sweep my_sweep.yaml --executor ray --address auto
   sb3-quad sweep --resume logs/sweep/my_sweep_1            goes on after Ctrl-C or a crash
 
-A folder is left: run folders, results.csv, results.json, report.md and report.html. The file's keys: docs/sweeps.md.
+A folder is left: run folders, results.csv, results.json, report.md and report.html. The file's
+keys: docs/sweeps.md.
 """
 
 import argparse
@@ -28,17 +29,43 @@ from sb3_quad.training.options import JobOptions, RunOptions, SettingsOptions
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("sweep", nargs="?", metavar="SWEEP", help="YAML file, or a name; the flags below go before what it says")
+    add(
+        "sweep",
+        nargs="?",
+        metavar="SWEEP",
+        help="YAML file, or a name; the flags below go before what it says",
+    )
     add("--seed", nargs="+", type=seed, metavar="N", help="seeds of each configuration (0)")
-    add("-conf", "--conf-file", nargs="+", metavar="FILE", help="settings files, of single runs or pipelines (two_stage.yml)")
+    add(
+        "-conf",
+        "--conf-file",
+        nargs="+",
+        metavar="FILE",
+        help="settings files, of single runs or pipelines (two_stage.yml)",
+    )
     add("--algo", nargs="+", help="algorithms of single runs (dagger)")
     add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
     add_fields(parser, SettingsOptions)
     add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
-    add_fields(parser, JobOptions, *RunOptions.model_fields, "log_folder", trained_agent={"type": agent_path})
-    add("--suite", metavar="SUITE", help="what the agents fly in the end (fresh episodes of both tasks, 240 each)")
+    add_fields(
+        parser,
+        JobOptions,
+        *RunOptions.model_fields,
+        "log_folder",
+        trained_agent={"type": agent_path},
+    )
+    add(
+        "--suite",
+        metavar="SUITE",
+        help="what the agents fly in the end (fresh episodes of both tasks, 240 each)",
+    )
     add("--episodes", type=positive, metavar="N", help="episodes of each scenario in the end")
-    add("--gym-packages", nargs="+", metavar="MODULE", help="modules that register further environments")
+    add(
+        "--gym-packages",
+        nargs="+",
+        metavar="MODULE",
+        help="modules that register further environments",
+    )
     add("--workers", type=positive, metavar="N", help="runs side by side (the cores)")
     add("--dry-run", action="store_true", help="list the runs, train nothing")
     add("--resume", metavar="FOLDER", help="go on with a sweep: what is not finished in its folder")
@@ -54,7 +81,9 @@ def run(options: argparse.Namespace) -> int:
 
     if options.resume is not None:
         for name in given(options, "sweep", *SweepSpec.model_fields, "suite", "episodes"):
-            raise ConfigError(f"--resume keeps the sweep's own settings; leave {name.replace('_', '-')} away")
+            raise ConfigError(
+                f"--resume keeps the sweep's own settings; leave {name.replace('_', '-')} away"
+            )
         place = SweepFolder(options.resume)
         return _go_on(options, place.read(), place)
     spec = _spec(options)
@@ -63,7 +92,10 @@ def run(options: argparse.Namespace) -> int:
     if not options.dry_run:
         return _go_on(options, plan, None)
     for each in plan.runs:
-        stages = (f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps" for stage in each.stages)
+        stages = (
+            f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
+            for stage in each.stages
+        )
         print(f"{each.name}: {', then '.join(stages)}")
     configurations = len({each.configuration for each in plan.runs})
     print(f"{_count(len(plan.runs), 'run')} of {_count(configurations, 'configuration')}")
@@ -71,7 +103,9 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _spec(options: argparse.Namespace) -> Any:
-    """The :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line: a file's, with the flags over it."""
+    """The :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line: a file's, with the flags over
+    it.
+    """
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
 
@@ -89,17 +123,23 @@ def _spec(options: argparse.Namespace) -> Any:
             (grid if len(values) > 1 else flags)[name] = values if len(values) > 1 else values[0]
     evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
     return validate(
-        SweepSpec, _with_defaults({**data, **flags, "grid": grid, "evaluation": evaluation}), options.sweep or "command line"
+        SweepSpec,
+        _with_defaults({**data, **flags, "grid": grid, "evaluation": evaluation}),
+        options.sweep or "command line",
     )
 
 
 def _with_defaults(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A sweep that trains, where nothing is said, what ``train`` does: its pipeline, or its algorithm in its environment."""
+    """A sweep that trains, where nothing is said, what ``train`` does: its pipeline, or its
+    algorithm in its environment.
+    """
     from sb3_quad.training.pipeline import is_pipeline
 
     said = {**data, **data["grid"]}
     files = said.get("conf_file") or []
-    if data.get("configurations") or any(is_pipeline(file) for file in ([files] if isinstance(files, str) else files)):
+    if data.get("configurations") or any(
+        is_pipeline(file) for file in ([files] if isinstance(files, str) else files)
+    ):
         return data
     if not said.keys() & {"conf_file", "algo", "env"}:
         return {**data, "conf_file": DEFAULT_PIPELINE}
@@ -107,7 +147,9 @@ def _with_defaults(data: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
-    """Do what is left of a sweep's Plan, in its SweepFolder (None: a new one). Returns the exit code."""
+    """Do what is left of a sweep's Plan, in its SweepFolder (None: a new one). Returns the exit
+    code.
+    """
     from sb3_quad.base.cores import available_cpus
     from sb3_quad.base.files import locked
     from sb3_quad.base.signals import StopSignals
@@ -120,13 +162,23 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
 
     start, needs = time.perf_counter(), plan.spec.resources
     workers = min(options.workers or available_cpus(), len(plan.runs))
-    with start_executor(options.executor, workers, options.address, needs.num_cpus, needs.num_gpus) as executor:
+    with start_executor(
+        options.executor, workers, options.address, needs.num_cpus, needs.num_gpus
+    ) as executor:
         if place is None:
-            place = SweepFolder(claim_folder(Path(options.log_folder or "logs") / "sweep", plan.spec.name or "sweep"))
+            place = SweepFolder(
+                claim_folder(
+                    Path(options.log_folder or "logs") / "sweep", plan.spec.name or "sweep"
+                )
+            )
             place.write(plan)
         where = f"{executor.workers} side by side, executor {options.executor}"
         print(f"sweep {place.path}: {_count(len(plan.runs), 'run')}, {where}")
-        with locked(place.path, "sweep folder"), StopSignals() as signals, progress_bar(options.progress) as show:
+        with (
+            locked(place.path, "sweep folder"),
+            StopSignals() as signals,
+            progress_bar(options.progress) as show,
+        ):
             records = execute(place, plan, executor, signals, show, print)
             signals.hold()
             found = evaluate(plan, records)
@@ -137,9 +189,14 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
                     console().print(table)
                 write_report(place, found, shown)
     failures = [record for record in records.values() if record.state == "failed"]
-    finished = f"{found.finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
+    finished = (
+        f"{found.finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
+    )
     print(f"{finished}; {time.perf_counter() - start:.1f} s")
-    print(f"saved in {place.path}: results.csv, results.json, runs/" + (", report.md, report.html" if found.groups else ""))
+    print(
+        f"saved in {place.path}: results.csv, results.json, runs/"
+        + (", report.md, report.html" if found.groups else "")
+    )
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
     if signals.received is not None:

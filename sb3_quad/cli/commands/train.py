@@ -1,4 +1,5 @@
-"""Train an agent. Without arguments: DAgger, then PPO with cloning, in random worlds, from an expert that is told the truth.
+"""Train an agent. Without arguments: DAgger, then PPO with cloning, in random worlds, from an
+expert that is told the truth.
 
 examples:
   sb3-quad train                                          both stages in random worlds, in the batched environment
@@ -28,7 +29,16 @@ from sb3_quad.training.options import JobOptions, SettingsOptions
 DEFAULT_PIPELINE, THESIS = "two_stage.yml", "thesis.yml"
 DEFAULT_ALGO, DEFAULT_ENV = "dagger", "QuadTargetTracking-v0"
 KEPT_BY_RESUME = (
-    *("algo", "env", "conf_file", "hyperparams", "eval_env_kwargs", "trained_agent", "log_folder", "seed"),
+    *(
+        "algo",
+        "env",
+        "conf_file",
+        "hyperparams",
+        "eval_env_kwargs",
+        "trained_agent",
+        "log_folder",
+        "seed",
+    ),
     *SettingsOptions.model_fields,
 )
 
@@ -37,16 +47,36 @@ def add_settings(parser: Parser) -> None:
     """Add the flags for what is trained, which ``tune`` has as well."""
     add = parser.add_argument
     add("--algo", help=f"algorithm: dagger, ppo_bc, sac_bc, ppo, sac or td3 ({DEFAULT_ALGO})")
-    add("--env", help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc")
+    add(
+        "--env",
+        help=f"environment id ({DEFAULT_ENV}); any id that Gymnasium knows, with --vec-env dummy or subproc",
+    )
     file = "settings: a YAML file, or one of the package, such as thesis/dagger.yml (ALGO.yml: still air, PID expert)"
     add("-conf", "--conf-file", metavar="FILE", help=file)
     add_fields(parser, SettingsOptions)
     add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
     add_fields(
-        parser, JobOptions, "eval_env_kwargs", "trained_agent", "n_eval_envs", "device", trained_agent={"type": agent_path}
+        parser,
+        JobOptions,
+        "eval_env_kwargs",
+        "trained_agent",
+        "n_eval_envs",
+        "device",
+        trained_agent={"type": agent_path},
     )
-    add("--num-threads", type=positive, metavar="N", help="threads (the cores; one where PyTorch computes)")
-    add("--gym-packages", nargs="+", default=[], metavar="MODULE", help="modules that register further environments")
+    add(
+        "--num-threads",
+        type=positive,
+        metavar="N",
+        help="threads (the cores; one where PyTorch computes)",
+    )
+    add(
+        "--gym-packages",
+        nargs="+",
+        default=[],
+        metavar="MODULE",
+        help="modules that register further environments",
+    )
     add_common(parser, "trust", "progress")
 
 
@@ -55,11 +85,44 @@ def add_arguments(parser: Parser) -> None:
     add_settings(parser)
     add = parser.add_argument
     add("--thesis", action="store_true", help=f"the thesis's method: --conf-file {THESIS}")
-    add("--seed", type=seed, metavar="N", help="seed (0); negative: a random one, recorded in args.yml")
-    add_fields(parser, JobOptions, "log_folder", "uuid", "eval_freq", "eval_episodes", "save_freq", "snapshot_every")
-    add_fields(parser, JobOptions, "log_interval", "tensorboard_log", "verbose", "track", "wandb_project_name")
-    add_fields(parser, JobOptions, "wandb_entity", "wandb_group", "wandb_tags", wandb_tags={"nargs": "+", "type": str})
-    add("--resume", metavar="RUN_FOLDER", help="continue an interrupted or killed run with all its settings")
+    add(
+        "--seed",
+        type=seed,
+        metavar="N",
+        help="seed (0); negative: a random one, recorded in args.yml",
+    )
+    add_fields(
+        parser,
+        JobOptions,
+        "log_folder",
+        "uuid",
+        "eval_freq",
+        "eval_episodes",
+        "save_freq",
+        "snapshot_every",
+    )
+    add_fields(
+        parser,
+        JobOptions,
+        "log_interval",
+        "tensorboard_log",
+        "verbose",
+        "track",
+        "wandb_project_name",
+    )
+    add_fields(
+        parser,
+        JobOptions,
+        "wandb_entity",
+        "wandb_group",
+        "wandb_tags",
+        wandb_tags={"nargs": "+", "type": str},
+    )
+    add(
+        "--resume",
+        metavar="RUN_FOLDER",
+        help="continue an interrupted or killed run with all its settings",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -72,23 +135,34 @@ def run(options: argparse.Namespace) -> int:
     from sb3_quad.training.trainer import resume, train
 
     if options.thesis and (options.conf_file or options.resume):
-        raise ConfigError(f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume")
+        raise ConfigError(
+            f"--thesis is --conf-file {THESIS}; it goes with neither --conf-file nor --resume"
+        )
     options.conf_file = THESIS if options.thesis else options.conf_file
     prepare(options)
     start = time.perf_counter()
-    arguments = {**given(options, *JobOptions.model_fields), "progress": shows_progress(options.progress)}
+    arguments = {
+        **given(options, *JobOptions.model_fields),
+        "progress": shows_progress(options.progress),
+    }
     if options.resume is not None:
         for name in given(options, *KEPT_BY_RESUME):
-            raise ConfigError(f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away")
+            raise ConfigError(
+                f"--resume keeps the run's own settings; leave --{name.replace('_', '-')} away"
+            )
         if stages.is_pipeline_run(Path(options.resume)):
             finished = stages.resume_pipeline(Path(options.resume), **arguments)
             return close_pipeline(finished, time.perf_counter() - start)
         return close_run(resume(options.resume, **arguments))
-    conf_file = options.conf_file or (DEFAULT_PIPELINE if options.algo is None and options.env is None else None)
+    conf_file = options.conf_file or (
+        DEFAULT_PIPELINE if options.algo is None and options.env is None else None
+    )
     if conf_file is not None and stages.is_pipeline(conf_file):
         for name in given(options, "algo", "env", "n_timesteps", "trained_agent"):
             own = f"a pipeline's stages have their own in {conf_file}"
-            raise ConfigError(f"--{name.replace('_', '-')} goes with a single run (--algo, --env); {own}")
+            raise ConfigError(
+                f"--{name.replace('_', '-')} goes with a single run (--algo, --env); {own}"
+            )
         pipeline = stages.with_settings(stages.load_pipeline(conf_file), changed_settings(options))
         finished = stages.run_pipeline(pipeline, arguments, Path(conf_file).stem)
         return close_pipeline(finished, time.perf_counter() - start)
@@ -119,7 +193,10 @@ def make_config(options: argparse.Namespace) -> Any:
     from sb3_quad.training.config import load_config
     from sb3_quad.training.transfer import as_agent
 
-    asked, changes = (options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file), changed_settings(options)
+    asked, changes = (
+        (options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file),
+        changed_settings(options),
+    )
     config = load_config(*asked, changes)
     if options.trained_agent is None or options.conf_file is not None:
         return config

@@ -1,4 +1,5 @@
-"""Trained policies that come with the package: for each ``NAME.zip``, for stock PPO, a card ``NAME.md``.
+"""Trained policies that come with the package: for each ``NAME.zip``, for stock PPO, a card
+``NAME.md``.
 
 The card says what it flies, how it was trained (command, seed, commit) and what was measured.
 ``examples/publish.py`` writes both.
@@ -39,9 +40,11 @@ def pretrained(name: str) -> Path:
 def load_pretrained(name: str, **kwargs: Any) -> "PPO":
     """A policy that comes with the package, as a stock PPO model.
 
-    It reads what an environment with :func:`env_kwargs` of that name observes, and gives 4 actions in [-1, 1].
+    It reads what an environment with :func:`env_kwargs` of that name observes, and gives 4 actions
+    in [-1, 1].
 
-    :param kwargs: of ``PPO.load``, such as ``env`` and ``device`` (here "cpu" unless told otherwise).
+    :param kwargs: of ``PPO.load``, such as ``env`` and ``device`` (here "cpu" unless told
+        otherwise).
     :raises ConfigError: an unknown name.
     """
     from stable_baselines3 import PPO
@@ -50,7 +53,8 @@ def load_pretrained(name: str, **kwargs: Any) -> "PPO":
 
 
 def agent_path(text: str) -> str:
-    """The path of an agent's zip, from what stands for one: the name of a policy that comes with the package, or a run folder.
+    """The path of an agent's zip, from what stands for one: the name of a policy that comes with
+    the package, or a run folder.
 
     Anything else is returned as it is.
     """
@@ -61,6 +65,8 @@ def agent_path(text: str) -> str:
 
 
 def run_agent(folder: Path, name: str) -> Path:
-    """What a run has to offer: its trimmed agent, else its best one, else its last one, ``<name>.zip``."""
+    """What a run has to offer: its trimmed agent, else its best one, else its last one,
+    ``<name>.zip``.
+    """
     zips = [folder / file for file in (TRIMMED, BEST, f"{name}.zip")]
     return next((path for path in zips if path.is_file()), zips[-1])

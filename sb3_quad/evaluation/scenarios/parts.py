@@ -1,4 +1,6 @@
-"""What a scenario is made of: start, target, wrenches, the vehicle's changes. Units SI, angles in degrees where said."""
+"""What a scenario is made of: start, target, wrenches, the vehicle's changes. Units SI, angles in
+degrees where said.
+"""
 
 import math
 from typing import Annotated, Any, ClassVar, Literal
@@ -15,7 +17,9 @@ Factor = Annotated[float, Field(ge=0.1, le=10)]
 
 
 class OneOf(Frozen):
-    """A part with several ways to be given, of which a file uses exactly one; a list alone is the first way."""
+    """A part with several ways to be given, of which a file uses exactly one; a list alone is the
+    first way.
+    """
 
     ways: ClassVar[tuple[str, ...]]
 
@@ -36,28 +40,43 @@ class OneOf(Frozen):
 class VectorDistribution(OneOf):
     """A vector: fixed, written as ``[x, y, z]``, or sampled anew for each episode.
 
-    ``{std: 2}`` is normal in each component, ``{magnitude: 3}`` has that length and a uniformly random direction.
+    ``{std: 2}`` is normal in each component, ``{magnitude: 3}`` has that length and a uniformly
+    random direction.
     """
 
     ways = ("value", "std", "magnitude")
 
-    value: Vector | None = Field(default=None, description="the vector itself, in the unit of what it is for")
-    std: NonNegativeFloat | None = Field(default=None, description="standard deviation of each component, in the same unit")
-    magnitude: NonNegativeFloat | None = Field(default=None, description="length, in the same unit; the direction is random")
+    value: Vector | None = Field(
+        default=None, description="the vector itself, in the unit of what it is for"
+    )
+    std: NonNegativeFloat | None = Field(
+        default=None, description="standard deviation of each component, in the same unit"
+    )
+    magnitude: NonNegativeFloat | None = Field(
+        default=None, description="length, in the same unit; the direction is random"
+    )
 
     @property
     def largest(self) -> float:
-        """The greatest length that is likely: for ``std``, three standard deviations in each component."""
+        """The greatest length that is likely: for ``std``, three standard deviations in each
+        component.
+        """
         if self.value is not None:
             return math.hypot(*self.value)
-        return self.magnitude if self.magnitude is not None else 3.0 * math.sqrt(3.0) * (self.std or 0.0)
+        return (
+            self.magnitude
+            if self.magnitude is not None
+            else 3.0 * math.sqrt(3.0) * (self.std or 0.0)
+        )
 
 
 ZERO = VectorDistribution(value=(0.0, 0.0, 0.0))
 
 
 class Attitude(OneOf):
-    """The attitude at the start: ``level``, ``uniform`` on SO(3), ``{quaternion: [w, x, y, z]}`` or ``{tilt: 60}``."""
+    """The attitude at the start: ``level``, ``uniform`` on SO(3), ``{quaternion: [w, x, y, z]}`` or
+    ``{tilt: 60}``.
+    """
 
     ways = ("quaternion", "tilt", "distribution")
 
@@ -65,9 +84,12 @@ class Attitude(OneOf):
         default=None, description="w, x, y, z, body to world; is normalised"
     )
     tilt: Annotated[float, Field(ge=0, le=180)] | None = Field(
-        default=None, description="angle between body z and world z, deg; about a random horizontal axis"
+        default=None,
+        description="angle between body z and world z, deg; about a random horizontal axis",
     )
-    distribution: Literal["uniform"] | None = Field(default=None, description="uniform on SO(3), as in state recovery")
+    distribution: Literal["uniform"] | None = Field(
+        default=None, description="uniform on SO(3), as in state recovery"
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -77,12 +99,16 @@ class Attitude(OneOf):
         if data == "uniform":
             return {"distribution": "uniform"}
         if isinstance(data, str):
-            raise ValueError(f"{unknown('attitude', data, ('level', 'uniform'))}, or {{quaternion: …}}, or {{tilt: …}}")
+            raise ValueError(
+                f"{unknown('attitude', data, ('level', 'uniform'))}, or {{quaternion: …}}, or {{tilt: …}}"
+            )
         return data
 
     @field_validator("quaternion")
     @classmethod
-    def _not_zero(cls, value: tuple[float, float, float, float] | None) -> tuple[float, float, float, float] | None:
+    def _not_zero(
+        cls, value: tuple[float, float, float, float] | None
+    ) -> tuple[float, float, float, float] | None:
         if value is not None and math.hypot(*value) < 1e-6:
             raise ValueError("must not be zero")
         return value
@@ -92,49 +118,81 @@ class Start(Frozen):
     """Where and how an episode starts; rotors turn at hover speed."""
 
     position: Vector = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
-    attitude: Attitude = Field(default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}")
-    velocity: VectorDistribution = Field(default=ZERO, description="m/s: [x, y, z], {std: …} or {magnitude: …}")
-    velocity_frame: Frame = Field(default="world", description="world or body: the axes of velocity")
-    body_rates: VectorDistribution = Field(default=ZERO, description="body frame, rad/s: given as velocity is")
+    attitude: Attitude = Field(
+        default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}"
+    )
+    velocity: VectorDistribution = Field(
+        default=ZERO, description="m/s: [x, y, z], {std: …} or {magnitude: …}"
+    )
+    velocity_frame: Frame = Field(
+        default="world", description="world or body: the axes of velocity"
+    )
+    body_rates: VectorDistribution = Field(
+        default=ZERO, description="body frame, rad/s: given as velocity is"
+    )
 
     @model_validator(mode="after")
     def _turnable(self) -> "Start":
-        if self.velocity_frame == "body" and (self.velocity.value is None or self.attitude.distribution is not None):
-            raise ValueError("velocity_frame: body goes with a fixed velocity and an attitude that is not uniform")
+        if self.velocity_frame == "body" and (
+            self.velocity.value is None or self.attitude.distribution is not None
+        ):
+            raise ValueError(
+                "velocity_frame: body goes with a fixed velocity and an attitude that is not uniform"
+            )
         return self
 
 
 class Target(OneOf):
-    """Where to fly: ``[x, y, z]``, ``{distance: 10}`` in a random direction, or ``{waypoints: [[x, y, z], …]}``."""
+    """Where to fly: ``[x, y, z]``, ``{distance: 10}`` in a random direction, or ``{waypoints: [[x,
+    y, z], …]}``.
+    """
 
     ways = ("position", "distance", "waypoints")
 
     position: Vector | None = Field(default=None, description="r_T, world frame, m")
     distance: NonNegativeFloat | None = Field(
-        default=None, description="from the start in a uniformly random direction above ground, m; 0: the start itself"
+        default=None,
+        description="from the start in a uniformly random direction above ground, m; 0: the start itself",
     )
     waypoints: tuple[Vector, ...] | None = Field(
         default=None, min_length=1, description="targets one after the other, world frame, m"
     )
-    radius: PositiveFloat | None = Field(default=None, description="a waypoint counts as reached within this, m (0.5)")
+    radius: PositiveFloat | None = Field(
+        default=None, description="a waypoint counts as reached within this, m (0.5)"
+    )
 
     @property
     def points(self) -> tuple[Vector, ...]:
         """The fixed targets, in order; none if the target is random."""
-        return self.waypoints if self.waypoints is not None else () if self.position is None else (self.position,)
+        return (
+            self.waypoints
+            if self.waypoints is not None
+            else ()
+            if self.position is None
+            else (self.position,)
+        )
 
 
 class Wrench(Frozen):
     """An external force and torque at the centre of mass for some time; those that overlap add up."""
 
     start: NonNegativeFloat = Field(default=0.0, description="when it begins, s")
-    duration: PositiveFloat | None = Field(default=None, description="how long it acts, s; left out: to the end")
-    force: VectorDistribution = Field(default=ZERO, description="N, or as unit says: [x, y, z], {std: …} or {magnitude: …}")
-    torque: VectorDistribution = Field(default=ZERO, description="N m, or as unit says: as force is given")
-    unit: Literal["SI", "weight"] = Field(
-        default="SI", description="weight: force in weights m g of the vehicle, torque in weights times its arm length"
+    duration: PositiveFloat | None = Field(
+        default=None, description="how long it acts, s; left out: to the end"
     )
-    factor: float = Field(default=1.0, description="multiplies force and torque alike; to vary the size of a hit")
+    force: VectorDistribution = Field(
+        default=ZERO, description="N, or as unit says: [x, y, z], {std: …} or {magnitude: …}"
+    )
+    torque: VectorDistribution = Field(
+        default=ZERO, description="N m, or as unit says: as force is given"
+    )
+    unit: Literal["SI", "weight"] = Field(
+        default="SI",
+        description="weight: force in weights m g of the vehicle, torque in weights times its arm length",
+    )
+    factor: float = Field(
+        default=1.0, description="multiplies force and torque alike; to vary the size of a hit"
+    )
     force_frame: Frame = Field(default="world", description="world or body: the axes of force")
     torque_frame: Frame = Field(default="body", description="world or body: the axes of torque")
 
@@ -145,22 +203,30 @@ class Wrench(Frozen):
 
 
 class VehicleChanges(Frozen):
-    """How the vehicle that flies differs from the one its controller was made for; motors and limits stay what they are."""
+    """How the vehicle that flies differs from the one its controller was made for; motors and
+    limits stay what they are.
+    """
 
-    mass: Factor = Field(default=1.0, description="is a factor: 1.3 is 30 % more; thrust limits in N stay")
+    mass: Factor = Field(
+        default=1.0, description="is a factor: 1.3 is 30 % more; thrust limits in N stay"
+    )
     inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
         default=1.0, description="factor of Ixx, Iyy and Izz, or one for each"
     )
-    motor_gain: Factor = Field(default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more")
+    motor_gain: Factor = Field(
+        default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"
+    )
     delay: Annotated[int, Field(ge=0, le=100)] | None = Field(
-        default=None, description="control steps from a command to its effect; left out: the vehicle's own"
+        default=None,
+        description="control steps from a command to its effect; left out: the vehicle's own",
     )
 
     def apply(self, vehicle: Vehicle) -> Vehicle:
         """The changed vehicle.
 
-        Rotor thrusts in N answer actions as before: the limits, which a vehicle gives in hover thrusts of its own mass
-        (Eq. 3.18), are divided by the mass factor, so that action 0 is the hover of the unchanged vehicle.
+        Rotor thrusts in N answer actions as before: the limits, which a vehicle gives in hover
+        thrusts of its own mass (Eq. 3.18), are divided by the mass factor, so that action 0 is the
+        hover of the unchanged vehicle.
 
         :raises ValueError: no such vehicle can fly, for example one too heavy for its rotors.
         """
@@ -171,7 +237,9 @@ class VehicleChanges(Frozen):
         return vehicle.model_copy(
             update={
                 "mass": vehicle.mass * self.mass,
-                "inertia": tuple(own * factor for own, factor in zip(vehicle.inertia, factors, strict=True)),
+                "inertia": tuple(
+                    own * factor for own, factor in zip(vehicle.inertia, factors, strict=True)
+                ),
                 "thrust_limits": (low / self.mass, high / self.mass),
                 "motor_gain_up": vehicle.motor_gain_up * self.motor_gain,
                 "motor_gain_down": vehicle.motor_gain_down * self.motor_gain,

@@ -1,4 +1,6 @@
-"""What happens in the episodes of a scenario, sampled from their seeds; the same for every controller and backend."""
+"""What happens in the episodes of a scenario, sampled from their seeds; the same for every
+controller and backend.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -19,10 +21,12 @@ Generators = Sequence[np.random.Generator]  # one for each episode
 class Plan:
     """What happens to n episodes whoever flies them.
 
-    :param start: what replaces the environments' own sample: any of position, quaternion, velocity, body_rates, target;
-        (n, 3) or (n, 4).
-    :param wrenches: from the control steps before which the external wrench changes to the new one, (n, WRENCH_SIZE).
-    :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its target.
+    :param start: what replaces the environments' own sample: any of position, quaternion, velocity,
+        body_rates, target; (n, 3) or (n, 4).
+    :param wrenches: from the control steps before which the external wrench changes to the new one,
+        (n, WRENCH_SIZE).
+    :param waypoints: targets one after the other, (W, 3), m; ``start`` holds the first as its
+        target.
     :param radius: the next waypoint becomes the target once |r - r_T| is within this, m.
     """
 
@@ -47,14 +51,25 @@ def sample_plan(scenario: Scenario, seeds: Sequence[int]) -> Plan:
         if distribution.std is None:
             start[name] = _vectors(distribution, generators)
     if scenario.start.velocity_frame == "body":
-        start["velocity"] = np.einsum("nij,nj->ni", rotation_matrices(start["quaternion"]), start["velocity"])
+        start["velocity"] = np.einsum(
+            "nij,nj->ni", rotation_matrices(start["quaternion"]), start["velocity"]
+        )
     if target.points:
         start["target"] = np.tile(np.array(target.points[0]), (len(seeds), 1))
-    wrenches = sample_wrenches(scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators)
-    return Plan(start, wrenches, np.array(target.waypoints or np.zeros((0, 3))), target.radius or Plan.radius)
+    wrenches = sample_wrenches(
+        scenario.wrenches, scenario.nominal_vehicle(), scenario.steps, generators
+    )
+    return Plan(
+        start,
+        wrenches,
+        np.array(target.waypoints or np.zeros((0, 3))),
+        target.radius or Plan.radius,
+    )
 
 
-def sample_wrenches(wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators) -> dict[int, FloatArray]:
+def sample_wrenches(
+    wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, generators: Generators
+) -> dict[int, FloatArray]:
     """The sum of some wrenches over the time of n episodes, as a :class:`Plan` holds it.
 
     :param vehicle: gives the control step, and weights their size.
@@ -63,14 +78,24 @@ def sample_wrenches(wrenches: Sequence[Wrench], vehicle: Vehicle, steps: int, ge
     acting = []
     for wrench in wrenches:
         first = round(wrench.start / vehicle.control_step)
-        length = steps if wrench.duration is None else max(1, round(wrench.duration / vehicle.control_step))
+        length = (
+            steps
+            if wrench.duration is None
+            else max(1, round(wrench.duration / vehicle.control_step))
+        )
         newton, newton_metre = wrench.units(vehicle)
-        vectors = newton * _vectors(wrench.force, generators), newton_metre * _vectors(wrench.torque, generators)
+        vectors = (
+            newton * _vectors(wrench.force, generators),
+            newton_metre * _vectors(wrench.torque, generators),
+        )
         values = make_wrench(*vectors, wrench.force_frame, wrench.torque_frame).T
         acting.append((first, first + length, wrench.factor * values))
     times = sorted({time for first, last, _ in acting for time in (first, last) if time < steps})
     none = np.zeros((len(generators), WRENCH_SIZE))
-    return {time: sum((values for first, last, values in acting if first <= time < last), none) for time in times}
+    return {
+        time: sum((values for first, last, values in acting if first <= time < last), none)
+        for time in times
+    }
 
 
 def _vectors(distribution: VectorDistribution, generators: Generators) -> FloatArray:
@@ -78,7 +103,9 @@ def _vectors(distribution: VectorDistribution, generators: Generators) -> FloatA
         return np.tile(np.array(distribution.value), (len(generators), 1))
     if distribution.magnitude is None:
         return (distribution.std or 0.0) * _normals(generators, 3)
-    return distribution.magnitude * (_directions(generators, 3) if distribution.magnitude else np.zeros((len(generators), 3)))
+    return distribution.magnitude * (
+        _directions(generators, 3) if distribution.magnitude else np.zeros((len(generators), 3))
+    )
 
 
 def _quaternions(attitude: Attitude, generators: Generators) -> FloatArray:
