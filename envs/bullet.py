@@ -119,9 +119,9 @@ class BulletBody:
         client, body = self.client, self.body
         push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
         world_force, world_torque = wrench[FORCE_WORLD].tolist(), wrench[TORQUE_WORLD].tolist()
-        is_pushed = any(world_force) or any(world_torque)
+        is_disturbed = any(world_force) or any(world_torque)
         for force, torque in wrenches.tolist():
-            if is_pushed:
+            if is_disturbed:
                 # A world-frame force acts at a point of the world: the centre of mass, where it is
                 # now.
                 position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from sb3_quad.algorithms.offset_correction import N_OFFSETS, ROUNDS, hover_offset
 from sb3_quad.base.arrays import Float32Array, FloatArray
 from sb3_quad.base.colours import colours_of
 from sb3_quad.base.errors import ConfigError
@@ -32,7 +33,6 @@ from sb3_quad.evaluation.tables import Column, Table
 from sb3_quad.report.scenario_plots import arrivals_plot
 from sb3_quad.simulation.observation import DEFAULT_STD, GROUPS
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.trim import N_OFFSETS, ROUNDS, hover_offset
 
 POSITION = GROUPS["position"]
 

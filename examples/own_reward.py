@@ -16,9 +16,9 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor
 
 from sb3_quad import PPOBC, GeometricExpert, pretrained
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.training.transfer import transfer_policy
 
 
 class CalmActions(VecEnvWrapper):

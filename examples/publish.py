@@ -1,7 +1,7 @@
 """Write a trained policy as a small zip for stock PPO, with a card: measured metrics, command,
 seed, versions.
 
-    python examples/publish.py logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --name my-agent
+    python examples/publish.py logs/ppo_bc/QuadStateRecovery-v0_1/corrected_model.zip --name my-agent
     python examples/publish.py logs/ppo/QuadStateRecovery-v0_2/best_model.zip --name other --command
     "my.py" -o published python examples/publish.py itm-recovery --name itm-recovery --hub python
     examples/publish.py itm-recovery --name itm-recovery --push somebody/itm-recovery
@@ -53,7 +53,7 @@ from sb3_quad.evaluation.metric_tables import (
     SUCCESS,
     SURVIVAL,
     metric_cells,
-    stay_row,
+    settling_row,
     time_row,
 )
 from sb3_quad.evaluation.metrics import Metrics, summarise
@@ -71,7 +71,7 @@ UNKNOWN = "not recorded"
 
 N_RECOVERIES = 4  # times as many recoveries as targets at each distance
 TARGETS = {f"targets {distance:.0f} m away": distance for distance in (10.0, 15.0, 20.0)}  # m
-RECOVERY, TIMES = "state recovery", (stay_row(0.1), LIMIT, time_row(0.1))
+RECOVERY, TIMES = "state recovery", (settling_row(0.1), LIMIT, time_row(0.1))
 SHOWN = (SUCCESS, SURVIVAL, REWARD, *TIMES, MEDIAN, QUANTILE)
 
 

@@ -14,12 +14,12 @@ from stable_baselines3.common.utils import LinearSchedule
 from stop_on_signal import StopOnSignal
 
 from sb3_quad import PPOBC, PIDExpert
+from sb3_quad.algorithms.offset_correction import correct_offset
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.callbacks import BestModel
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.transfer import transfer_policy
-from sb3_quad.training.trim import trim
 
 parser = argparse.ArgumentParser(
     description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -79,7 +79,7 @@ best = BestModel(
 )
 model.learn(arguments.timesteps, callback=[best, StopOnSignal(arguments.output)])
 if arguments.timesteps > every:  # an agent that still crashes has no offset
-    trim(model)
+    correct_offset(model)
 model.save(arguments.output)
 for task in ("state_recovery", "target_tracking"):
     flights = fly(model, task, n_episodes=480, seed=1_000_000)

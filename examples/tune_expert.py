@@ -82,7 +82,7 @@ class Objective:
             np.exp(-np.maximum(lowest.height, 0.0) / CLOSE).sum() / self.starts
         )  # tells near losses apart
         settling = np.nan_to_num(
-            tracking.time_to_stay[NEAR], nan=2 * WAY * self.vehicle.control_step
+            tracking.settling_time[NEAR], nan=2 * WAY * self.vehicle.control_step
         ).mean()
         left, reward = (
             (tracking.survival & (tracking.overshoot > NEAR)).mean(),
@@ -124,7 +124,7 @@ def measure_expert(
     tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
     times, stays = (
         np.nan_to_num(each[NEAR], nan=time_limit * vehicle.control_step)
-        for each in (tracking.time_to, tracking.time_to_stay)
+        for each in (tracking.time_to, tracking.settling_time)
     )
     return {
         "recovery_survival": round(float(recovery.survival.mean()), 5),
@@ -132,7 +132,7 @@ def measure_expert(
         "tracking_survival": round(float(tracking.survival.mean()), 5),
         "tracking_episodes": tracking.n,
         "time_to_0_1_m": round(float(times.mean()), 3),  # mean time until 0.1 m from the target, s
-        "time_to_stay": round(float(stays.mean()), 3),  # until it stays there, s
+        "settling_time": round(float(stays.mean()), 3),  # until it stays there, s
         "tracking_reward": round(float(tracking.reward.mean()), 3),  # mean (Eqs. 4.5-4.9)
         "observation_noise": 0.0,
         "seeds": [*seeds],
@@ -142,7 +142,7 @@ def measure_expert(
 def fresh_cost(metrics: dict[str, Any]) -> float:
     """What gains cost on fresh episodes, with the same weights, s."""
     lost = LOST * (1.0 - metrics["recovery_survival"])
-    return lost + metrics["time_to_stay"]
+    return lost + metrics["settling_time"]
 
 
 def main() -> None:

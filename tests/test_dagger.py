@@ -401,7 +401,7 @@ def test_hidden_units_learn_to_say_what_no_observation_shows(tmp_path):
     model = DAgger(
         "MlpPolicy",
         env,
-        "told_geometric",
+        "privileged_geometric",
         aux_coef=1.0,
         policy_kwargs={"net_arch": [64, 32]},
         seed=0,

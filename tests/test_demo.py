@@ -289,7 +289,7 @@ def test_a_zip_that_does_not_fit_is_refused_in_one_line(tmp_path):
         assert message in in_node(tmp_path, zip=str(tmp_path / f"{name}.zip"))
 
 
-@pytest.mark.parametrize("given", ["told_geometric", "examples.hover:Hover", "nothere.zip"])
+@pytest.mark.parametrize("given", ["privileged_geometric", "examples.hover:Hover", "nothere.zip"])
 def test_a_controller_that_the_page_cannot_fly_is_named(given, tmp_path, capsys):
     assert main(["demo", given, "-o", str(tmp_path / "demo.html")]) == 2
     said = capsys.readouterr().err

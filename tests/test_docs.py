@@ -12,7 +12,7 @@ import pytest
 from stable_baselines3 import PPO
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-import sb3_quad.training.trim
+import sb3_quad.algorithms.offset_correction
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 
@@ -79,7 +79,7 @@ def shorten_trainings(monkeypatch, rollouts=1):
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
     monkeypatch.setattr(
-        sb3_quad.training.trim, "trim", lambda model: None
+        sb3_quad.algorithms.offset_correction, "correct_offset", lambda model: None
     )  # which needs an agent that flies
     return trained
 

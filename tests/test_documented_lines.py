@@ -106,7 +106,7 @@ def folder(tmp_path_factory, trained_runs):
             run = shutil.copytree(source, place / "logs" / algo / f"{env_id}_{number}")
             for path in [*run.glob("QuadStateRecovery-v0*")]:
                 path.rename(path.with_name(path.name.replace("QuadStateRecovery-v0", env_id)))
-            shutil.copy(pretrained("thesis-recovery"), run / "trimmed_model.zip")
+            shutil.copy(pretrained("thesis-recovery"), run / "corrected_model.zip")
             shutil.copy(pretrained("thesis-imitation"), run / "best_model.zip")
     for algo in ("ppo", "logs/ppo"):
         shutil.copytree(
@@ -142,7 +142,14 @@ def shorter(content):
         key: shorter(value)
         for key, value in content.items()
         if key
-        not in ("require", "trim", "position_scale", "leaving_cost", "trim_env_kwargs", "trims")
+        not in (
+            "require",
+            "correct_offset",
+            "position_scale",
+            "overshoot_cost",
+            "correction_env_kwargs",
+            "correction_rounds",
+        )
     }
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}
@@ -171,7 +178,7 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
         FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN))
     )
     monkeypatch.setattr("sb3_quad.show.film.HOLD", 0.1)
-    monkeypatch.setattr("sb3_quad.training.transfer.CLONE_STEPS", 100)
+    monkeypatch.setattr("sb3_quad.algorithms.transfer.CLONE_STEPS", 100)
     monkeypatch.setattr(pipeline, "is_pipeline_run", lambda path: False)
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(folder)

@@ -146,11 +146,11 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
         within = seen <= 0.1
         first, last = int(np.argmax(within)), len(seen) - int(np.argmin(within[::-1]))
         assert flights.time_to[0.1][row] == pytest.approx(first * 0.01)
-        assert flights.time_to_stay[0.1][row] == pytest.approx(last * 0.01)
+        assert flights.settling_time[0.1][row] == pytest.approx(last * 0.01)
         assert flights.overshoot[row] == pytest.approx(seen[first:].max())
         leaves.append(first != last)
     assert 0 < sum(leaves) < 24 or all(flights.overshoot <= 0.1)
-    assert summarise(flights).arrivals[0].leaves.value == np.mean(leaves)
+    assert summarise(flights).arrivals[0].overshoot_rate.value == np.mean(leaves)
 
 
 def table_of(metrics, name, beside):
@@ -171,13 +171,13 @@ def test_tables_say_how_many_arrived():
         length=np.full(n, 1500),
         flown=np.full(n, 15.0),
         time_to={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 5.0, np.nan, 6.0])},
-        time_to_stay={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 6.0, np.nan, np.nan])},
+        settling_time={0.1: np.full(n, np.nan), 1.0: np.array([4.0, 6.0, np.nan, np.nan])},
         overshoot=np.full(n, np.nan),
         path_length=np.full(n, 10.0),
         final_error=np.array([0.1, 0.2, 9.0, 0.3]),
         final_offset=np.array([[0.1, 0, 0], [0.2, 0, 0], [np.nan] * 3, [0.3, 0, 0]]),
-        stabilised=np.array([1.0, 2.0, np.nan, 3.0]),
-        sideways=np.array([0.2, 0.4, 9.0, 0.6]),
+        recovery_time=np.array([1.0, 2.0, np.nan, 3.0]),
+        cross_track_error=np.array([0.2, 0.4, 9.0, 0.6]),
         waypoint_times=np.zeros((n, 0)),
         start=np.zeros((n, 13)),
         target=np.zeros((n, 3)),
@@ -187,15 +187,15 @@ def test_tables_say_how_many_arrived():
     assert (metrics.collisions, metrics.out_of_range) == (1, 0)
     assert metrics.arrivals[-1].time.value == 5.0 and metrics.arrivals[-1].share.value == 0.75
     assert (
-        metrics.arrivals[-1].stays.time.value == 5.0
-        and metrics.arrivals[-1].stays.share.value == 0.5
+        metrics.arrivals[-1].settling.time.value == 5.0
+        and metrics.arrivals[-1].settling.share.value == 0.5
     )
     assert (
-        metrics.arrivals[-1].leaves.value == pytest.approx(2 / 3)
-        and metrics.arrivals[0].leaves is None
+        metrics.arrivals[-1].overshoot_rate.value == pytest.approx(2 / 3)
+        and metrics.arrivals[0].overshoot_rate is None
     )
-    assert metrics.stabilised.time.value == 2.0 and metrics.stabilised.share.value == 0.75
-    assert metrics.sideways.value == pytest.approx(0.4)
+    assert metrics.recovery_time.time.value == 2.0 and metrics.recovery_time.share.value == 0.75
+    assert metrics.cross_track_error.value == pytest.approx(0.4)
     assert (
         metrics.final_error_95.value == pytest.approx(0.29) and metrics.final_error_95.high <= 0.3
     )

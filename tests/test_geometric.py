@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains, told_derived
+from sb3_quad.experts.geometric import GeometricExpert, derived_gains, privileged_derived
 from sb3_quad.simulation.state import (
     BODY_RATES,
     POSITION,
@@ -151,23 +151,23 @@ def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(
 
 
 @pytest.mark.parametrize(("name", "late"), [("hummingbird", False), ("cf2x_L250", True)])
-def test_told_derived_is_gentler_where_commands_act_late(name: str, late: bool) -> None:
+def test_privileged_derived_is_gentler_where_commands_act_late(name: str, late: bool) -> None:
     """A quick vehicle flies by its derived gains; a slow one comes to rest within 0.1 m, too, but
     by other ones.
     """
     vehicle = load_vehicle(name)
-    bold = GeometricExpert(vehicle, derived_gains(vehicle), told=True)
+    bold = GeometricExpert(vehicle, derived_gains(vehicle), privileged=True)
     gentle, plain = (
         fly(expert, seed=3, n_episodes=24, vehicle=vehicle, max_steps=900)
-        for expert in (told_derived(name), bold)
+        for expert in (privileged_derived(name), bold)
     )
-    assert gentle.success.all() and not np.isnan(gentle.time_to_stay[0.1]).any()
+    assert gentle.success.all() and not np.isnan(gentle.settling_time[0.1]).any()
     assert (np.abs(gentle.reward - plain.reward) > 1e-9).any() == late
 
 
-@pytest.mark.parametrize(("told", "name"), [(False, "attitude"), (True, "atitude")])
-def test_gains_where_commands_act_late_are_known_ones_of_a_told_expert(
-    told: bool, name: str
+@pytest.mark.parametrize(("privileged", "name"), [(False, "attitude"), (True, "atitude")])
+def test_gains_where_commands_act_late_are_known_ones_of_a_privileged_expert(
+    privileged: bool, name: str
 ) -> None:
     with pytest.raises(ConfigError, match=f"late {name}"):
-        GeometricExpert(told=told, late={name: 0.5})
+        GeometricExpert(privileged=privileged, late={name: 0.5})

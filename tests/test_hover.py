@@ -7,12 +7,12 @@ import pytest
 import torch as th
 from stable_baselines3 import PPO
 
+from sb3_quad.algorithms.offset_correction import correct_hover
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.observation import DEFAULT_STD
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QuadcopterState
-from sb3_quad.training.trim import trim_hover
 from sb3_quad.vehicles.vehicle import load_vehicle
 
 
@@ -38,7 +38,7 @@ def at_target(heading):
 def test_the_agent_hovers_at_its_target_with_every_heading(model):
     observations = at_target(np.linspace(-np.pi, np.pi, 50))
     before = model.predict(observations, deterministic=True)[0]
-    result = trim_hover(model, seed=3, settings=FlightSettings(noise=0.0))
+    result = correct_hover(model, seed=3, settings=FlightSettings(noise=0.0))
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after).mean() < 0.1 * np.square(before).mean()
     assert (
@@ -51,7 +51,7 @@ def test_hover_of_a_vehicle_whose_middle_thrust_is_another(model):
     observations = at_target(np.linspace(-np.pi, np.pi, 50))
     hover = load_vehicle("hummingbird").hover_action
     assert hover < -0.2
-    result = trim_hover(model, seed=3, settings=FlightSettings(noise=0.0, vehicle="hummingbird"))
+    result = correct_hover(model, seed=3, settings=FlightSettings(noise=0.0, vehicle="hummingbird"))
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after - hover).mean() < 0.1 * np.square(after).mean()
     assert result.after == pytest.approx(np.sqrt(np.square(after - hover).mean()), abs=0.02)
@@ -59,7 +59,7 @@ def test_hover_of_a_vehicle_whose_middle_thrust_is_another(model):
 
 def test_only_the_last_layer_changes_and_the_zip_stays_stock(model, tmp_path):
     before = {key: value.clone() for key, value in model.policy.state_dict().items()}
-    trim_hover(model, seed=3)
+    correct_hover(model, seed=3)
     changed = {
         key for key, value in model.policy.state_dict().items() if not th.equal(value, before[key])
     }
@@ -72,9 +72,9 @@ def test_only_the_last_layer_changes_and_the_zip_stays_stock(model, tmp_path):
 
 
 def test_what_is_trimmed_already_is_left_alone(model):
-    trim_hover(model, seed=3)
+    correct_hover(model, seed=3)
     weight = model.policy.action_net.weight.clone()
-    again = trim_hover(model, seed=3)
+    again = correct_hover(model, seed=3)
     assert (
         again.before < 0.05
         and (model.policy.action_net.weight - weight).norm() < 0.05 * weight.norm()
@@ -96,11 +96,11 @@ def test_the_scaling_that_the_agent_flies_with_is_taken_into_account(model, shif
         np.float32
     )
     before = model.predict(observations, deterministic=True)[0]
-    trim_hover(model, seed=3, settings=FlightSettings(noise=0.0, **scaling))
+    correct_hover(model, seed=3, settings=FlightSettings(noise=0.0, **scaling))
     after = model.predict(observations, deterministic=True)[0]
     assert np.square(after).mean() < 0.2 * np.square(before).mean()
 
 
 def test_an_agent_of_other_observations_is_refused():
     with pytest.raises(ConfigError, match="18 features"):
-        trim_hover(PPO("MlpPolicy", "Pendulum-v1", device="cpu"))
+        correct_hover(PPO("MlpPolicy", "Pendulum-v1", device="cpu"))

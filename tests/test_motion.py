@@ -34,18 +34,20 @@ def watched(states, flying=True):
 def test_stable_is_the_beginning_of_a_time_that_lasts():
     tumbling, level = state(tilt=2.0), state(tilt=0.3)
     short = [tumbling, *[level] * 10, *[state(rate=5.0)] * 5]  # upright for 0.1 s, and turning on
-    assert watched([*short, *[level] * 40]).stabilised[0] == pytest.approx(len(short) * 0.01)
-    assert np.isnan(watched(short).stabilised[0])
-    assert watched([level] * 40).stabilised[0] == 0.0
+    assert watched([*short, *[level] * 40]).recovery_time[0] == pytest.approx(len(short) * 0.01)
+    assert np.isnan(watched(short).recovery_time[0])
+    assert watched([level] * 40).recovery_time[0] == 0.0
 
 
 def test_a_lost_flight_gets_stable_no_more():
-    assert np.isnan(watched([state(tilt=2.0), *[state()] * 40], flying=False).stabilised[0])
+    assert np.isnan(watched([state(tilt=2.0), *[state()] * 40], flying=False).recovery_time[0])
 
 
 def test_sideways_is_across_the_way_only():
     states = [state(), state(position=(4, 3, 4)), state(position=(12, 0, 1))]
-    assert watched(states).sideways[0] == pytest.approx(5.0)
+    assert watched(states).cross_track_error[0] == pytest.approx(5.0)
     assert np.isnan(
-        watched([state(target=(0, 0, 0)), state(position=(1, 2, 3), target=(0, 0, 0))]).sideways[0]
+        watched(
+            [state(target=(0, 0, 0)), state(position=(1, 2, 3), target=(0, 0, 0))]
+        ).cross_track_error[0]
     )

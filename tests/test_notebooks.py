@@ -37,7 +37,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
     monkeypatch.setattr(plt, "show", show)
     monkeypatch.setattr(FlightSettings, "longest_episode", 100)
     monkeypatch.setattr(
-        "sb3_quad.training.trim.trim", lambda model: None
+        "sb3_quad.algorithms.offset_correction.correct_offset", lambda model: None
     )  # which needs an agent that flies
     with plt.rc_context():
         exec(compile(shortened(text), str(NOTEBOOKS[name]), "exec"), {"__name__": name})

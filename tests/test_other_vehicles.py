@@ -40,7 +40,7 @@ def here(tmp_path, monkeypatch):
             "env": ENV,
             "conf_file": f"nominal/{algo}.yml",
             "pass_on": "last",
-            "trim": "hover",
+            "correct_offset": "hover",
             "settings": {**TINY, "expert": "geometric"},
         }
         for name, algo in (("one", "dagger"), ("two", "ppo_bc"))
@@ -96,7 +96,7 @@ def test_both_stages_are_trained_and_their_agents_flown_from_anywhere(
         )
         == 0
     )
-    agent = here / "logs" / "ppo_bc" / f"{ENV}_1" / "trimmed_model.zip"
+    agent = here / "logs" / "ppo_bc" / f"{ENV}_1" / "corrected_model.zip"
     assert main(["export", str(agent), "--format", "torchscript", "-o", "agent.pt"]) == 0
     assert f'"vehicle": "{flown.name}:'.encode() in (elsewhere / "agent.pt").read_bytes()
 

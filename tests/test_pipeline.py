@@ -13,6 +13,13 @@ import torch as th
 import yaml
 from stable_baselines3 import PPO
 
+from sb3_quad.algorithms.offset_correction import (
+    Correction,
+    correct_offset,
+    hover_offset,
+    scale_position,
+    shift_position,
+)
 from sb3_quad.algorithms.ppo_bc import PPOBC
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.seeds import LARGEST
@@ -32,7 +39,6 @@ from sb3_quad.training.pipeline import (
     with_settings,
 )
 from sb3_quad.training.trainer import train
-from sb3_quad.training.trim import Trim, hover_offset, scale_position, shift_position, trim
 
 TINY = {
     "n_envs": 8,
@@ -107,16 +113,25 @@ def test_a_requirement_that_is_missed_stops_the_pipeline(tmp_path, job):
         ([{**STAGES[0], "settings": {"n_stepz": 3}}], "did you mean 'n_steps'"),
         ([{**STAGES[0], "require": {"success": 1}}], "did you mean 'success_rate'"),
         (
-            [{**STAGES[0], "trim": "hover", "conf_file": "robust/dagger.yml"}],
+            [{**STAGES[0], "correct_offset": "hover", "conf_file": "robust/dagger.yml"}],
             "see the 18 features alone",
         ),
-        ([{**STAGES[0], "position_scale": 0.6}], "position_scale goes with trim: position"),
         (
-            [{**STAGES[0], "trim": "hover", "leaving_cost": 2.0}],
-            "leaving_cost goes with trim: arrival",
+            [{**STAGES[0], "position_scale": 0.6}],
+            "position_scale goes with correct_offset: position",
         ),
         (
-            [{**STAGES[0], "trim": "arrival", "trim_env_kwargs": {"randomize": {"gust": {}}}}],
+            [{**STAGES[0], "correct_offset": "hover", "overshoot_cost": 2.0}],
+            "overshoot_cost goes with correct_offset: arrival",
+        ),
+        (
+            [
+                {
+                    **STAGES[0],
+                    "correct_offset": "arrival",
+                    "correction_env_kwargs": {"randomize": {"gust": {}}},
+                }
+            ],
             "did you mean 'gusts'",
         ),
         ([], "at least 1"),
@@ -186,23 +201,28 @@ def test_an_agent_that_crashes_cannot_be_trimmed():
 @pytest.mark.slow
 def test_trimming_cancels_the_offset_of_a_trained_agent(monkeypatch):
     monkeypatch.setattr(
-        "sb3_quad.training.trim.fly", partial(fly, max_steps=700)
+        "sb3_quad.algorithms.offset_correction.fly", partial(fly, max_steps=700)
     )  # 7 s are enough to arrive
     model = load_pretrained("itm-imitation")
     shift_position(model, np.array([0.5, 0.0, -0.5]), np.full(3, 10 / np.sqrt(3)))
     assert np.linalg.norm(hover_offset(model, 40)) > 0.4
-    result = trim(model)
+    result = correct_offset(model)
     assert result.before > 0.4 and result.after < 0.05
 
 
 def test_a_stage_says_where_and_how_often_its_agent_is_trimmed(tmp_path, job, monkeypatch):
     seen = []
     monkeypatch.setattr(
-        pipeline_module, "trim_arrival", lambda *given: seen.append(given) or Trim(1.0, 0.5)
+        pipeline_module,
+        "correct_arrival",
+        lambda *given: seen.append(given) or Correction(1.0, 0.5),
     )
-    for own in ({}, {"trim_env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}, "trims": 2}):
+    for own in (
+        {},
+        {"correction_env_kwargs": {"randomize": {"mass": [0.9, 1.1]}}, "correction_rounds": 2},
+    ):
         settings = {"env_kwargs": {"randomize": {"share": 0.5}, "noise": 0.1}}
-        stage = {**STAGES[0], "trim": "arrival", "settings": settings, **own}
+        stage = {**STAGES[0], "correct_offset": "arrival", "settings": settings, **own}
         run_pipeline(tiny(tmp_path, [stage]), job, "stages", quiet)
     randomize = [worlds.randomize for _, _, _, worlds, _ in seen]
     assert [(each.share, each.mass and each.mass.high) for each in randomize] == [
@@ -225,7 +245,7 @@ def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_oversh
     with th.no_grad():
         layer.weight[:, 12:15] *= 0.7
     before = layer.weight.detach().clone()
-    result = arrival.trim_arrival(model, 1, settings, settings)
+    result = arrival.correct_arrival(model, 1, settings, settings)
     assert result.after < result.before - 0.2
     factors = (layer.weight / before).detach().numpy()
     np.testing.assert_allclose(factors, np.broadcast_to(factors[0], factors.shape), rtol=1e-4)
@@ -247,12 +267,14 @@ def test_scales_that_do_not_help_are_not_kept(monkeypatch):
         "MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"
     )  # loses every flight, however it is scaled
     before = model.policy.mlp_extractor.policy_net[0].weight.detach().clone()
-    result = arrival.trim_arrival(model, 1, *[FlightSettings(last_action=True, history=[0, 2])] * 2)
+    result = arrival.correct_arrival(
+        model, 1, *[FlightSettings(last_action=True, history=[0, 2])] * 2
+    )
     assert result.after == result.before and th.equal(
         model.policy.mlp_extractor.policy_net[0].weight, before
     )
     with pytest.raises(ConfigError, match="reads the 18 features"):
-        arrival.trim_arrival(model, 1, FlightSettings(), FlightSettings())
+        arrival.correct_arrival(model, 1, FlightSettings(), FlightSettings())
 
 
 def small_file(tmp_path):
@@ -299,27 +321,27 @@ def test_a_stage_may_fly_other_episodes_than_the_one_before(tmp_path):
 def two_stages(tmp_path):
     """The first is to be trimmed."""
     first = {**STAGES[0], "conf_file": "nominal/dagger.yml"}
-    return tiny(tmp_path, [{**first, "trim": "hover"}, {**first, "name": "two"}])
+    return tiny(tmp_path, [{**first, "correct_offset": "hover"}, {**first, "name": "two"}])
 
 
-def no_trim(model, seed, settings):
-    return Trim(1.0, 0.0)
+def no_correction(model, seed, settings):
+    return Correction(1.0, 0.0)
 
 
 def test_a_stage_is_not_trained_anew_when_its_trimming_was_interrupted(tmp_path, job, monkeypatch):
     def interrupted(model, seed, settings):
         signal.raise_signal(signal.SIGTERM)
 
-    monkeypatch.setattr(pipeline_module, "trim_hover", interrupted)
+    monkeypatch.setattr(pipeline_module, "correct_hover", interrupted)
     lines = []
     result = run_pipeline(two_stages(tmp_path), job, "stages", lines.append)
     assert result.exit_code == 143 and f"--resume {result.folder}" in lines[-1]
 
-    monkeypatch.setattr(pipeline_module, "trim_hover", no_trim)
+    monkeypatch.setattr(pipeline_module, "correct_hover", no_correction)
     after = resume_pipeline(result.folder, quiet)
-    assert after.stages["one"].agent.endswith("trimmed_model.zip")
+    assert after.stages["one"].agent.endswith("corrected_model.zip")
     assert len(list((tmp_path / "logs" / "dagger").iterdir())) == 2
-    monkeypatch.setattr(pipeline_module, "trim_hover", interrupted)
+    monkeypatch.setattr(pipeline_module, "correct_hover", interrupted)
     again = resume_pipeline(result.folder, quiet)  # as after a kill in the final tables
     assert [each.agent for each in again.stages.values()] == [
         each.agent for each in after.stages.values()
@@ -333,7 +355,7 @@ def test_a_pipeline_that_was_killed_before_it_noted_its_progress_is_resumed(
         raise SystemExit
 
     folder = tmp_path / "logs" / "stages" / "stages_1"
-    monkeypatch.setattr(pipeline_module, "trim_hover", no_trim)
+    monkeypatch.setattr(pipeline_module, "correct_hover", no_correction)
     monkeypatch.setattr(pipeline_module, "train", killed)  # the first stage has no run folder yet
     with pytest.raises(SystemExit):
         run_pipeline(two_stages(tmp_path), job, "stages", quiet)

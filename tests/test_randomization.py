@@ -14,7 +14,7 @@ from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts import geometric
-from sb3_quad.experts.geometric import GeometricExpert, told_cautious, told_geometric
+from sb3_quad.experts.geometric import GeometricExpert, privileged_cautious, privileged_geometric
 from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.simulation.state import QUATERNION, VELOCITY, P, W
@@ -296,7 +296,7 @@ def test_wind_carries_away_what_has_drag_and_the_told_expert_holds_against_it():
     for randomize, expert, least, most in (
         ({"wind": 4.0}, GeometricExpert(), 0.0, 1e-3),
         (windy, GeometricExpert(), 0.1, 2.0),
-        (windy, told_geometric(), 0.0, 1e-3),
+        (windy, privileged_geometric(), 0.0, 1e-3),
     ):
         errors = fly(
             expert, "target_tracking", 48, seed=3, max_steps=900, randomize=randomize
@@ -314,7 +314,7 @@ def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
         "torque": torque,
     }
     errors = {}
-    for expert in (GeometricExpert(), told_geometric()):
+    for expert in (GeometricExpert(), privileged_geometric()):
         batch = batch_of(240, task=task, randomize=randomize, autoreset=False)
         for _ in range(1000):
             batch.step(expert.actions(batch.true_state()))
@@ -324,7 +324,7 @@ def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
 
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
 def test_the_told_expert_flies_every_vehicle_of_a_distribution(task):
-    flights = fly(told_geometric(), task, 240, seed=11, max_steps=900, vehicles=RAPTOR)
+    flights = fly(privileged_geometric(), task, 240, seed=11, max_steps=900, vehicles=RAPTOR)
     assert flights.survival.all() and np.median(flights.final_error) < 1e-3
 
 
@@ -332,10 +332,10 @@ def test_the_told_expert_flies_as_the_others_where_nothing_is_random():
     batch, gains, told = (
         batch_of(240, task="state_recovery"),
         GeometricExpert().gains,
-        told_geometric(),
+        privileged_geometric(),
     )
     plain = GeometricExpert(
-        gains=gains.model_copy(update={"yaw_rate": geometric._TOLD_YAW * gains.yaw_rate})
+        gains=gains.model_copy(update={"yaw_rate": geometric._PRIVILEGED_YAW * gains.yaw_rate})
     )
     for _ in range(100):
         state = batch.true_state()
@@ -346,7 +346,7 @@ def test_the_told_expert_flies_as_the_others_where_nothing_is_random():
 def test_the_cautious_expert_falls_less_fast_where_the_rotors_lift_hardly_more_than_weight_and_push():
     randomize = {"mass": [1.2, 1.25], "force": {"magnitude": [2, 4], "direction": [0, 0, -1]}}
     descent, survival = {}, {}
-    for expert in (told_geometric(), told_cautious()):
+    for expert in (privileged_geometric(), privileged_cautious()):
         batch = batch_of(480, randomize=randomize, autoreset=False)
         lowest, lost = np.zeros(480), np.zeros(480, bool)
         for _ in range(600):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from adaptive_scaling import AdaptiveScaling, adaptive_factor, measure_mean
 
+from sb3_quad.algorithms.offset_correction import hover_offset
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_arrays
 from sb3_quad.base.seeds import seed_for
@@ -20,7 +21,6 @@ from sb3_quad.evaluation.scenarios.sample import sample_plan
 from sb3_quad.evaluation.scenarios.scenario import Scenario
 from sb3_quad.evaluation.statistics import mean, share
 from sb3_quad.experts.pid import PIDExpert
-from sb3_quad.training.trim import hover_offset
 
 
 def scenario(entry: str) -> Scenario:

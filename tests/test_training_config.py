@@ -218,8 +218,11 @@ def test_the_types_are_resolved_whichever_algorithm_is_asked_first():
 
     class Own(PPO):
         def __init__(
-            self, policy: str, env: Optional["VecEnv"], learning_rate: float = 0.1
-        ) -> None:  # noqa: F821
+            self,
+            policy: str,
+            env: Optional["VecEnv"],  # noqa: F821
+            learning_rate: float = 0.1,
+        ) -> None:
             raise NotImplementedError
 
     assert constructor_parameters(Own)["learning_rate"].annotation is float
@@ -281,7 +284,7 @@ def test_packaged_files_hold_good_settings_and_the_first_line_names_a_mixture_of
 def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_id):
     for algo in ("dagger", "ppo_bc"):
         assert (
-            load_config(algo, env_id, f"robust/{algo}.yml").expert == "told_cautious"
+            load_config(algo, env_id, f"robust/{algo}.yml").expert == "privileged_cautious"
         )  # in random worlds
         assert load_config(algo, env_id, f"nominal/{algo}.yml").expert == "geometric"
         assert (
@@ -296,7 +299,7 @@ def test_the_thesiss_expert_is_the_default_and_others_are_asked_for_by_file(env_
         )  # which config.yml then names
         assert load_config(algo, env_id, f"thesis/{algo}.yml").expert == "pid"
     robust = dict.fromkeys(
-        (DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "told_cautious"
+        (DEFAULT_PIPELINE, "robust/two_stage.yml", "robust/crazyflie.yml"), "privileged_cautious"
     )
     pipelines = {**robust, "nominal/two_stage.yml": "geometric"}
     for file, expert in {**pipelines, THESIS: "pid", "thesis/two_stage.yml": "pid"}.items():

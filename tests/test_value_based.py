@@ -8,6 +8,8 @@ import torch as th
 import yaml
 from stable_baselines3 import SAC
 
+from sb3_quad.algorithms.offset_correction import correct_offset, hover_offset
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.cli import main
 from sb3_quad.controllers.pretrained import pretrained
@@ -20,8 +22,6 @@ from sb3_quad.training.config import build_config, load_config
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.pipeline import load_pipeline, run_pipeline, with_settings
 from sb3_quad.training.trainer import resume, train
-from sb3_quad.training.transfer import transfer_policy
-from sb3_quad.training.trim import hover_offset, trim
 from sb3_quad.tuning.space import load_space
 
 ENV = "QuadStateRecovery-v0"
@@ -155,7 +155,7 @@ def test_its_offset_is_trimmed(clone):
             0.3 * model.actor.latent_pi[0].weight[:, 0]
         )  # sees itself where it is not
     before = np.linalg.norm(hover_offset(model))
-    assert trim(model).after < 0.1 * before > 0.1
+    assert correct_offset(model).after < 0.1 * before > 0.1
 
 
 @pytest.mark.slow

@@ -23,13 +23,13 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_quad import PPOBC, DAgger, PIDExpert, load_pretrained
+from sb3_quad.algorithms.offset_correction import correct_offset
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.colours import COLOURS
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.report.plots import STYLE
-from sb3_quad.training.transfer import transfer_policy
-from sb3_quad.training.trim import trim
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 
@@ -192,11 +192,11 @@ plt.show()
 # The first points are those of few and short episodes. After two rollouts, in which only the critic
 # learns, the policy gets better.
 #
-# A policy that hovers beside its target is corrected without training: `trim` measures the offset
+# A policy that hovers beside its target is corrected without training: `correct_offset` measures the offset
 # and takes it out of the first layer.
 
 # %%
-trim(agent)
+correct_offset(agent)
 agent.save("my_agent")
 
 # %% [markdown]
@@ -220,7 +220,7 @@ for name in stages:
 figure, axes = plt.subplots(figsize=(6.4, 3))
 times = np.linspace(0, 6, 301)
 for (name, flights), colour in zip(recoveries.items(), COLOURS, strict=False):
-    stable = [(flights.stabilised <= time).mean() * 100 for time in times]
+    stable = [(flights.recovery_time <= time).mean() * 100 for time in times]
     axes.plot(times, stable, color=colour, label=name, linewidth=2)
 axes.set(
     xlabel="time since the start (s)",

@@ -23,6 +23,7 @@ from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnvWrapper
 
 from sb3_quad import PPOBC, DAgger, GeometricExpert, load_pretrained, pretrained
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.colours import COLOURS
 from sb3_quad.envs import QuadcopterVecEnv
 from sb3_quad.evaluation.flightlog import Recorder
@@ -30,7 +31,6 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.experts.protocol import Expert
 from sb3_quad.report.plots import STYLE
 from sb3_quad.simulation.state import TARGET, QuadcopterState
-from sb3_quad.training.transfer import transfer_policy
 
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 

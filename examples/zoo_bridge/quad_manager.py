@@ -16,6 +16,7 @@ import rl_zoo3.exp_manager
 from rl_zoo3 import ALGOS
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecMonitor
 
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.literals import parse_mapping
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
@@ -23,7 +24,6 @@ from sb3_quad.envs.registration import ENVIRONMENTS
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.training.algorithms import constructor_parameters, takes_expert
 from sb3_quad.training.config import SETTINGS, VecEnvKind
-from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import convert
 
 Settings = dict[str, Any]

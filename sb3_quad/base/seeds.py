@@ -15,7 +15,7 @@ from pydantic import Field
 Purpose = Literal[
     "training",
     "evaluation",  # along the way
-    "trim",  # before and after an agent is trimmed
+    "correction",  # before and after an agent is trimmed
     "table",  # at the end of a run
     "search",  # for gains: examples/tune_expert.py
     "expert",  # at the end of that search, and of check-vehicle

@@ -6,60 +6,21 @@ import shlex
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from sb3_quad.base.seeds import row_seeds, seed_for
+from sb3_quad.base.seeds import seed_for
 from sb3_quad.cli.output import console
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.resolve import DEFAULT_EXPERT, resolve_expert
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.envs.registration import ENVIRONMENTS
-from sb3_quad.evaluation.flights import fly_settings
-from sb3_quad.evaluation.metric_tables import CAPTION, metric_cells, metric_rows
-from sb3_quad.evaluation.metrics import summarise
-from sb3_quad.evaluation.scenarios.load import load_suite
-from sb3_quad.evaluation.tables import Column, Table
+from sb3_quad.evaluation.compare import SCENARIOS, task_table
+from sb3_quad.evaluation.tables import Table
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.tasks import in_words
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.pipeline import PipelineResult
 from sb3_quad.training.runs import RunFolder, open_run
 from sb3_quad.training.trainer import TrainingResult
 
 FRESH_EPISODES, PIPELINE_EPISODES = 240, 480  # in a table after a single run, and after a pipeline
-THESIS_VEHICLE = "itm"  # the thesis has no metrics of another one
-SCENARIOS = {"target_tracking": "tracking", "state_recovery": "recovery"}  # of its suite, by task
-
-
-def task_table(
-    controllers: Mapping[str, Any],
-    settings: FlightSettings,
-    n: int,
-    seed: int,
-    beside: Iterable[str] = (),
-) -> Table:
-    """The table of some controllers over the same episodes of a task.
-
-    :param settings: how all of them fly.
-    :param n: how many episodes.
-    :param beside: the columns of the thesis that stand beside them, if they fly the thesis's
-        vehicle.
-    """
-    seeds = row_seeds(seed, n)
-    measured = [
-        metric_cells(summarise(fly_settings(each, settings, seeds)))
-        for each in controllers.values()
-    ]
-    task = in_words(settings.task)
-    scenario = load_suite("thesis").scenario(
-        SCENARIOS.get(task, SCENARIOS["target_tracking"])
-    )  # whose rows others have, too
-    of_thesis = task in SCENARIOS and settings.vehicle == THESIS_VEHICLE
-    shown = [name for name in beside if of_thesis and name in scenario.reference]
-    columns = [*map(Column, controllers), *(Column(name, source="thesis") for name in shown)]
-    rows = metric_rows(scenario, measured, [scenario.reference[name] for name in shown])
-    title = f"{task}: {n} fresh episodes, the same for all" + (
-        "" if settings.noise else ", true state"
-    )
-    return Table(columns, rows, title=title, caption=CAPTION)
 
 
 def print_tables(
@@ -67,14 +28,16 @@ def print_tables(
     how: Mapping[str, Any],
     n: int,
     seed: int,
-    beside: Iterable[str] = (),
+    thesis_columns: Iterable[str] = (),
 ) -> None:
     """Print a table as of :func:`task_table` for each task.
 
     :param how: the controllers fly in any task: vehicle, noise and scaling.
     """
     for task in SCENARIOS:
-        console().print(task_table(controllers, FlightSettings(task=task, **how), n, seed, beside))
+        console().print(
+            task_table(controllers, FlightSettings(task=task, **how), n, seed, thesis_columns)
+        )
 
 
 def agent_and_expert(job: TrainingJob, model: Any) -> Table:
@@ -127,13 +90,13 @@ def close_pipeline(result: PipelineResult, seconds: float) -> int:
     flown = result.job.flight_settings
     controllers = {"expert": _expert(result.job)}
     controllers |= {name: load_model(stage.agent) for name, stage in result.stages.items()}
-    beside = ("expert", "IL-agent", "RL-agent")
+    thesis_columns = ("expert", "IL-agent", "RL-agent")
     print_tables(
         controllers,
         flown.in_any_task(),
         PIPELINE_EPISODES,
         seed_for("table", result.job.seed),
-        beside,
+        thesis_columns,
     )
     for name, stage in result.stages.items():
         print(f"{name}: {stage.agent}, {stage.seconds:.0f} s")

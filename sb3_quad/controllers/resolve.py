@@ -13,9 +13,9 @@ from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
-    "told_geometric": "sb3_quad.experts.geometric:told_geometric",
-    "told_derived": "sb3_quad.experts.geometric:told_derived",
-    "told_cautious": "sb3_quad.experts.geometric:told_cautious",
+    "privileged_geometric": "sb3_quad.experts.geometric:privileged_geometric",
+    "privileged_derived": "sb3_quad.experts.geometric:privileged_derived",
+    "privileged_cautious": "sb3_quad.experts.geometric:privileged_cautious",
 }
 DEFAULT_EXPERT = "pid"
 """Whose actions are learnt where nothing else is asked for: the thesis's."""

@@ -52,7 +52,7 @@ class Flights:
     time_to: Mapping[float, FloatArray]
     # : By tolerance: s after which it stays within it to the end, (n,), NaN if it ends outside or
     # was lost.
-    time_to_stay: Mapping[float, FloatArray]
+    settling_time: Mapping[float, FloatArray]
     # : (n,), largest |r - r_T| since it was first within NEAR, m; NaN if it never was
     overshoot: FloatArray
     path_length: FloatArray  #: (n,), m, over the whole episode
@@ -60,9 +60,9 @@ class Flights:
     final_offset: (
         FloatArray  #: (n, 3), r - r_T at the end, world frame, m; NaN where the flight was lost
     )
-    stabilised: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
+    recovery_time: FloatArray  #: (n,), s until it was stable again, NaN if it never was, see Motion
     # : (n,), largest distance from the straight way to the target, m; NaN where there is none
-    sideways: FloatArray
+    cross_track_error: FloatArray
     # : (n, W), s until each waypoint was reached, NaN if it never was; W = 0 without waypoints
     waypoint_times: FloatArray
     # : (n, 13), position, quaternion (w, x, y, z; body to world), velocity (world), body rates
@@ -221,13 +221,13 @@ def _fly_fleet(
         length=np.zeros(n, dtype=np.int64),
         flown=np.zeros(n),
         time_to=dict(zip(tolerances, times, strict=True)),
-        time_to_stay=dict(zip(tolerances, stays, strict=True)),
+        settling_time=dict(zip(tolerances, stays, strict=True)),
         overshoot=np.where(np.isnan(first), np.nan, error),
         path_length=np.zeros(n),
         final_error=error.copy(),
         final_offset=np.full((n, 3), np.nan),
-        stabilised=motion.stabilised,
-        sideways=motion.sideways if count == 0 else np.full(n, np.nan),
+        recovery_time=motion.recovery_time,
+        cross_track_error=motion.cross_track_error if count == 0 else np.full(n, np.nan),
         waypoint_times=np.full((n, count), np.nan),
         start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
         target=state.target.copy(),
@@ -282,9 +282,9 @@ def _fly_fleet(
 class Motion:
     """Watches n flights, step by step.
 
-    ``stabilised`` (n,): s until the tilt has come below 45° and the turning about the body's x and
+    ``recovery_time`` (n,): s until the tilt has come below 45° and the turning about the body's x and
     y axes below 2 rad/s, both for 0.2 s at least, of which the beginning counts; NaN if that never
-    was. The thesis reads such a time from Fig. 4.9. ``sideways`` (n,): the largest distance from
+    was. The thesis reads such a time from Fig. 4.9. ``cross_track_error`` (n,): the largest distance from
     the straight line through start and target, m, on the way and beyond: the oscillations of 4.3.1;
     NaN where both are one point.
 
@@ -299,8 +299,8 @@ class Motion:
         self._direction = np.divide(way, length, out=np.zeros_like(way), where=length > 0.0)
         self._since = np.zeros(state.n)  # when the present stable time began
         self._stable = np.ones(state.n, dtype=np.bool_)
-        self.stabilised = np.full(state.n, np.nan)
-        self.sideways = np.where(length[:, 0] > 0.0, 0.0, np.nan)
+        self.recovery_time = np.full(state.n, np.nan)
+        self.cross_track_error = np.where(length[:, 0] > 0.0, 0.0, np.nan)
         self.see(0, state, np.ones(state.n, dtype=np.bool_))
 
     def see(self, step: int, state: QuadcopterState, flying: BoolArray) -> None:
@@ -311,10 +311,10 @@ class Motion:
         self._stable = upright & (np.hypot(*state.body_rates.T[:2]) < RATE)
         self._since[self._stable & ~before] = time
         held = flying & self._stable & (time - self._since > HOLD - 0.5 * self._control_step)
-        new = held & np.isnan(self.stabilised)
-        self.stabilised[new] = self._since[new]
+        new = held & np.isnan(self.recovery_time)
+        self.recovery_time[new] = self._since[new]
         flown = state.position - self._start
         beside = np.linalg.norm(
             flown - (flown * self._direction).sum(axis=1, keepdims=True) * self._direction, axis=1
         )
-        self.sideways[flying] = np.maximum(self.sideways, beside)[flying]
+        self.cross_track_error[flying] = np.maximum(self.cross_track_error, beside)[flying]

@@ -20,7 +20,10 @@ PATH, MEDIAN, QUANTILE = (
     Row("final error, median", "m"),
     Row("final error, 95 %", "m"),
 )
-STABLE, SIDEWAYS = Row("mean time until stable", "s"), Row("beside the straight way", "m")
+RECOVERY_TIME, CROSS_TRACK_ERROR = (
+    Row("mean time until stable", "s"),
+    Row("beside the straight way", "m"),
+)
 REACHED, COMPLETED, COURSE_TIME = (
     Row("waypoints reached"),
     Row("courses completed", "%"),
@@ -28,7 +31,7 @@ REACHED, COMPLETED, COURSE_TIME = (
 )
 TIME = "mean time to"  # begins the names of the rows with times to a tolerance
 LIMIT = Row("physical limit of that time", "s")
-LEAVES, OVERSHOOT = Row("leave it again", "%"), Row("overshoot, median", "m")
+OVERSHOOT_RATE, OVERSHOOT = Row("leave it again", "%"), Row("overshoot, median", "m")
 ALWAYS_COMPARABLE = {
     SUCCESS,
     SURVIVAL,
@@ -47,7 +50,7 @@ def time_row(tolerance: float | str) -> Row:
     return Row(f"{TIME} {float(tolerance):g} m", "s")
 
 
-def stay_row(tolerance: float) -> Row:
+def settling_row(tolerance: float) -> Row:
     """The row with the time after which a tolerance is not left again."""
     return Row(f"{TIME} stay within {tolerance:g} m", "s")
 
@@ -61,17 +64,19 @@ def metric_cells(metrics: Metrics) -> Cells:
         SURVIVAL: _share(metrics.survival),
         REWARD: _mean(metrics.reward),
         FLOWN: _mean(metrics.flown),
-        stay_row(near): _moment(arrival.stays, "do"),
+        settling_row(near): _moment(arrival.settling, "do"),
         **{time_row(each.tolerance): _moment(each) for each in metrics.arrivals},
-        LEAVES: Cell(words="–") if arrival.leaves is None else _share(arrival.leaves),
+        OVERSHOOT_RATE: Cell(words="–")
+        if arrival.overshoot_rate is None
+        else _share(arrival.overshoot_rate),
         OVERSHOOT: Cell(metrics.overshoot, words="–"),
         PATH: _mean(metrics.path),
         MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
         QUANTILE: replace(_mean(metrics.final_error_95), decimals=3),
-        STABLE: _moment(metrics.stabilised, "are"),
+        RECOVERY_TIME: _moment(metrics.recovery_time, "are"),
     }
-    if metrics.sideways is not None:
-        cells[SIDEWAYS] = _mean(metrics.sideways)
+    if metrics.cross_track_error is not None:
+        cells[CROSS_TRACK_ERROR] = _mean(metrics.cross_track_error)
     if metrics.course is not None:
         cells[REACHED], cells[COMPLETED] = (
             _mean(metrics.course.reached),
@@ -101,7 +106,7 @@ def reference_cells(reference: Reference) -> Cells:
         MEDIAN: reference.final_error,
         FLOWN: reference.flown,
     }
-    values |= {STABLE: reference.stabilised}
+    values |= {RECOVERY_TIME: reference.recovery_time}
     cells = {row: _printed(value) for row, value in values.items() if value is not None}
     shares = {SUCCESS: reference.success, SURVIVAL: reference.survival}
     cells |= {
@@ -218,18 +223,18 @@ def _rows_of(scenario: Scenario) -> list[Row]:
             SURVIVAL,
             *([FLOWN] if scenario.is_fixed else []),
             REWARD,
-            STABLE,
+            RECOVERY_TIME,
             MEDIAN,
             QUANTILE,
         ]
     times = [
-        stay_row(arrival_tolerance(tolerances)),
+        settling_row(arrival_tolerance(tolerances)),
         LIMIT,
-        LEAVES,
+        OVERSHOOT_RATE,
         OVERSHOOT,
         *map(time_row, tolerances),
     ]
-    return [SUCCESS, SURVIVAL, REWARD, *times, PATH, SIDEWAYS, MEDIAN, QUANTILE]
+    return [SUCCESS, SURVIVAL, REWARD, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
 def _beats(cell: Cell, other: Cell, higher: bool) -> bool:

@@ -27,8 +27,10 @@ class Arrival(Moment):
     """
 
     tolerance: float = Field(description="m")
-    stays: Moment = Field(description="flights that end within it, and after which time they stay")
-    leaves: Estimate | None = Field(
+    settling: Moment = Field(
+        description="flights that end within it, and after which time they stay"
+    )
+    overshoot_rate: Estimate | None = Field(
         description="share that leaves it again, of the flights that came to it"
     )
 
@@ -65,8 +67,8 @@ class Metrics(Frozen):
     final_error_95: Estimate | None = Field(description="its 95 % quantile, m")
     final_error_max: float | None = Field(description="m")
     final_offset: Vector | None = Field(description="mean r - r_T at the end, world frame, m")
-    stabilised: Moment = Field(description="which flights got stable again, and when")
-    sideways: Estimate | None = Field(
+    recovery_time: Moment = Field(description="which flights got stable again, and when")
+    cross_track_error: Estimate | None = Field(
         description="mean largest distance from the straight way, m; None: there is none"
     )
     course: Course | None = Field(description="of scenarios with waypoints")
@@ -93,7 +95,7 @@ def summarise(flights: Flights) -> Metrics:
         reward=bootstrap(flights.reward),
         flown=bootstrap(flights.flown),
         arrivals=[
-            _arrival(each, times, flights.time_to_stay[each])
+            _arrival(each, times, flights.settling_time[each])
             for each, times in sorted(flights.time_to.items())
         ],
         overshoot=float(np.nanmedian(flights.overshoot))
@@ -107,17 +109,20 @@ def summarise(flights: Flights) -> Metrics:
         else None,
         final_error_max=float(error.max()) if some else None,
         final_offset=tuple(offset.mean(axis=0).tolist()) if some else None,
-        stabilised=Moment(**_moment(flights.stabilised)),
-        sideways=mean(flights.sideways[done]),
+        recovery_time=Moment(**_moment(flights.recovery_time)),
+        cross_track_error=mean(flights.cross_track_error[done]),
         course=course,
     )
 
 
 def _arrival(tolerance: float, times: FloatArray, stays: FloatArray) -> Arrival:
     arrived = np.isfinite(times)
-    leaves = share((stays != times)[arrived]) if arrived.any() else None
+    overshoot_rate = share((stays != times)[arrived]) if arrived.any() else None
     return Arrival(
-        tolerance=tolerance, stays=Moment(**_moment(stays)), leaves=leaves, **_moment(times)
+        tolerance=tolerance,
+        settling=Moment(**_moment(stays)),
+        overshoot_rate=overshoot_rate,
+        **_moment(times),
     )
 
 

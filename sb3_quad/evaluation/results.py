@@ -150,7 +150,7 @@ def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
             f"{name}_{axis}": values
             for axis, values in zip(axes, arrays[f"episode_{name}"].T, strict=True)
         }
-    for name in ("time_to", "time_to_stay"):
+    for name in ("time_to", "settling_time"):
         times = zip(arrays["episode_tolerances"], arrays[f"episode_{name}"].T, strict=True)
         columns |= {f"{name}_{tolerance:g}": values for tolerance, values in times}
     columns["overshoot"] = arrays["episode_overshoot"]

@@ -40,10 +40,10 @@ _LATE = {
     **_SLOWER,
     "descent": 0.5,
     "body_rates": 1.25,
-}  # what told_derived multiplies where commands act late
+}  # what privileged_derived multiplies where commands act late
 _LATE_FROM, _LATE_TO = 0.085, 0.125  # s of command lag: not yet, fully
 # Times the yaw gain: an error in the moment set against a known torque becomes a yaw rate / gain
-_TOLD_YAW = 4.0
+_PRIVILEGED_YAW = 4.0
 
 
 def derived_gains(vehicle: Vehicle) -> GeometricGains:
@@ -108,7 +108,7 @@ class _TrueConstants:
     def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float]) -> None:
         self._control_step, self._seen = vehicle.control_step, np.empty(0)
         self._scale = gains.values()[:, None] / self._gains(vehicle.parameters()[:, None])
-        self._scale[G.yaw_rate] *= _TOLD_YAW
+        self._scale[G.yaw_rate] *= _PRIVILEGED_YAW
         self._late = np.array([[late.get(name, 1.0)] for name in GAIN_NAMES])
 
     def _gains(self, v: FloatArray) -> FloatArray:
@@ -163,13 +163,13 @@ class GeometricExpert(Expert):
     :param vehicle: name, YAML path or Vehicle it is designed for.
     :param gains: the :class:`GeometricGains`; None for those in the vehicle's YAML
         (``geometric_gains``), or :func:`derived_gains` where it has none.
-    :param told: whether it uses each vehicle's true parameters and compensates the external wrench,
+    :param privileged: whether it uses each vehicle's true parameters and compensates the external wrench,
         as far as a state holds them (``state.vehicles``, ``state.wrench``). Its gains then scale
         with the vehicle as :func:`derived_gains` do.
     :param reserve: thrust, in weights, that it keeps back when it plans to brake a descent.
     :param late: times the gains of that name, the more the later commands act: fully from a command
         lag of 0.125 s on.
-    :raises ConfigError: a negative reserve, an unknown gain, or either parameter without ``told``.
+    :raises ConfigError: a negative reserve, an unknown gain, or either parameter without ``privileged``.
     """
 
     def __init__(
@@ -178,16 +178,18 @@ class GeometricExpert(Expert):
         gains: GeometricGains | None = None,
         observation_mean: npt.ArrayLike | None = None,
         observation_std: npt.ArrayLike | None = None,
-        told: bool = False,
+        privileged: bool = False,
         reserve: float = 0.0,
         late: dict[str, float] | None = None,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
-        if reserve < 0.0 or (reserve and not told):
-            raise ConfigError(f"reserve {reserve:g}: must not be negative, and needs told=True")
-        if late and (not told or set(late) - set(GAIN_NAMES)):
+        if reserve < 0.0 or (reserve and not privileged):
             raise ConfigError(
-                f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, and needs told=True"
+                f"reserve {reserve:g}: must not be negative, and needs privileged=True"
+            )
+        if late and (not privileged or set(late) - set(GAIN_NAMES)):
+            raise ConfigError(
+                f"late {', '.join(late)}: must be among {', '.join(GAIN_NAMES)}, and needs privileged=True"
             )
         self.reserve = reserve
         v = self.vehicle
@@ -199,16 +201,16 @@ class GeometricExpert(Expert):
             v.mixer_inverse[None],
             np.array(v.thrust_range)[:, None],
         )
-        self._told = _TrueConstants(v, self.gains, late or {}) if told else None
+        self._privileged = _TrueConstants(v, self.gains, late or {}) if privileged else None
 
     def actions(self, state: QuadcopterState) -> Actions:
         """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
         moving = [state.array[rows] for rows in _ROWS]
-        wrench = _NO_WRENCH if self._told is None or state.wrench is None else state.wrench
+        wrench = _NO_WRENCH if self._privileged is None or state.wrench is None else state.wrench
         constants: tuple[FloatArray, ...] = self._constants
-        if self._told is not None and state.vehicles is not None:
-            constants = self._told.constants(state.vehicles)
+        if self._privileged is not None and state.vehicles is not None:
+            constants = self._privileged.constants(state.vehicles)
             if state.wrench is not None and state.vehicles[P.drag_x : P.drag_z + 1].any():
                 wrench = state.wrench.copy()
                 wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(
@@ -218,30 +220,32 @@ class GeometricExpert(Expert):
         return actions
 
 
-def told_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+def privileged_geometric(vehicle: str | Vehicle = "itm") -> GeometricExpert:
     """A :class:`GeometricExpert` that knows the true vehicle and wrench."""
-    return GeometricExpert(vehicle, told=True)
+    return GeometricExpert(vehicle, privileged=True)
 
 
-def told_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_geometric`, with the derived gains of each vehicle: for distributions of
+def privileged_derived(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+    """As :func:`privileged_geometric`, with the derived gains of each vehicle: for distributions of
     vehicles unlike this one.
 
     Where commands act late, its outer loop is slower and its inner one faster: agents that learn
     from it bear slow motors.
     """
-    return GeometricExpert(vehicle, derived_gains(load_vehicle(vehicle)), told=True, late=_LATE)
+    return GeometricExpert(
+        vehicle, derived_gains(load_vehicle(vehicle)), privileged=True, late=_LATE
+    )
 
 
-def told_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
-    """As :func:`told_geometric`, with 0.7 of the ``descent`` and of the ``tilt``, and 0.05 weights
+def privileged_cautious(vehicle: str | Vehicle = "itm") -> GeometricExpert:
+    """As :func:`privileged_geometric`, with 0.7 of the ``descent`` and of the ``tilt``, and 0.05 weights
     of thrust in reserve.
 
     It teaches agents that must find out what their rotors lift before they fall too fast to stop.
     """
     gains = GeometricExpert(vehicle).gains
     gentle = gains.model_copy(update={"descent": 0.7 * gains.descent, "tilt": 0.7 * gains.tilt})
-    return GeometricExpert(vehicle, gentle, told=True, reserve=0.05)
+    return GeometricExpert(vehicle, gentle, privileged=True, reserve=0.05)
 
 
 @compiled
@@ -382,7 +386,7 @@ def _geometric(
 ):  # type: ignore[no-untyped-def]
     gains, body = np.empty(all_gains.shape[0]), np.empty(bodies.shape[0])
     for i in range(actions.shape[0]):
-        column, pushed = min(i, bodies.shape[1] - 1), min(i, wrench.shape[1] - 1)
+        column, disturbed = min(i, bodies.shape[1] - 1), min(i, wrench.shape[1] - 1)
         gains[:], body[:] = all_gains[:, column], bodies[:, column]
         mixer_inverse, low, high = inverses[column], limits[0, column], limits[1, column]
         mass, g, _, _, izz, lag = body
@@ -396,17 +400,17 @@ def _geometric(
             quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
         )
         ux, uy, uz = (
-            wrench[W.force_body, pushed],
-            wrench[W.force_body + 1, pushed],
-            wrench[W.force_body + 2, pushed],
+            wrench[W.force_body, disturbed],
+            wrench[W.force_body + 1, disturbed],
+            wrench[W.force_body + 2, disturbed],
         )
-        ax = (wrench[W.force_world, pushed] + r11 * ux + r12 * uy + r13 * uz) / mass
-        ay = (wrench[W.force_world + 1, pushed] + r21 * ux + r22 * uy + r23 * uz) / mass
-        az = (wrench[W.force_world + 2, pushed] + r31 * ux + r32 * uy + r33 * uz) / mass
+        ax = (wrench[W.force_world, disturbed] + r11 * ux + r12 * uy + r13 * uz) / mass
+        ay = (wrench[W.force_world + 1, disturbed] + r21 * ux + r22 * uy + r23 * uz) / mass
+        az = (wrench[W.force_world + 2, disturbed] + r31 * ux + r32 * uy + r33 * uz) / mass
         tx, ty, tz = (
-            wrench[W.torque_world, pushed],
-            wrench[W.torque_world + 1, pushed],
-            wrench[W.torque_world + 2, pushed],
+            wrench[W.torque_world, disturbed],
+            wrench[W.torque_world + 1, disturbed],
+            wrench[W.torque_world + 2, disturbed],
         )
         vx, vy, vz = velocity[0, i], velocity[1, i], velocity[2, i]
         fx, fy, fz = _desired_force(ex, ey, ez, vx, vy, vz, ax, ay, az, gains, g, reserve * g)
@@ -416,9 +420,9 @@ def _geometric(
         b3 = (r13 * fx + r23 * fy + r33 * fz) / size
         b1, b2, b3 = _rotated(b1, b2, b3, p, q, r, lag)
         mx, my = _turn_moments(b1, b2, b3, p, q, r, gains, body)
-        mx -= wrench[W.torque_body, pushed] + r11 * tx + r21 * ty + r31 * tz
-        my -= wrench[W.torque_body + 1, pushed] + r12 * tx + r22 * ty + r32 * tz
+        mx -= wrench[W.torque_body, disturbed] + r11 * tx + r21 * ty + r31 * tz
+        my -= wrench[W.torque_body + 1, disturbed] + r12 * tx + r22 * ty + r32 * tz
         mz = -gains[G.yaw_rate] * izz * r - (
-            wrench[W.torque_body + 2, pushed] + r13 * tx + r23 * ty + r33 * tz
+            wrench[W.torque_body + 2, disturbed] + r13 * tx + r23 * ty + r33 * tz
         )
         _allocate(mass * size * b3, mx, my, mz, mixer_inverse, low, high, actions[i])

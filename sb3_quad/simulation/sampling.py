@@ -126,14 +126,14 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
         sample_from_distribution(i, streams, distribution, vehicles)
     # Forces in weights are those of the vehicle before it is randomised.
     column, u = min(i, vehicles.shape[1] - 1), uniforms(streams, i, 4, PUSH)
-    is_pushed, weight = (
+    is_disturbed, weight = (
         u[0] < table[R.wrench_share],
         vehicles[P.mass, column] * vehicles[P.gravity, column],
     )
     if table[R.force + 2] != FIXED or table[R.torque + 2] != FIXED:
         for k in range(wrench.shape[0]):
             wrench[k, i] = 0.0
-        if is_pushed:
+        if is_disturbed:
             moment = weight * arm_length(column, vehicles)
             _push(table, R.force, u[1], u[2], u[3], weight, wrench, W.force_world, W.force_body, i)
             _push(
@@ -141,9 +141,9 @@ def sample_episode(i, streams, base, distribution, table, vehicles, wrench, gust
             )
     if gust.shape[1] > 0:
         unit = weight if table[R.gust_by_weight] != 0.0 else 1.0
-        _begin_gusts(i, table, R.gust_std, unit * is_pushed, uniforms(streams, i, 4, GUST), gust)
+        _begin_gusts(i, table, R.gust_std, unit * is_disturbed, uniforms(streams, i, 4, GUST), gust)
     if table[R.wind + 2] != FIXED or wind_gust.shape[1] > 0:
-        _begin_wind(i, streams, table, is_pushed, wind, wind_gust)
+        _begin_wind(i, streams, table, is_disturbed, wind, wind_gust)
     if has_own_vehicle:
         _randomize_vehicle(i, streams, table, vehicles)
 
@@ -206,7 +206,7 @@ def _randomize_vehicle(i, streams, table, vehicles):
 
 
 @compiled
-def _begin_wind(i, streams, table, is_pushed, wind, wind_gust):
+def _begin_wind(i, streams, table, is_disturbed, wind, wind_gust):
     """The constant wind of row i's episode, level unless its direction is given, and the first of
     its gusts, in place.
     """
@@ -214,10 +214,10 @@ def _begin_wind(i, streams, table, is_pushed, wind, wind_gust):
     if table[R.wind + 2] != FIXED:
         for axis in range(3):
             wind[axis, i] = 0.0
-        if is_pushed:
+        if is_disturbed:
             _push(table, R.wind, u[8], 0.5, u[9], 1.0, wind, 0, 0, i)
     if wind_gust.shape[1] > 0:
-        _begin_gusts(i, table, R.wind_std, 1.0 * is_pushed, u, wind_gust)
+        _begin_gusts(i, table, R.wind_std, 1.0 * is_disturbed, u, wind_gust)
 
 
 @compiled

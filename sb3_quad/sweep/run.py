@@ -219,7 +219,7 @@ def _numbers(flights: Flights) -> dict[str, Numbers]:
         flights.time_to[min(flights.time_to)] if flights.time_to else np.full(flights.n, np.nan)
     )
     time = np.where(
-        np.isfinite(flights.sideways), arrival, flights.stabilised
+        np.isfinite(flights.cross_track_error), arrival, flights.recovery_time
     )  # who starts at the target has no way to it
     columns = (flights.success, flights.survival, flights.reward, error, time)
     return {

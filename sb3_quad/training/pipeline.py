@@ -23,6 +23,7 @@ from pydantic import (
     model_validator,
 )
 
+from sb3_quad.algorithms.offset_correction import correct_hover, correct_offset
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.literals import parse_mapping
@@ -33,12 +34,11 @@ from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
 from sb3_quad.training.algorithms import get_algorithm
-from sb3_quad.training.arrival import LEFT, trim_arrival
+from sb3_quad.training.arrival_correction import LEFT, correct_arrival
 from sb3_quad.training.config import SETTINGS, load_config, with_vehicle_path
 from sb3_quad.training.job import TrainingJob, describe
 from sb3_quad.training.runs import RunFolder, claim_folder, open_run
 from sb3_quad.training.trainer import resume, train, trained_seconds
-from sb3_quad.training.trim import trim, trim_hover
 
 STATUS_FILE = "pipeline.yml"
 
@@ -69,21 +69,21 @@ class Stage(Frozen):
     pass_on: Literal["best", "last"] = Field(
         default="best", description="the best evaluation, as best_by of its settings says"
     )
-    trim: Literal["position", "hover", "arrival"] | None = Field(
-        default=None, description="training.trim, .arrival say how"
+    correct_offset: Literal["position", "hover", "arrival"] | None = Field(
+        default=None, description="algorithms.offset_correction, .arrival say how"
     )
     position_scale: PositiveFloat = Field(
-        default=1.0, description="α, which trim: position makes a part of the agent"
+        default=1.0, description="α, which correct_offset: position makes a part of the agent"
     )
-    leaving_cost: NonNegativeFloat = Field(
-        default=LEFT, description="s that trim: arrival counts for a target left again"
+    overshoot_cost: NonNegativeFloat = Field(
+        default=LEFT, description="s that correct_offset: arrival counts for a target left again"
     )
-    trim_env_kwargs: dict[str, Any] = Field(
-        default={}, description="changes to env_kwargs in which trim: arrival counts, too"
+    correction_env_kwargs: dict[str, Any] = Field(
+        default={}, description="changes to env_kwargs in which correct_offset: arrival counts, too"
     )
-    trims: PositiveInt = Field(
+    correction_rounds: PositiveInt = Field(
         default=1,
-        description="how often trim: arrival searches, each time from what it found before",
+        description="how often correct_offset: arrival searches, each time from what it found before",
     )
     require: Requirement = Field(
         default=Requirement(), description="the pipeline stops where this is missed"
@@ -95,13 +95,18 @@ class Stage(Frozen):
 
     @model_validator(mode="after")
     def _of_its_trim(self) -> "Stage":
-        for name in ("position_scale", "leaving_cost", "trim_env_kwargs", "trims"):
-            trimmed = "position" if name == "position_scale" else "arrival"
+        for name in (
+            "position_scale",
+            "overshoot_cost",
+            "correction_env_kwargs",
+            "correction_rounds",
+        ):
+            kind = "position" if name == "position_scale" else "arrival"
             if (
                 getattr(self, name) != type(self).model_fields[name].default
-                and self.trim != trimmed
+                and self.correct_offset != kind
             ):
-                raise ValueError(f"{name} goes with trim: {trimmed}")
+                raise ValueError(f"{name} goes with correct_offset: {kind}")
         return self
 
 
@@ -237,17 +242,17 @@ def stage_jobs(pipeline: Pipeline, job: Mapping[str, Any]) -> list[TrainingJob]:
         where = f"stage {stage.name!r}"
         try:
             config = load_config(stage.algo, stage.env, stage.conf_file, stage.settings)
-            if stage.trim == "arrival":
-                config.flight_settings.with_changes(**stage.trim_env_kwargs)
+            if stage.correct_offset == "arrival":
+                config.flight_settings.with_changes(**stage.correction_env_kwargs)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
         if (
-            stage.trim in ("position", "hover")
+            stage.correct_offset in ("position", "hover")
             and config.task is not None
             and config.flight_settings.size != OBSERVATION_SIZE
         ):
             raise ConfigError(
-                f"{where}: trim {stage.trim} is for agents that see the 18 features alone"
+                f"{where}: correct_offset: {stage.correct_offset} is for agents that see the 18 features alone"
             )
         own = stage.model_dump(include={"eval_freq", "eval_episodes"}, exclude_none=True)
         made = validate(TrainingJob, {**job, **own, "config": config}, where)
@@ -302,7 +307,9 @@ def _train_stages(
                 if signals.received is not None:
                     break
                 agent = str(
-                    _trimmed(stage, job, run, report) if stage.trim else _passed_on(stage, job, run)
+                    _corrected(stage, job, run, report)
+                    if stage.correct_offset
+                    else _passed_on(stage, job, run)
                 )
                 results[stage.name] = StageResult(str(run.path), agent, timesteps, seconds)
         except KeyboardInterrupt:
@@ -333,29 +340,31 @@ def _passed_on(stage: Stage, job: TrainingJob, run: RunFolder) -> Path:
     return run.best_model if stage.pass_on == "best" and run.best_model.is_file() else run.model
 
 
-def _trimmed(stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]) -> Path:
+def _corrected(
+    stage: Stage, job: TrainingJob, run: RunFolder, report: Callable[[str], None]
+) -> Path:
     """The trimmed agent of a stage, which lies beside the one that it is made of."""
-    if run.trimmed_model.is_file():
-        return run.trimmed_model
+    if run.corrected_model.is_file():
+        return run.corrected_model
     model = load_zip(get_algorithm(job.config.algo), _passed_on(stage, job, run), device=job.device)
-    report(f"trimming the agent ({stage.trim}), which may take minutes")
-    seed = seed_for("trim", job.seed)
-    if stage.trim == "hover":
-        did = trim_hover(model, seed, job.flight_settings)
+    report(f"trimming the agent ({stage.correct_offset}), which may take minutes")
+    seed = seed_for("correction", job.seed)
+    if stage.correct_offset == "hover":
+        did = correct_hover(model, seed, job.flight_settings)
         words = f"action at the target {did.before:.4f} from hover, now {did.after:.4f}"
-    elif stage.trim == "arrival":
-        flown = job.config.flight_settings.with_changes(**stage.trim_env_kwargs)
-        seeds = [seed_for("trim", job.seed + i) for i in range(stage.trims)]
+    elif stage.correct_offset == "arrival":
+        flown = job.config.flight_settings.with_changes(**stage.correction_env_kwargs)
+        seeds = [seed_for("correction", job.seed + i) for i in range(stage.correction_rounds)]
         found = [
-            trim_arrival(model, each, job.flight_settings, flown, stage.leaving_cost)
+            correct_arrival(model, each, job.flight_settings, flown, stage.overshoot_cost)
             for each in seeds
         ]
         words = "slow arrivals, failures and losses cost " + "; ".join(
             f"{a:.2f} s, now {b:.2f} s" for a, b in found
         )
     else:
-        did = trim(model, seed, job.flight_settings, stage.position_scale)
+        did = correct_offset(model, seed, job.flight_settings, stage.position_scale)
         words = f"steady offset {did.before:.3f} m, now {did.after:.3f} m"
-    save_model(model, run.trimmed_model)
-    report(f"trimmed: {words}: {run.trimmed_model}")
-    return run.trimmed_model
+    save_model(model, run.corrected_model)
+    report(f"trimmed: {words}: {run.corrected_model}")
+    return run.corrected_model

@@ -15,7 +15,7 @@ from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, write_text
 from sb3_quad.base.version import __version__
 from sb3_quad.base.yaml_files import read_yaml
-from sb3_quad.controllers.pretrained import BEST, TRIMMED, run_agent
+from sb3_quad.controllers.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.controllers.zips import saved_data
 
 MADE_WITH = ("commit", "versions")  # keys of args.yml
@@ -32,7 +32,9 @@ class RunFolder:
         self.path, self.name = path, name
         self.model = path / f"{name}.zip"  # at the end, or where the run was interrupted
         self.best_model = path / BEST  # of the evaluations: by success, then by mean reward
-        self.trimmed_model = path / TRIMMED  # the same after trimming, where a pipeline does that
+        self.corrected_model = (
+            path / CORRECTED
+        )  # the same after trimming, where a pipeline does that
         self.evaluations = path / "evaluations.npz"  # as SB3's EvalCallback writes it
         self.episodes = path / "0.monitor.csv"  # every training episode, as SB3's Monitor writes it
         self.resume_state = path / "resume.npz"  # the snapshot of an unfinished run

@@ -21,6 +21,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env import VecEnv
 
+from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes
 from sb3_quad.base.seeds import seed_for
@@ -40,7 +41,6 @@ from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.runs import MADE_WITH, RunFolder, claim_run, made_with, open_run
 from sb3_quad.training.snapshots import Snapshot, SnapshotFile, load_snapshot
 from sb3_quad.training.tracking import HyperparameterLog, tracked
-from sb3_quad.training.transfer import transfer_policy
 from sb3_quad.training.values import instance
 
 NOISES = {"normal": NormalActionNoise, "ornstein-uhlenbeck": OrnsteinUhlenbeckActionNoise}

@@ -23,12 +23,12 @@ import torch
 import yaml
 from stable_baselines3.common.save_util import load_from_zip_file
 
+import sb3_quad.algorithms.offset_correction
 import sb3_quad.cli.closing
 import sb3_quad.evaluation.evaluate
 import sb3_quad.report.results_page
 import sb3_quad.sweep.run
 import sb3_quad.training.snapshots
-import sb3_quad.training.trim
 import sb3_quad.tuning.results
 from sb3_quad.cli import main
 from sb3_quad.envs import QuadcopterVecEnv
@@ -90,7 +90,7 @@ STAGES = [
         "env": "QuadTargetTracking-v0",
         "conf_file": "nominal/dagger.yml",
         "settings": DAGGER,
-        "trim": "hover",
+        "correct_offset": "hover",
         "pass_on": "last",
     },
     {
@@ -265,8 +265,8 @@ def campaign(folder: Path, kills: int, seed: int) -> int:
         (sb3_quad.cli.closing, "FRESH_EPISODES", 4),
         (sb3_quad.cli.closing, "PIPELINE_EPISODES", 4),
         (sb3_quad.training.snapshots, "PAUSE", 0.1),
-        (sb3_quad.training.trim, "N_FLIGHTS", 4),
-        (sb3_quad.training.trim, "N_HEADINGS", 4),
+        (sb3_quad.algorithms.offset_correction, "N_FLIGHTS", 4),
+        (sb3_quad.algorithms.offset_correction, "N_HEADINGS", 4),
     ):
         assert hasattr(module, name)
         setattr(module, name, value)

@@ -12,7 +12,7 @@ examples:
 A controller is pid, geometric, the path of an SB3 zip or a run folder, or package.module:factory;
 name=… labels it. The first agent says which vehicle, task and observation all fly with, unless
 --env, --task, --scenario or --env-kwargs do. Without --load-…, the agent of a run is
-trimmed_model.zip, else best_model.zip, else <Env>.zip.
+corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
 import argparse

@@ -9,7 +9,7 @@ controllers:
 
 examples:
   sb3-quad evaluate pid geometric                              the thesis's chapter 4 for both experts
-  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip" --suite thesis -o evaluations/mine
+  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/corrected_model.zip" --suite thesis -o evaluations/mine
   sb3-quad evaluate pid agent.zip --suite quick                a quick look, in less than a minute
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto

@@ -8,7 +8,7 @@ the policy on 10,000 observations before it is written. A policy that sees earli
 action or the position integral takes a state beside them, and returns the next.
 
 examples:
-  sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/trimmed_model.zip --format onnx
+  sb3-quad export logs/ppo_bc/QuadStateRecovery-v0_1/corrected_model.zip --format onnx
   sb3-quad export agent.zip --format c -o firmware/agent.h --name agent     agent_policy(observation, thrust)
   sb3-quad export agent.zip --format torchscript --output speeds            rotor speeds, rad/s
   sb3-quad export agent.zip --format c --vehicle my_vehicle.yaml

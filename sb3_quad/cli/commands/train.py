@@ -191,7 +191,7 @@ def prepare(options: argparse.Namespace) -> None:
 def make_config(options: argparse.Namespace) -> Any:
     """The :class:`~sb3_quad.training.config.TrainingConfig` that a command line describes."""
     from sb3_quad.training.config import load_config
-    from sb3_quad.training.transfer import as_agent
+    from sb3_quad.training.successor import as_agent
 
     asked, changes = (
         (options.algo or DEFAULT_ALGO, options.env or DEFAULT_ENV, options.conf_file),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
 FOLDER = Path(__file__).parent
-TRIMMED, BEST = "trimmed_model.zip", "best_model.zip"  # in a run folder
+CORRECTED, BEST = "corrected_model.zip", "best_model.zip"  # in a run folder
 
 
 def pretrained_names() -> list[str]:
@@ -68,5 +68,5 @@ def run_agent(folder: Path, name: str) -> Path:
     """What a run has to offer: its trimmed agent, else its best one, else its last one,
     ``<name>.zip``.
     """
-    zips = [folder / file for file in (TRIMMED, BEST, f"{name}.zip")]
+    zips = [folder / file for file in (CORRECTED, BEST, f"{name}.zip")]
     return next((path for path in zips if path.is_file()), zips[-1])

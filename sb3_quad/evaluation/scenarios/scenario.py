@@ -53,7 +53,7 @@ class Reference(Frozen):
     path: NumberOrRange | None = Field(default=None, description="mean path, m")
     final_error: NumberOrRange | None = Field(default=None, description="|r - r_T| at the end, m")
     flown: NumberOrRange | None = Field(default=None, description="until the flight ended, s")
-    stabilised: NumberOrRange | None = Field(
+    recovery_time: NumberOrRange | None = Field(
         default=None, description="until the vehicle was stable again, s"
     )
     note: str = Field(default="", description="what the source says in words")

@@ -1,7 +1,7 @@
 """Trimming an agent, in place: its steady offset from the target is cancelled by its own weights,
 so its zip stays stock.
 
-:func:`trim` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its
+:func:`correct_offset` does what the thesis does (4.3.1). An agent that PPO has trained hovers beside its
 target, by the same vector wherever the target is. The thesis cancels that in the scaling of the
 observation (Eq. 3.16): the measured offset goes into the position components of μ. To make an agent
 quicker near its target, σ is multiplied by an α below 1 (Eq. 4.10). Here α is a constant, so that
@@ -9,7 +9,7 @@ both can go into the actor's first layer, since W (s - μ) / (α σ) + b = (W / 
 (α σ)): the agent flies without any wrapper. An α well below 1 costs recoveries and far targets; PPO
 after it wins them back.
 
-That fits one heading. :func:`trim_hover` is for agents whose offset turns with the heading: at its
+That fits one heading. :func:`correct_hover` is for agents whose offset turns with the heading: at its
 target, level and at rest, an agent should give hover thrust, and one that was trained by samples
 gives that but for a hundredth. What its last layer W, b must change by, D = [ΔW, Δb], follows in
 closed form::
@@ -50,10 +50,10 @@ N_FLIGHTS, STEPS, EVERY = (
 )  # flights whose states must not see a change: their first 3 s, every third step
 
 
-class Trim(NamedTuple):
+class Correction(NamedTuple):
     """What trimming did.
 
-    :param before: size of the steady offset in m; of :func:`trim_hover`, the mean action at the
+    :param before: size of the steady offset in m; of :func:`correct_hover`, the mean action at the
         target less that of hover, root mean square over headings and rotors.
     :param after: the same, after it.
     """
@@ -62,9 +62,9 @@ class Trim(NamedTuple):
     after: float
 
 
-def trim(
+def correct_offset(
     model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None, scale: float = 1.0
-) -> Trim:
+) -> Correction:
     """Find μ for an agent and fold it into its first layer, and α before it.
 
     :param scale: α.
@@ -82,7 +82,7 @@ def trim(
     for each in row_seeds(seed, ROUNDS):
         shift_position(model, after, std[_POSITION])
         after = hover_offset(model, seed=each, settings=own)
-    return Trim(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
+    return Correction(float(np.linalg.norm(before)), float(np.linalg.norm(after)))
 
 
 def hover_offset(
@@ -124,7 +124,9 @@ def scale_position(model: BaseAlgorithm, scale: float) -> None:
         first_layer(model).weight[:, _POSITION] /= scale
 
 
-def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None) -> Trim:
+def correct_hover(
+    model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | None = None
+) -> Correction:
     """Correct an agent's last layer so that it hovers at its target with every heading.
 
     :param seed: of the flights and of the observation noise.
@@ -156,7 +158,7 @@ def trim_hover(model: BaseAlgorithm, seed: int = 0, settings: FlightSettings | N
         layer.weight.copy_(weights[:-1].T)
         layer.bias.copy_(weights[-1])
         after = at_target @ weights - hover
-    return Trim(*(float(action.square().mean().sqrt()) for action in (before, after)))
+    return Correction(*(float(action.square().mean().sqrt()) for action in (before, after)))
 
 
 def first_layer(model: BaseAlgorithm, size: int = OBSERVATION_SIZE) -> th.nn.Linear:

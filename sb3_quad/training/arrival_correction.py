@@ -19,12 +19,12 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import ActorCriticPolicy
 
 from sb3_quad.algorithms.networks.gradients import mean_actions, network_of
+from sb3_quad.algorithms.offset_correction import Correction, first_layer, scaling
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.evaluation.flights import NEAR, fly_settings
 from sb3_quad.simulation.observation import FEATURE_NAMES, OBSERVATION_SIZE
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training.trim import Trim, first_layer, scaling
 
 GROUPS = (
     "position_[xy]",
@@ -51,13 +51,13 @@ LEFT, FAILED, LOST = (
 _Sets = list[tuple[FlightSettings, float]]  # of flights, with the weight of their time
 
 
-def trim_arrival(
+def correct_arrival(
     model: BaseAlgorithm,
     seed: int,
     settings: FlightSettings,
     trained: FlightSettings,
     left: float = LEFT,
-) -> Trim:
+) -> Correction:
     """Find the scales of an agent and fold them into its first layer, unless fresh flights say that
     they make it worse.
 
@@ -95,13 +95,13 @@ def trim_arrival(
         frame = np.append(np.exp(mean @ _MEMBERS), np.ones(settings.frame_size - OBSERVATION_SIZE))
         with th.no_grad():
             layer.weight.div_(th.as_tensor(np.tile(frame, len(settings.ages))).to(layer.weight))
-    return Trim(float(before), float(min(after, before)))
+    return Correction(float(before), float(min(after, before)))
 
 
 def _costs(
     agent: Any, log_scales: FloatArray, sets: _Sets, seed: int, n: int, left: float
 ) -> FloatArray:
-    """What :func:`trim_arrival` minimises for each of m candidates, on the same n flights of each
+    """What :func:`correct_arrival` minimises for each of m candidates, on the same n flights of each
     set, (m,).
     """
     scales = np.repeat(np.exp(log_scales @ _MEMBERS), n, axis=0)
@@ -111,7 +111,7 @@ def _costs(
         flights = fly_settings(
             agent, scaled, row_seeds(episodes, n) * len(log_scales), tolerances=(NEAR,)
         )
-        stay = np.nan_to_num(flights.time_to_stay[NEAR], nan=2.0 * flights.flown.max())
+        stay = np.nan_to_num(flights.settling_time[NEAR], nan=2.0 * flights.flown.max())
         total += (
             weight * (stay + left * (flights.time_to[NEAR] < stay))
             + LOST * ~flights.survival
