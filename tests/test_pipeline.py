@@ -29,7 +29,7 @@ from sb3_quad.controllers.pretrained import load_pretrained
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.training import arrival
+from sb3_quad.training import arrival_correction
 from sb3_quad.training import pipeline as pipeline_module
 from sb3_quad.training.pipeline import (
     load_pipeline,
@@ -238,14 +238,14 @@ def test_a_stage_says_where_and_how_often_its_agent_is_trimmed(tmp_path, job, mo
 def test_an_agent_that_answers_to_its_velocity_too_little_arrives_without_overshoot_again(
     monkeypatch,
 ):
-    monkeypatch.setattr(arrival, "N_FLIGHTS", 24)
-    monkeypatch.setattr(arrival, "N_CHECKED", 120)
+    monkeypatch.setattr(arrival_correction, "N_FLIGHTS", 24)
+    monkeypatch.setattr(arrival_correction, "N_CHECKED", 120)
     model, settings = load_pretrained("itm-recovery"), FlightSettings()
     layer = model.policy.mlp_extractor.policy_net[0]
     with th.no_grad():
         layer.weight[:, 12:15] *= 0.7
     before = layer.weight.detach().clone()
-    result = arrival.correct_arrival(model, 1, settings, settings)
+    result = arrival_correction.correct_arrival(model, 1, settings, settings)
     assert result.after < result.before - 0.2
     factors = (layer.weight / before).detach().numpy()
     np.testing.assert_allclose(factors, np.broadcast_to(factors[0], factors.shape), rtol=1e-4)
@@ -261,20 +261,20 @@ def test_scales_that_do_not_help_are_not_kept(monkeypatch):
         ("N_FLIGHTS", 2),
         ("N_CHECKED", 2),
     ):
-        monkeypatch.setattr(arrival, name, value)
+        monkeypatch.setattr(arrival_correction, name, value)
     env = QuadcopterVecEnv(4, seed=1, last_action=True, history=[0, 2])
     model = PPO(
         "MlpPolicy", env, n_steps=8, batch_size=8, seed=0, device="cpu"
     )  # loses every flight, however it is scaled
     before = model.policy.mlp_extractor.policy_net[0].weight.detach().clone()
-    result = arrival.correct_arrival(
+    result = arrival_correction.correct_arrival(
         model, 1, *[FlightSettings(last_action=True, history=[0, 2])] * 2
     )
     assert result.after == result.before and th.equal(
         model.policy.mlp_extractor.policy_net[0].weight, before
     )
     with pytest.raises(ConfigError, match="reads the 18 features"):
-        arrival.correct_arrival(model, 1, FlightSettings(), FlightSettings())
+        arrival_correction.correct_arrival(model, 1, FlightSettings(), FlightSettings())
 
 
 def small_file(tmp_path):

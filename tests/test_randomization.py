@@ -291,7 +291,7 @@ def test_a_distribution_goes_with_an_agent_and_a_vehicle_replaces_it():
 # --- experts that know the vehicle and what pushes it
 
 
-def test_wind_carries_away_what_has_drag_and_the_told_expert_holds_against_it():
+def test_wind_carries_away_what_has_drag_and_the_privileged_expert_holds_against_it():
     windy = {"drag": 0.4, "wind": 4.0}
     for randomize, expert, least, most in (
         ({"wind": 4.0}, GeometricExpert(), 0.0, 1e-3),
@@ -305,7 +305,7 @@ def test_wind_carries_away_what_has_drag_and_the_told_expert_holds_against_it():
 
 
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
-def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
+def test_the_privileged_expert_stays_where_the_other_is_pushed_away(task):
     torque = {"magnitude": [0.0, 0.1], "axes": [1, 1, 0.33]}
     randomize = {
         "mass": [0.8, 1.2],
@@ -318,17 +318,17 @@ def test_the_told_expert_stays_where_the_other_is_pushed_away(task):
         batch = batch_of(240, task=task, randomize=randomize, autoreset=False)
         for _ in range(1000):
             batch.step(expert.actions(batch.true_state()))
-        errors[expert._told is not None] = np.median(batch.outcome["distance"])
+        errors[expert._privileged is not None] = np.median(batch.outcome["distance"])
     assert errors[True] < 0.01 < 0.1 < errors[False]
 
 
 @pytest.mark.parametrize("task", ["target_tracking", "state_recovery"])
-def test_the_told_expert_flies_every_vehicle_of_a_distribution(task):
+def test_the_privileged_expert_flies_every_vehicle_of_a_distribution(task):
     flights = fly(privileged_geometric(), task, 240, seed=11, max_steps=900, vehicles=RAPTOR)
     assert flights.survival.all() and np.median(flights.final_error) < 1e-3
 
 
-def test_the_told_expert_flies_as_the_others_where_nothing_is_random():
+def test_the_privileged_expert_flies_as_the_others_where_nothing_is_random():
     batch, gains, told = (
         batch_of(240, task="state_recovery"),
         GeometricExpert().gains,
@@ -358,10 +358,10 @@ def test_the_cautious_expert_falls_less_fast_where_the_rotors_lift_hardly_more_t
     )
 
 
-@pytest.mark.parametrize(("told", "reserve"), [(True, -0.1), (False, 0.1)])
-def test_a_reserve_is_for_a_told_expert_and_not_negative(told, reserve):
+@pytest.mark.parametrize(("privileged", "reserve"), [(True, -0.1), (False, 0.1)])
+def test_a_reserve_is_for_a_privileged_expert_and_not_negative(privileged, reserve):
     with pytest.raises(ConfigError, match="reserve"):
-        GeometricExpert(told=told, reserve=reserve)
+        GeometricExpert(privileged=privileged, reserve=reserve)
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_quad import SACBC, PIDExpert
+from sb3_quad.algorithms import transfer
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, ExpertError, TrainingError
 from sb3_quad.envs import QuadcopterVecEnv
-from sb3_quad.training import transfer
 
 SMALL = {
     "policy_kwargs": {"net_arch": [16]},

@@ -114,7 +114,7 @@ def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
         **{f"episode_{name}": getattr(flights, name) for name in as_they_are},
         "episode_path": flights.path_length,
         "episode_time_to": np.stack(list(flights.time_to.values()), axis=1),
-        "episode_time_to_stay": np.stack(list(flights.settling_time.values()), axis=1),
+        "episode_settling_time": np.stack(list(flights.settling_time.values()), axis=1),
         "episode_tolerances": np.array(list(flights.time_to)),
         "episode_waypoints": flights.waypoint_times,
     }
