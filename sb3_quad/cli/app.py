@@ -8,10 +8,9 @@ import traceback
 from collections.abc import Container, Sequence
 from pathlib import Path
 
+from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
-from sb3_quad.base.signals import interrupts_leave
-from sb3_quad.base.trust import trusting
-from sb3_quad.base.version import __version__
+from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
 from sb3_quad.cli.parser import Parser
 

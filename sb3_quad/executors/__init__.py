@@ -7,7 +7,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.executors.local import LocalExecutor
 
 EXECUTORS = ("local", "ray")

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 
 from sb3_quad.base.errors import WorkerDied
-from sb3_quad.base.signals import ignore_interrupts
+from sb3_quad.base.process import ignore_interrupts
 
 
 class LocalExecutor:

@@ -15,7 +15,7 @@ import torch
 
 from sb3_quad.base.errors import ConfigError, WorkerDied
 from sb3_quad.base.imports import require
-from sb3_quad.base.trust import VARIABLE, trusted
+from sb3_quad.base.process import TRUST_VARIABLE, trusted
 
 RETRIES = 3  # of a call whose node or worker process dies
 
@@ -40,7 +40,7 @@ class RayExecutor:
         self._references = list[Any]()
         variables = {
             "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
-            **({VARIABLE: "1"} if trusted() else {}),
+            **({TRUST_VARIABLE: "1"} if trusted() else {}),
         }
         environment: dict[str, Any] = {"env_vars": variables}
         options: dict[str, Any] = {

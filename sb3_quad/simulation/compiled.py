@@ -13,7 +13,7 @@ from numba import types
 from numba.core import event
 from numba.extending import intrinsic
 
-from sb3_quad.base.notices import tell
+from sb3_quad.base.process import print_once
 
 # Rows of a block; a multiple of every vector width, small enough for a block to stay in the first
 # cache
@@ -37,7 +37,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     except (
         RuntimeError
     ):  # neither the package's folder nor the user's folder for caches can be written
-        tell(
+        print_once(
             "compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder"
         )
     else:
@@ -57,7 +57,7 @@ def _source_stamp() -> str:
 
 class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
-        tell("compiling the simulation, once; it is kept for later runs (about 15 s)")
+        print_once("compiling the simulation, once; it is kept for later runs (about 15 s)")
 
     def on_end(self, event: event.Event) -> None:
         pass

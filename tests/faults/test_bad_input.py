@@ -104,7 +104,7 @@ def test_an_interrupt_while_modules_are_imported_leaves_at_once():
     code = "\n".join(
         [
             "import os, signal",
-            "from sb3_quad.base.signals import interrupts_leave",
+            "from sb3_quad.base.process import interrupts_leave",
             "with interrupts_leave():",
             "    try:",
             "        os.kill(os.getpid(), signal.SIGINT)",

@@ -150,9 +150,8 @@ def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
     """Do what is left of a sweep's Plan, in its SweepFolder (None: a new one). Returns the exit
     code.
     """
-    from sb3_quad.base.cores import available_cpus
     from sb3_quad.base.files import locked
-    from sb3_quad.base.signals import StopSignals
+    from sb3_quad.base.process import StopSignals, available_cpus
     from sb3_quad.cli.output import console, progress_bar
     from sb3_quad.executors import start_executor
     from sb3_quad.sweep.folder import SweepFolder

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import SB3QuadError
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
 from sb3_quad.cli.parser import Parser, given, natural, positive, seed, whole
 
