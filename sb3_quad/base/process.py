@@ -123,6 +123,21 @@ def available_cpus() -> int:
     return min(count, _most_cpus)
 
 
+def has_ended(process: int) -> bool:
+    """Whether no process of this machine has this id. False on Windows, which cannot tell."""
+    # There, os.kill sends Ctrl-C or ends the process.
+    if sys.platform == "win32":
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return True
+    except PermissionError:
+        # The process of another user.
+        pass
+    return False
+
+
 def trusted() -> bool:
     """Whether files may run code of their own: after ``--trust``, or by ``SB3_QUAD_TRUST=1``."""
     return os.environ.get(TRUST_VARIABLE, "0") not in ("", "0")

@@ -4,6 +4,7 @@ which numba lacks.
 
 import functools
 import hashlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -79,5 +80,7 @@ def atomic_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.int64(array, types.int64, types.int64), codegen
 
 
-give_way = types.ExternalFunction("sched_yield", types.int32())
+# The operating system's function that ends a thread's turn.
+_YIELD = "SwitchToThread" if sys.platform == "win32" else "sched_yield"
+give_way = types.ExternalFunction(_YIELD, types.int32())
 """Let another thread have this core; found by its name wherever the code was compiled."""
