@@ -71,19 +71,19 @@ def did_you_mean(name: object, valid: Iterable[str]) -> str:
 
 
 def _guesses(text: str, names: list[str]) -> list[str]:
-    by_lower_case = {name.lower(): name for name in names}
-    # difflib's measure asks too much of short names with swapped letters, such as imt for itm.
-    for lower, name in by_lower_case.items():
-        if sorted(lower) == sorted(text):
-            return [name]
     words = _words(text)
     if words:
         longer = [name for name in names if words <= _words(name.lower())]
         if 1 <= len(longer) <= 3:
             return longer
-    # At difflib's own cutoff of 0.6, any two loss weights such as bc_coef and vf_coef are "close".
-    close = get_close_matches(text, by_lower_case, n=1, cutoff=0.75)
-    return [by_lower_case[lower] for lower in close]
+    by_lower_case = {name.lower(): name for name in names}
+    # Few slips change the first letter. Among all names, those of three letters and any two loss
+    # weights such as bc_coef and vf_coef are alike to difflib, so that they ask for more.
+    initial = text.lstrip("-")[:1]
+    same_initial = [name for name in by_lower_case if name.lstrip("-").startswith(initial)]
+    close = get_close_matches(text, same_initial, n=1, cutoff=0.65)
+    close = close or get_close_matches(text, by_lower_case, n=1, cutoff=0.75)
+    return [by_lower_case[name] for name in close]
 
 
 def _words(text: str) -> set[str]:

@@ -189,7 +189,7 @@ def attempt(case: Case, folder: Path) -> str:
         f"exit code {code}": code not in (0, 1, 2),
         "no line says why": code == 2 and not last.startswith("error: "),
         "a traceback": "Traceback (most recent call last)" in text,
-        "unforeseen": "python -X dev" in text,
+        "unforeseen": "add --traceback" in text,
         f"{usage.ru_maxrss / 2**20:.1f} GB": usage.ru_maxrss * 1024 > MEMORY,
         f"{time.monotonic() - start:.0f} s": time.monotonic() - start > SECONDS,
         "something outside": len(list(folder.iterdir())) > 2,
