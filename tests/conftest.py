@@ -69,7 +69,7 @@ def pytest_configure():
     """Under nohup, or in a shell's background, signals are ignored, also by the programs that are
     started from here.
     """
-    for number in (signal.SIGINT, signal.SIGHUP):
+    for number in (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(
                 number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL

@@ -35,8 +35,8 @@ run = Path("logs/dagger/QuadTargetTracking-v0_1")
 assert main(["train", "--resume", str(run)]) == 0
 with locked(run, "run folder"):
     assert main(["train", "--resume", str(run)]) == 2
-assert main(["evaluate", "pid", "geometric", "--suite", "quick", "--episodes", "2", "--workers", "2",
-             "--scenario", "recovery", "--no-report"]) == 0
+evaluate = "evaluate pid geometric --suite quick --episodes 2 --scenario recovery --no-report"
+assert main([*evaluate.split(), "--workers", "2"]) == 0
 """
 DAGGER = """
 from sb3_quad import DAgger

@@ -92,7 +92,7 @@ def write_text(path: str | Path, text: str) -> None:
 def write_csv(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Write a table by :func:`replacing`.
 
-    A cell is empty where its row lacks the key. Keys that are no column are left out.
+    A cell is empty where its row lacks the key. Keys without a column are ignored.
     """
     text = io.StringIO()
     writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")

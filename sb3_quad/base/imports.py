@@ -68,7 +68,7 @@ def import_packages(packages: Iterable[str], where: str) -> None:
 def require(module: str, extra: str, what: str) -> Any:
     """Import a module that only some features need.
 
-    :param extra: The extra of this package that installs it, empty if there is none.
+    :param extra: The extra of this package that installs it, or an empty text.
     :param what: The feature, for the error message.
     :raises MissingExtra: It cannot be imported. The message says what to install.
     """

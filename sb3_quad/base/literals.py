@@ -80,7 +80,8 @@ def parse_mapping(value: Any, key: str) -> dict[str, Any]:
         value = {}
     if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
         raise ConfigError(f"{key}: must be a mapping of names to values, not {value!r}")
-    return _resolve(value, key)
+    mapping: dict[str, Any] = _resolve(value, key)
+    return mapping
 
 
 def put_key(data: dict[str, Any], key: str, value: Any, where: str) -> None:

@@ -129,7 +129,7 @@ def _check_address(address: str) -> None:
 
     :raises ConfigError: Nothing answers, or the address has another form.
     """
-    # Ray searches this machine for a cluster, and says at once if there is none.
+    # Ray searches this machine for a cluster, and raises at once if it finds nothing.
     if address == "auto":
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")

@@ -37,7 +37,6 @@ from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, 
 from sb3_quad.envs.registration import ENVIRONMENTS
 
 DEFAULT_ENV = "QuadTargetTracking-v0"
-LAST = "last checkpoint"
 # Width and height of the only panel, and of one of several, pixels.
 SINGLE = (640, 480)
 PANEL = (480, 480)
@@ -52,7 +51,7 @@ def add_arguments(parser: Parser) -> None:
         metavar="CONTROLLER",
         help="controllers to fly, in addition to the agent of --algo",
     )
-    add("--algo", help="algorithm of a trained agent, which is looked up in the log folder")
+    _add_run_arguments(parser)
     task = parser.add_mutually_exclusive_group()
     task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
     task.add_argument("--task", help="a task such as target_tracking, instead of --env")
@@ -61,32 +60,6 @@ def add_arguments(parser: Parser) -> None:
         metavar="SUITE:NAME",
         help="a scenario such as thesis:side_hit, instead of --env",
     )
-    add(
-        "-f",
-        "--folder",
-        "--log-folder",
-        default="logs",
-        metavar="DIR",
-        help="folder that holds the run folders (logs)",
-    )
-    add(
-        "--exp-id",
-        type=whole,
-        default=0,
-        help="number of the run (0: the latest one that has an agent)",
-    )
-    which = parser.add_mutually_exclusive_group()
-    best: dict[str, Any] = {"dest": "which", "action": "store_const", "const": "best"}
-    which.add_argument("--load-best", help="fly the best agent of the evaluations", **best)
-    which.add_argument(
-        "--load-checkpoint",
-        dest="which",
-        type=whole,
-        metavar="N",
-        help="fly the checkpoint after N timesteps",
-    )
-    last = {**best, "const": LAST}
-    which.add_argument("--load-last-checkpoint", help=f"fly the {LAST}", **last)
     add(
         "-n",
         "--n-timesteps",
@@ -127,6 +100,48 @@ def add_arguments(parser: Parser) -> None:
         help="playback speed of film and window; 0.5 is slow motion (1)",
     )
     add_common(parser, "trust", "overwrite", "progress")
+
+
+def _add_run_arguments(parser: Parser) -> None:
+    """Add the flags that name the agent of a run folder."""
+    add = parser.add_argument
+    add("--algo", help="algorithm of a trained agent, which is looked up in the log folder")
+    add(
+        "-f",
+        "--folder",
+        "--log-folder",
+        default="logs",
+        metavar="DIR",
+        help="folder that holds the run folders (logs)",
+    )
+    add(
+        "--exp-id",
+        type=whole,
+        default=0,
+        help="number of the run (0: the latest one that has an agent)",
+    )
+    add = parser.add_mutually_exclusive_group().add_argument
+    add(
+        "--load-best",
+        dest="which",
+        action="store_const",
+        const="best",
+        help="fly the best agent of the evaluations",
+    )
+    add(
+        "--load-checkpoint",
+        dest="which",
+        type=whole,
+        metavar="N",
+        help="fly the checkpoint after N timesteps",
+    )
+    add(
+        "--load-last-checkpoint",
+        dest="which",
+        action="store_const",
+        const="last",
+        help="fly the last checkpoint",
+    )
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -282,7 +297,7 @@ def _agent_of_run(options: argparse.Namespace) -> tuple[str, str]:
     run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
     if isinstance(options.which, int):
         path = run.checkpoint(options.which)
-    elif options.which == LAST:
+    elif options.which == "last":
         path = run.latest_checkpoint()
     elif options.which == "best":
         path = run.best_model

@@ -119,7 +119,7 @@ def run(options: argparse.Namespace) -> int:
 def _group(text: str) -> tuple[str, list[str]]:
     """Return the name and the run folders of an argument.
 
-    :raises ConfigError: There are none.
+    :raises ConfigError: No such folder, or no name.
     """
     path = Path(text)
     name, equals, pattern = text.partition("=")

@@ -6,7 +6,7 @@ examples:
   # list the runs of your sweep, then train them in four worker processes
   sb3-quad sweep my_sweep.yaml --dry-run
   sb3-quad sweep my_sweep.yaml --workers 4
-  # a sweep of the package, such as nominal or random_worlds
+  # a sweep of the package, such as pid or nominal
   sb3-quad sweep pid
   # a sweep without a file
   sb3-quad sweep --seed 0 1 2 --conf-file two_stage.yml thesis.yml
