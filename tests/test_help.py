@@ -96,7 +96,7 @@ def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, v
         ("train --n-timestep 5", "option '--n-timestep': did you mean '--n-timesteps'?"),
         (
             "train --learning-rate 1e-3",
-            "option '--learning-rate': a hyperparameter is given as --hyperparams learning_rate:1e-3,",
+            "'--learning-rate': a hyperparameter is given as --hyperparams learning_rate:1e-3,",
         ),
         (
             "tune --gamma=0.9 -n 5",
