@@ -36,8 +36,8 @@ from stable_baselines3 import PPO
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import read_text, refuse_existing, replacing
 from sb3_quad.base.imports import require
+from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.base.signals import StopSignals
 from sb3_quad.cli import app
 from sb3_quad.cli.parser import Parser, add_common, positive
 from sb3_quad.controllers.agent_settings import agent_settings

@@ -13,7 +13,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.files import save_model
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.envs import QuadcopterVecEnv
 
 

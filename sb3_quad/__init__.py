@@ -11,8 +11,8 @@ _checkout = Path(__file__).resolve().parent.parent
 if (_checkout / "setup.cfg").is_file() and (_checkout / "envs" / "__init__.py").is_file():
     __path__.append(str(_checkout))
 
+from sb3_quad.base import __version__  # noqa: E402
 from sb3_quad.base.imports import lazy_names  # noqa: E402
-from sb3_quad.base.version import __version__  # noqa: E402
 from sb3_quad.envs.registration import register_environments  # noqa: E402
 
 if TYPE_CHECKING:

@@ -69,7 +69,7 @@ def pytest_configure():
     """Under nohup, or in a shell's background, signals are ignored, also by the programs that are
     started from here.
     """
-    for number in (signal.SIGINT, signal.SIGHUP):
+    for number in (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT)):
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(
                 number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
@@ -139,8 +139,9 @@ def results_folder(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("results")
     suite = folder / "small.yaml"
-    scenarios = "[{name: hover, duration: 0.5, episodes: 3}, {name: far, target: [1, 0, 15], duration: 1, episodes: 2}]"
-    suite.write_text(f"{{name: small, scenarios: {scenarios}}}")
+    hover = "{name: hover, duration: 0.5, episodes: 3}"
+    far = "{name: far, target: [1, 0, 15], duration: 1, episodes: 2}"
+    suite.write_text(f"{{name: small, scenarios: [{hover}, {far}]}}")
     out = folder / "out"
     assert (
         main(["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out), "--no-report"])

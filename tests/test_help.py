@@ -1,6 +1,4 @@
-"""Every command's help shows examples, and these are command lines that the command takes; what
-none takes is answered.
-"""
+"""Every command's help shows examples that the command takes, and unknown options raise advice."""
 
 import re
 import shlex
@@ -19,24 +17,24 @@ README = (Path(__file__).parent.parent / "README.md").read_text()
 
 
 def examples(text: str) -> list[list[str]]:
-    """The arguments of each example, less the remark behind it."""
-    lines = text.split("examples:\n")[1].split("\n\n")[0].splitlines()
-    commands = [re.split(r" {2,}", line.strip())[0] for line in lines]
+    """The arguments of each example, without the remarks above them."""
+    block = text.split("examples:\n")[1].split("\n\n")[0]
+    lines = [line.strip() for line in block.replace("\\\n", " ").splitlines()]
+    commands = [re.split(r" {2,}[^- ]", line)[0] for line in lines if not line.startswith("# ")]
     assert all(command.startswith("sb3-quad ") for command in commands)
     return [shlex.split(command)[1:] for command in commands]
 
 
 @pytest.mark.parametrize("name", ["", *COMMANDS])
 def test_examples_are_taken(name):
-    found = examples(COMMANDS[name].__doc__ if name else EPILOG)
-    assert found
-    assert any(arguments[0] == name for arguments in found) or not name
-    for arguments in found:
+    commands = examples(COMMANDS[name].__doc__ if name else EPILOG)
+    assert commands
+    assert any(arguments[0] == name for arguments in commands) or not name
+    for arguments in commands:
         if "--help" in arguments:
             continue
-        options = make_parser().parse_args(
-            arguments
-        )  # raises on a flag that there is not, or a bad value
+        # Raises on an unknown flag or a bad value.
+        options = make_parser().parse_args(arguments)
         assert options.command in COMMANDS
         if getattr(options, "algo", None) is not None:
             assert {*([options.algo] if isinstance(options.algo, str) else options.algo)} <= {
@@ -47,6 +45,16 @@ def test_examples_are_taken(name):
         files = getattr(options, "conf_file", None) or []
         for file in [files] if isinstance(files, str) else files:
             assert file in (*SETTINGS.names(), "my.yml") or file.endswith("/best.yml")
+
+
+@pytest.mark.parametrize("name", ["", *COMMANDS])
+def test_help_fits_a_terminal_of_80_columns(name, monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert main([name, "--help"] if name else ["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    # argparse does not break a group of flags that exclude each other.
+    assert [line for line in lines if len(line) > 80 and " | " not in line] == []
+    assert not name or "--traceback" in "\n".join(lines)
 
 
 @pytest.mark.parametrize("name", list(COMMANDS))
@@ -76,9 +84,7 @@ TASKS = ("far_tracking", "state_recovery", "target_tracking")
         ("anything", (), []),
     ],
 )
-def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_random(
-    given, valid, meant
-):
+def test_a_misspelt_name_or_a_part_of_names_is_guessed_and_nothing_else(given, valid, meant):
     assert did_you_mean(given, valid) == (
         f"did you mean {' or '.join(map(repr, meant))}? " if meant else ""
     )
@@ -90,7 +96,7 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
         ("train --n-timestep 5", "option '--n-timestep': did you mean '--n-timesteps'?"),
         (
             "train --learning-rate 1e-3",
-            "option '--learning-rate': a hyperparameter is given as --hyperparams learning_rate:1e-3,",
+            "'--learning-rate': a hyperparameter is given as --hyperparams learning_rate:1e-3,",
         ),
         (
             "tune --gamma=0.9 -n 5",
@@ -121,10 +127,8 @@ def test_a_name_is_guessed_from_its_slips_or_as_a_part_of_others_and_not_at_rand
         ),
     ],
 )
-def test_what_is_unknown_is_answered_by_what_helps(
-    arguments, message, tmp_path, monkeypatch, capsys
-):
+def test_an_unknown_option_raises_advice(arguments, message, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     assert main(shlex.split(arguments)) == 2
-    said = capsys.readouterr().err
-    assert message in said and said.startswith("error: ") and said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert message in error and error.startswith("error: ") and error.count("\n") == 1

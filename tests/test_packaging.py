@@ -211,7 +211,7 @@ def test_extras_are_installed_from_a_clone(options):
 
 
 def test_the_version_stands_in_one_place(options):
-    assert options["metadata"]["version"] == "attr: sb3_quad.base.version.__version__"
+    assert options["metadata"]["version"] == "attr: sb3_quad.base.__version__"
     assert f"\nversion: {sb3_quad.__version__}\n" in (ROOT / "CITATION.cff").read_text()
 
 

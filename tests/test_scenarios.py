@@ -61,7 +61,7 @@ def test_the_thesis_suite_holds_all_of_chapter_four():
     [
         ("strat: 3", "did you mean 'start'"),
         ("start: {velocity: {sdt: 2}}", "start.velocity: unknown key 'sdt': did you mean 'std'"),
-        ("duration: 15 s", "'15 s' must be a number alone"),
+        ("duration: 15 s", "'15 s' must be a plain number"),
         ("noise: 5", "0.05 is 5 %"),
         ("start: {attitude: levle}", "did you mean 'level'"),
         ("start: {position: [0, 0, 0.1]}", "touches the ground"),

@@ -354,7 +354,7 @@ def test_a_run_is_found_by_algorithm_environment_and_number(run_folder, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "nobody to fly"),
+        ([], "no controller given"),
         (["pdi", "--no-render"], "did you mean 'pid'"),
         (["nowhere.zip", "--no-render"], "no such file"),
         (["pid", "--env", "Pendulum-v1", "--no-render"], "rl_zoo3"),

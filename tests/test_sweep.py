@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_quad.base.errors import WorkerDied
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.cli import main
 from sb3_quad.executors import as_they_end, start_executor

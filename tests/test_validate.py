@@ -50,10 +50,10 @@ def test_data_become_a_frozen_model():
         ({}, "x: mass: is missing (m, kg)"),
         ({"mass": -1}, "x: mass: Input should be greater than 0 (m, kg)"),
         ({"mass": float("nan")}, "x: mass: Input should be a finite number (m, kg)"),
-        ({"mass": "1 kg"}, "x: mass: '1 kg' must be a number alone, its unit left out (m, kg)"),
+        ({"mass": "1 kg"}, "x: mass: '1 kg' must be a plain number, without a unit (m, kg)"),
         (
             {"mass": 1, "count": "four"},
-            "x: count: 'four' must be a number alone, its unit left out",
+            "x: count: 'four' must be a plain number, without a unit",
         ),
         (
             {"mass": 1, "cuont": 4},
@@ -62,7 +62,7 @@ def test_data_become_a_frozen_model():
         ),
         (
             {"mass": 1, "rotors": [{"thrust": 1}, {"thrust": "x"}]},
-            "x: rotors.1.thrust: 'x' must be a number alone",
+            "x: rotors.1.thrust: 'x' must be a plain number",
         ),
         (
             {"mass": 1, "rotors": [{"thrust": 1, "thurst": 2}]},

@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import VecMonitor
 
 from sb3_quad import envs
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.notices import tell
+from sb3_quad.base.process import print_once
 from sb3_quad.base.seeds import row_seeds
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.experts.pid import PIDExpert
@@ -217,7 +217,7 @@ def test_compiling_is_told_where_something_is_compiled_and_nowhere_else(capsys):
     def doubled(x):
         return x + x
 
-    tell.cache_clear()
+    print_once.cache_clear()
     with compile_notice():
         pass
     assert capsys.readouterr().err == ""

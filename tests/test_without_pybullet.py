@@ -14,7 +14,10 @@ from sb3_quad.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
 ON_PYBULLET = ("base.bullet", "envs.bullet", "envs.quadcopter_env", "envs.rendering", "show")
-LINE = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend pybullet, enjoy) needs pybullet "
+LINE = (
+    "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend pybullet, enjoy) "
+    "needs pybullet "
+)
 
 
 def modules():
@@ -96,7 +99,10 @@ def test_a_program_that_needs_it_is_told(without_pybullet, name):
 
 
 def test_a_training_evaluates_on_the_batch(without_pybullet, tmp_path, capsys):
-    command = "train --algo dagger -n 400 --n-envs 8 --eval-freq 200 --eval-episodes 4 --n-eval-envs 2 --no-progress"
+    command = (
+        "train --algo dagger -n 400 --n-envs 8 --eval-freq 200 --eval-episodes 4 --n-eval-envs 2 "
+        "--no-progress"
+    )
     hyperparams = ["--hyperparams", "n_steps:25", "gradient_steps:2", "batch_size:64"]
     assert main([*command.split(), "-f", str(tmp_path), *hyperparams]) == 0
     assert capsys.readouterr().out.count("timesteps, ") >= 2

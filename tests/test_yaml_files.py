@@ -29,7 +29,7 @@ def here(tmp_path, monkeypatch):
         (SETTINGS, Path("dagger.yml"), True),
     ],
 )
-def test_paths_are_told_from_names(here, folder, source, is_path):
+def test_paths_are_distinguished_from_names(here, folder, source, is_path):
     assert folder.is_path(source) == is_path
 
 
@@ -59,7 +59,8 @@ def test_what_messages_call_a_file(here):
         (
             "imt",
             None,
-            "unknown vehicle 'imt': did you mean 'itm'? (valid: cf21B_500, cf2x_L250, crazyflie, hummingbird, itm, l2f_",
+            "unknown vehicle 'imt': did you mean 'itm'? "
+            "(valid: cf21B_500, cf2x_L250, crazyflie, hummingbird, itm, l2f_",
         ),
         ("missing.yaml", None, "missing.yaml: no such file"),
         ("bad.yaml", b"\xff\xfe\x00\x01", "bad.yaml: cannot be read"),

@@ -1,1 +1,3 @@
-"""What every floor uses: errors, whole files, signals, seeds."""
+"""Errors, files, signals, seeds and validation, which every floor uses."""
+
+__version__ = "0.1.0"

@@ -1,8 +1,7 @@
-"""PyBullet, imported without the line about its build that it prints: ``from sb3_quad.base.bullet
-import p``.
+"""Import PyBullet without the line about its build that it prints.
 
-It comes with the package where it has a wheel, up to Python 3.11; elsewhere this import says how to
-get it.
+Use ``from sb3_quad.base.bullet import p``. The package installs PyBullet where it has a wheel, up
+to Python 3.11. Elsewhere this import says how to get it.
 """
 
 import os
@@ -16,7 +15,7 @@ NEEDS = "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend py
 
 @contextmanager
 def _standard_error_silenced() -> Iterator[None]:
-    """PyBullet writes to file descriptor 2 itself, beside ``sys.stderr``."""
+    """Redirect file descriptor 2, which PyBullet writes to without ``sys.stderr``."""
     kept = os.dup(2)
     nowhere = os.open(os.devnull, os.O_WRONLY)
     try:

@@ -1,11 +1,12 @@
-"""The exceptions this package raises on bad input.
+"""The exceptions that this package raises on bad input.
 
-Each message is one line that names the thing and the way out; the command line prints it and leaves
+Each message is one line that names the thing and the way out. The command line prints it and exits
 with code 2.
 """
 
 import re
 from collections.abc import Iterable
+from difflib import get_close_matches
 
 
 class SB3QuadError(Exception):
@@ -13,11 +14,11 @@ class SB3QuadError(Exception):
 
 
 class ConfigError(SB3QuadError, ValueError):
-    """A file, key or value that does not fit: says which one, what is wrong and what is allowed."""
+    """A file, key or value that does not fit. Names it, what is wrong and what is allowed."""
 
 
 class MissingExtra(ConfigError, ImportError):
-    """A package that is not installed: says what needs it, and which extra brings it."""
+    """A package that is not installed. Names what needs it and the extra that brings it."""
 
 
 class CannotHover(ConfigError):
@@ -25,29 +26,27 @@ class CannotHover(ConfigError):
 
 
 class ExpertError(SB3QuadError, ValueError):
-    """An expert that cannot label this environment, or whose labels are not finite actions of the
-    right shape.
-    """
+    """An expert that cannot label this environment, or whose labels are not finite actions."""
 
 
 class TrainingError(SB3QuadError, RuntimeError):
-    """Training that cannot go on, for example a loss that is no longer finite."""
+    """Training that cannot continue, for example because the loss is no longer finite."""
 
 
 class ControllerError(SB3QuadError, RuntimeError):
-    """A controller that fails in flight: says when, and what it raised or gave."""
+    """A controller that fails in flight. Says when, and what it raised or returned."""
 
 
 class WorkerDied(SB3QuadError, RuntimeError):
-    """A worker process that ended before its task was done: killed, crashed, or out of memory."""
+    """A worker process that ended before its task: killed, crashed, or out of memory."""
 
 
 class ExportError(SB3QuadError, RuntimeError):
-    """An exported policy that does not compute what the trained one does, or cannot be checked."""
+    """An exported policy that computes other actions than the trained one, or cannot be checked."""
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
-    """The message for an unknown ``name``: what it may be a slip of, and the whole list.
+    """The message for an unknown name: a guess at what was meant, and the whole list.
 
     >>> unknown("task", "state_recovry", ["target_tracking", "state_recovery"])
     "unknown task 'state_recovry': did you mean 'state_recovery'? (valid: state_recovery,
@@ -58,38 +57,34 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> str:
 
 
 def did_you_mean(name: object, valid: Iterable[str]) -> str:
-    """The valid name that ``name`` misspells, or those few that it is a part of, as a question;
-    empty if there is none.
+    """A question with the valid name that ``name`` misspells, or up to three that have its words.
+
+    Empty if no name is near.
 
     >>> did_you_mean("tracking", ["far_tracking", "state_recovery", "target_tracking"])
     "did you mean 'far_tracking' or 'target_tracking'? "
     """
-    text, names = str(name).lower(), sorted(valid)
-    letters = sum(map(str.isalnum, text))
-    most = min(max(1, letters // 4), letters - 1)  # slips
-    near = {
-        each: _edit_distance(text, each.lower())
-        for each in names
-        if abs(len(each) - len(text)) <= most
-    }
-    found = [each for each in sorted(near, key=near.__getitem__)[:1] if near[each] <= most]
-    if not found and (parts := _parts(text)):
-        found = [each for each in names if parts <= _parts(each.lower())]
-    return f"did you mean {' or '.join(map(repr, found))}? " if 0 < len(found) <= 3 else ""
+    guesses = _guesses(str(name).lower(), sorted(valid))
+    if not guesses:
+        return ""
+    return f"did you mean {' or '.join(map(repr, guesses))}? "
 
 
-def _parts(text: str) -> set[str]:
-    return {*re.findall(r"[^\W_]+", text)}
+def _guesses(text: str, names: list[str]) -> list[str]:
+    words = _words(text)
+    if words:
+        longer = [name for name in names if words <= _words(name.lower())]
+        if 1 <= len(longer) <= 3:
+            return longer
+    by_lower_case = {name.lower(): name for name in names}
+    # Few slips change the first letter. Among all names, those of three letters and any two loss
+    # weights such as bc_coef and vf_coef are alike to difflib, so that they ask for more.
+    initial = text.lstrip("-")[:1]
+    same_initial = [name for name in by_lower_case if name.lstrip("-").startswith(initial)]
+    close = get_close_matches(text, same_initial, n=1, cutoff=0.65)
+    close = close or get_close_matches(text, by_lower_case, n=1, cutoff=0.75)
+    return [by_lower_case[name] for name in close]
 
 
-def _edit_distance(given: str, meant: str) -> int:
-    """How many letters left out, added, replaced, or swapped with the next make one text the other."""
-    rows: list[list[int]] = [[*range(len(meant) + 1)]]
-    for i, letter in enumerate(given):
-        rows.append([i + 1])
-        for j, other in enumerate(meant):
-            least = min(rows[i][j + 1] + 1, rows[i + 1][j] + 1, rows[i][j] + (letter != other))
-            if i > 0 and j > 0 and letter == meant[j - 1] and other == given[i - 1]:
-                least = min(least, rows[i - 1][j - 1] + 1)
-            rows[i + 1].append(least)
-    return rows[-1][-1]
+def _words(text: str) -> set[str]:
+    return set(re.findall(r"[^\W_]+", text))

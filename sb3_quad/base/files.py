@@ -1,11 +1,10 @@
 """Files that appear whole or not at all, with a clear error where a folder cannot be written."""
 
 import csv
-import fcntl
 import io
 import os
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, BinaryIO
@@ -14,31 +13,32 @@ import numpy as np
 
 from sb3_quad.base.errors import ConfigError
 
+LOCK = ".lock"
+
 
 @contextmanager
 def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """A stream to a file beside ``path`` that is moved there when it is finished, so that a reader
-    never meets half of it.
+    """A stream to a temporary file that replaces ``path`` once it is finished.
 
-    :raises ConfigError: no name of a file, a folder that cannot be written, a full disk; what
-        ``path`` held is still there.
+    A reader never meets half a file. If anything fails, ``path`` keeps what it held.
+
+    :raises ConfigError: Not the name of a file, a folder that cannot be written, or a full disk.
     """
     file = Path(path)
-    if not file.name or (
-        file.exists() and not file.is_file()
-    ):  # a device, as /dev/null, would be replaced, too
+    # A device such as /dev/null would be replaced, too.
+    if not file.name or (file.exists() and not file.is_file()):
         raise ConfigError(f"{str(path)!r}: names no file that can be written")
-    beside = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
         try:
-            with beside.open("wb") as stream:
+            with temporary.open("wb") as stream:
                 yield stream
                 stream.flush()
                 os.fsync(stream.fileno())
-            os.replace(beside, file)
+            os.replace(temporary, file)
         finally:
-            beside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written ({error.strerror or error})") from error
 
@@ -51,39 +51,48 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 
 @contextmanager
 def locked(folder: Path, what: str) -> Iterator[None]:
-    """Keep a folder to this process, and remove what a killed one has left half-written in it.
+    """Reserve a folder for this process, and remove half-written files of a killed one.
 
-    The lock ends with the process, however that ends, and leaves no file. A file system without
-    locks grants every one.
+    The lock ends with the process, however it ends. On a file system without locks, every process
+    gets one.
 
-    :param what: the folder in an error message.
-    :raises ConfigError: another process has it.
+    :param what: Name of the folder in the error message, such as "run folder".
+    :raises ConfigError: Another process holds the lock.
     """
-    descriptor = os.open(folder, os.O_RDONLY)
+    # Imported here because it takes as long as the rest of --help.
+    from filelock import FileLock, Timeout
+
+    lock = FileLock(folder / LOCK)
     try:
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ConfigError(
-                f"{what} {folder}: another process is writing to it; wait until that ends"
-            ) from None
-        except OSError:  # no locks here
-            pass
-        for half in folder.rglob(".*.tmp"):
-            half.unlink(missing_ok=True)
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ConfigError(
+            f"{what} {folder}: another process is writing to it; wait until that ends"
+        ) from None
+    except (OSError, NotImplementedError):
+        # This file system has no locks.
+        pass
+    try:
+        for temporary in folder.rglob(".*.tmp"):
+            temporary.unlink(missing_ok=True)
         yield
     finally:
-        os.close(descriptor)
+        # Removed while it is held, so that no other process can lock a file without a name.
+        # Windows removes it on release, and the folder may be gone.
+        with suppress(OSError):
+            (folder / LOCK).unlink()
+        lock.release()
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """As :func:`write_bytes`, of text in UTF-8."""
+    """Write text in UTF-8 by :func:`replacing`."""
     write_bytes(path, text.encode("utf-8"))
 
 
 def write_csv(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """As :func:`write_bytes`, of a table: empty where a row has no such key, without what no column
-    is called.
+    """Write a table by :func:`replacing`.
+
+    A cell is empty where its row lacks the key. Keys without a column are ignored.
     """
     text = io.StringIO()
     writer = csv.DictWriter(text, list(columns), extrasaction="ignore", lineterminator="\n")
@@ -93,41 +102,45 @@ def write_csv(path: str | Path, columns: Iterable[str], rows: Iterable[Mapping[s
 
 
 def write_arrays(path: str | Path, compressed: bool = False, **arrays: Any) -> None:
-    """As :func:`write_bytes`, of NumPy arrays as ``.npz``."""
+    """Write NumPy arrays as ``.npz`` by :func:`replacing`."""
+    save = np.savez_compressed if compressed else np.savez
     with replacing(path) as stream:
-        (np.savez_compressed if compressed else np.savez)(stream, **arrays)
+        save(stream, **arrays)
 
 
 def read_arrays(path: str | Path, prefix: str = "") -> dict[str, Any]:
-    """The arrays of an ``.npz`` file whose names begin with ``prefix``; the others are not even
-    read.
+    """Return the arrays of an ``.npz`` file whose names begin with ``prefix``.
 
-    :raises ConfigError: a missing or damaged file.
+    Arrays with other names are not even read.
+
+    :raises ConfigError: A missing or damaged file.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files if name.startswith(prefix)}
-    except Exception as error:  # what a damaged archive raises depends on where the damage is
+    except Exception as error:
+        # A damaged archive may raise anything, depending on where the damage is.
         raise ConfigError(f"{path}: cannot be read ({one_line(error)})") from None
 
 
 def read_text(path: str | Path) -> str:
-    """The text of a file.
+    """Return the text of a file.
 
-    :raises ConfigError: it is missing or cannot be read.
+    :raises ConfigError: It is missing or cannot be read.
     """
     try:
         return Path(path).read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
-    except (OSError, ValueError) as error:  # ValueError: not UTF-8, or no path
+    except (OSError, ValueError) as error:
+        # ValueError: the content is not UTF-8, or the path holds a null character.
         raise ConfigError(f"{path}: cannot be read ({error})") from None
 
 
 def refuse_existing(path: str | Path, overwrite: bool) -> None:
-    """See that a file that a command is to write does not cost one that is there.
+    """Check that writing a file replaces none, unless ``overwrite``.
 
-    :raises ConfigError: it exists, and ``overwrite`` was not asked for; or it is a folder.
+    :raises ConfigError: The file exists, or it is a folder.
     """
     if Path(path).is_dir():
         raise ConfigError(f"{path}: is a folder; name a file")
@@ -136,15 +149,17 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 
 
 def make_folder(path: str | Path, what: str, flag: str) -> None:
-    """Make a folder that files are to be written to, unless it is there.
+    """Make a folder for files to come, if it does not exist, and check that it can be written.
 
-    :param what: the folder in the message, which also names the flag that gives another.
-    :raises ConfigError: it cannot be written.
+    :param what: Name of the folder in the error message.
+    :param flag: The flag that gives another folder, for the error message.
+    :raises ConfigError: The folder cannot be written.
     """
     try:
         Path(path).mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=path).close()
-    except (OSError, ValueError) as error:  # ValueError: no path
+    except (OSError, ValueError) as error:
+        # ValueError: the path holds a null character.
         reason = getattr(error, "strerror", None) or error
         raise ConfigError(
             f"{what} {path}: cannot be written ({reason}); give another with {flag}"
@@ -152,20 +167,21 @@ def make_folder(path: str | Path, what: str, flag: str) -> None:
 
 
 def model_bytes(model: Any) -> bytes:
-    """The zip that ``model.save`` of Stable-Baselines3 would write."""
+    """Return the zip that Stable-Baselines3's ``model.save`` writes."""
     buffer = io.BytesIO()
     model.save(buffer)
     return buffer.getvalue()
 
 
 def save_model(model: Any, path: str | Path) -> None:
-    """``model.save(path)``, whole or not at all.
+    """Save a model by :func:`replacing`.
 
-    :raises ConfigError: a folder that cannot be written, a full disk.
+    :raises ConfigError: A folder that cannot be written, or a full disk.
     """
     write_bytes(path, model_bytes(model))
 
 
 def one_line(error: BaseException) -> str:
-    """What an exception says, in one line that is not too long."""
-    return (" ".join(str(error).split()) or type(error).__name__)[:200]
+    """Return the message of an exception as one line of at most 200 characters."""
+    text = " ".join(str(error).split())
+    return (text or type(error).__name__)[:200]

@@ -1,4 +1,4 @@
-"""Imports that wait until they are needed, and those of packages that only some commands need."""
+"""Imports that wait until they are needed, and imports of optional packages."""
 
 import importlib
 import importlib.util
@@ -14,16 +14,17 @@ from sb3_quad.base.errors import ConfigError, MissingExtra
 def lazy_names(
     package: str, modules: Mapping[str, str]
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package whose names are imported on first use (PEP 562).
+    """Return ``__getattr__`` and ``__dir__`` of a package that imports its names on first use
+    (PEP 562).
 
-    :param package: its ``__name__``.
-    :param modules: by name, the module that has it.
+    :param package: The package's ``__name__``.
+    :param modules: The module that defines each name.
     """
 
     def get(name: str) -> Any:
-        if name in modules:
-            return getattr(importlib.import_module(modules[name]), name)
-        raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        if name not in modules:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(modules[name]), name)
 
     def names() -> list[str]:
         return sorted({*vars(sys.modules[package]), *modules})
@@ -32,14 +33,15 @@ def lazy_names(
 
 
 def import_name(text: str) -> Any:
-    """What is at ``package.module:name`` or ``package.module.name``, which the user names."""
+    """Import ``package.module:name`` or ``package.module.name``, as given by the user."""
     search_present_folder(text.partition(":")[0])
     return pkgutil.resolve_name(text)
 
 
 def search_present_folder(module: str) -> None:
-    """Let a module that is not installed be imported from the present folder, where installed
-    commands do not look.
+    """Let a module that is not installed be imported from the working directory.
+
+    Python searches it only for scripts, not for installed commands.
     """
     here = os.getcwd()
     if here not in sys.path and importlib.util.find_spec(module.partition(".")[0]) is None:
@@ -47,30 +49,34 @@ def search_present_folder(module: str) -> None:
 
 
 def import_packages(packages: Iterable[str], where: str) -> None:
-    """Import modules that the user names, as those that register further environments.
+    """Import modules that the user names, such as those that register further environments.
 
-    :param where: they are named, for the message.
-    :raises ConfigError: one that cannot be imported.
+    :param where: The flag or key that names them, for the error message.
+    :raises ConfigError: A module cannot be imported.
     """
     for package in packages:
         try:
             search_present_folder(package)
             importlib.import_module(package)
-        except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+        except (Exception, SystemExit) as error:
+            # The module's own code may raise anything.
             raise ConfigError(
                 f"{where} {package}: cannot be imported ({type(error).__name__}: {error})"
             ) from None
 
 
 def require(module: str, extra: str, what: str) -> Any:
-    """The module, imported.
+    """Import a module that only some features need.
 
-    :param extra: of this package, which brings it; empty: none does.
-    :param what: needs it, for the message.
-    :raises MissingExtra: it cannot be imported; the message says what to install.
+    :param extra: The extra of this package that installs it, or an empty text.
+    :param what: The feature, for the error message.
+    :raises MissingExtra: It cannot be imported. The message says what to install.
     """
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        install = f"'.[{extra}]' from a clone of sb3_quad" if extra else module.replace("_", "-")
+        if extra:
+            install = f"'.[{extra}]' from a clone of sb3_quad"
+        else:
+            install = module.replace("_", "-")
         raise MissingExtra(f"{what} needs {module} ({error}): pip install {install}") from None

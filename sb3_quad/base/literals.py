@@ -1,4 +1,4 @@
-"""Values from YAML and the command line: literals and a few named classes, never evaluated as code."""
+"""Values from YAML and the command line: literals and a few named classes, never code."""
 
 import ast
 import pkgutil
@@ -9,27 +9,33 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.files import one_line
 
-_ACTIVATIONS = (
-    "ELU",
-    "GELU",
-    "Hardtanh",
-    "LeakyReLU",
-    "Mish",
-    "ReLU",
-    "ReLU6",
-    "SELU",
-    "Sigmoid",
-    "SiLU",
-    "Softplus",
-    "Tanh",
+CLASSES = (
+    "nn.ELU",
+    "nn.GELU",
+    "nn.Hardtanh",
+    "nn.LeakyReLU",
+    "nn.Mish",
+    "nn.ReLU",
+    "nn.ReLU6",
+    "nn.SELU",
+    "nn.Sigmoid",
+    "nn.SiLU",
+    "nn.Softplus",
+    "nn.Tanh",
+    "optim.Adam",
+    "optim.AdamW",
+    "optim.Adamax",
+    "optim.RMSprop",
+    "optim.SGD",
 )
-_OPTIMIZERS = ("Adam", "AdamW", "Adamax", "RMSprop", "SGD")
-CLASSES = (*(f"nn.{name}" for name in _ACTIVATIONS), *(f"optim.{name}" for name in _OPTIMIZERS))
+"""The classes of PyTorch that settings may name."""
 _CLASS_NAME = re.compile(r"(?:torch\.|th\.)?((?:nn|optim)\..*)")
 
 
 def parse_number(value: Any) -> Any:
-    """``"1e-3"`` (a string to PyYAML) as a number; anything else as it is.
+    """Return a number for a text such as ``"1e-3"``, which PyYAML reads as a string.
+
+    Anything else is returned unchanged.
 
     >>> parse_number("1e-3"), parse_number("2_000"), parse_number("mse"), parse_number(3)
     (0.001, 2000, 'mse', 3)
@@ -42,13 +48,13 @@ def parse_number(value: Any) -> Any:
 
 
 def parse_value(text: str, key: str = "") -> Any:
-    """The value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the string
-    itself.
+    """Return the value of ``v`` in ``--hyperparams k:v``: a literal or ``dict(…)``, else the text.
 
-    >>> parse_value("[64, 64]"), parse_value("dict(a=1)"), parse_value("mse"), parse_value("lin_1e-3")
-    ([64, 64], {'a': 1}, 'mse', 'lin_1e-3')
+    >>> parse_value("[64, 64]"), parse_value("dict(a=1)"), parse_value("lin_1e-3")
+    ([64, 64], {'a': 1}, 'lin_1e-3')
 
-    :raises ConfigError: there is a ``key``, which the message names, and the text is no literal.
+    :param key: The key that an error message names.
+    :raises ConfigError: There is a ``key``, and the text is not a literal.
     """
     try:
         return ast.literal_eval(_AsLiterals().visit(ast.parse(text.strip(), mode="eval")))
@@ -61,43 +67,52 @@ def parse_value(text: str, key: str = "") -> Any:
 
 
 def parse_mapping(value: Any, key: str) -> dict[str, Any]:
-    """A mapping given as one, as None, or as rl-zoo's string ``"dict(net_arch=[64, 64],
-    activation_fn=nn.Tanh)"``.
+    """Return a mapping, given as one, as None, or as rl_zoo3's ``"dict(net_arch=[64, 64])"``.
 
-    :raises ConfigError: anything else; the message names ``key``. Names such as ``nn.Tanh`` become
-        classes.
+    Names such as ``nn.Tanh`` become classes.
+
+    :param key: The key that an error message names.
+    :raises ConfigError: The value is anything else.
     """
-    given = parse_value(value, key) if isinstance(value, str) else {} if value is None else value
-    if not isinstance(given, dict) or not all(isinstance(name, str) for name in given):
+    if isinstance(value, str):
+        value = parse_value(value, key)
+    elif value is None:
+        value = {}
+    if not isinstance(value, dict) or not all(isinstance(name, str) for name in value):
         raise ConfigError(f"{key}: must be a mapping of names to values, not {value!r}")
-    return {name: _named(entry, f"{key}.{name}") for name, entry in given.items()}
+    mapping: dict[str, Any] = _resolve(value, key)
+    return mapping
 
 
 def put_key(data: dict[str, Any], key: str, value: Any, where: str) -> None:
-    """Set a value at a dotted key, in place; numbers count the entries of a list.
+    """Set a value at a dotted key, in place. Numbers are positions in a list.
 
-    :raises ConfigError: what the key leads through holds no keys.
+    :raises ConfigError: Something on the way holds no keys.
     """
     *path, last = key.split(".")
     place: Any = data
     for part in path:
         if isinstance(place, list) and part.isdigit() and int(part) < len(place):
             place = place[int(part)]
+        elif isinstance(place, dict):
+            place = place.setdefault(part, {})
         else:
-            place = place.setdefault(part, {}) if isinstance(place, dict) else None
+            place = None
     if not isinstance(place, dict):
         raise ConfigError(f"{where}: {'.'.join(path)} holds no keys here")
     place[last] = value
 
 
-def _named(value: Any, key: str) -> Any:
+def _resolve(value: Any, key: str) -> Any:
+    """Replace names of classes and texts of numbers, at any depth."""
     if isinstance(value, dict):
-        return {name: _named(entry, f"{key}.{name}") for name, entry in value.items()}
+        return {name: _resolve(entry, f"{key}.{name}") for name, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return type(value)(_named(entry, key) for entry in value)
+        return type(value)(_resolve(entry, key) for entry in value)
     if not isinstance(value, str):
         return value
-    if (match := _CLASS_NAME.fullmatch(value)) is None:
+    match = _CLASS_NAME.fullmatch(value)
+    if match is None:
         return parse_number(value)
     if match[1] not in CLASSES:
         raise ConfigError(f"{key}: {unknown('class', value, CLASSES)}")
@@ -105,17 +120,18 @@ def _named(value: Any, key: str) -> Any:
 
 
 class _AsLiterals(ast.NodeTransformer):
-    """Makes literals of ``dict(…)`` calls, and strings of names such as ``nn.Tanh``."""
+    """Turns ``dict(…)`` calls into literals, and names such as ``nn.Tanh`` into strings."""
 
     def visit_Call(self, node: ast.Call) -> ast.AST:
         self.generic_visit(node)
-        names = [entry.arg for entry in node.keywords]
+        names = [keyword.arg for keyword in node.keywords]
         if ast.unparse(node.func) != "dict" or node.args or None in names:
             return node
-        return ast.Dict(
-            [ast.Constant(name) for name in names], [entry.value for entry in node.keywords]
-        )
+        values = [keyword.value for keyword in node.keywords]
+        return ast.Dict([ast.Constant(name) for name in names], values)
 
     def visit_Attribute(self, node: ast.Attribute) -> ast.AST:
         text = ast.unparse(node)
-        return ast.Constant(text) if _CLASS_NAME.match(text) else node
+        if _CLASS_NAME.match(text):
+            return ast.Constant(text)
+        return node

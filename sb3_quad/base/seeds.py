@@ -1,9 +1,7 @@
-"""Every stream of random numbers, by what it is for: what judges a training is never what it was
-trained on.
+"""Every stream of random numbers, by its purpose: no agent is judged on the episodes it trained on.
 
-Streams are told apart by :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row.
-No two share numbers: seeds 0 and 1 of a training have as little in common as a training and its
-evaluation.
+Streams are separated by :class:`numpy.random.SeedSequence` of a run's seed, a purpose and a row. No
+two share numbers: seeds 0 and 1 of a training are as independent as a training and its evaluation.
 """
 
 import typing
@@ -14,41 +12,52 @@ from pydantic import Field
 
 Purpose = Literal[
     "training",
-    "evaluation",  # along the way
-    "correction",  # before and after an agent is trimmed
-    "table",  # at the end of a run
-    "search",  # for gains: examples/tune_expert.py
-    "expert",  # at the end of that search, and of check-vehicle
-    "offset",  # that adaptive scaling cancels
-    "card",  # of published policies
-    "suite",  # of scenarios
+    # Evaluations during a training.
+    "evaluation",
+    # The measurements before and after an offset correction.
+    "correction",
+    # The closing table of a run.
+    "table",
+    # The search for gains in examples/tune_expert.py.
+    "search",
+    # The measurement after that search, and check-vehicle.
+    "expert",
+    # The offset that adaptive scaling cancels.
+    "offset",
+    # The cards of published policies.
+    "card",
+    # Suites of scenarios.
+    "suite",
 ]
 PURPOSES = typing.get_args(Purpose)
-_PURPOSE, _ROW = range(2)  # what a key tells apart
-SCENARIO_STREAM = (
-    0x5B3  # a scenario's own random numbers have nothing to do with those of the environment
-)
-LARGEST = 2**32  # NumPy's global generator, which SB3 seeds, takes no more
+# The first number of a key separates purposes from rows.
+_PURPOSE = 0
+_ROW = 1
+# The random numbers of a scenario are independent of those of the environment.
+SCENARIO_STREAM = 0x5B3
+# NumPy's global generator, which SB3 seeds, takes no larger seed.
+LARGEST = 2**32
 Seed: TypeAlias = Annotated[int, Field(ge=0, lt=LARGEST)]
 
 
 def seed_for(purpose: Purpose, seed: int = 0) -> int:
-    """The seed of what a run with ``seed`` flies for some purpose; its rows fly by
-    :func:`row_seeds` of it.
+    """Return the seed for one purpose of a run with ``seed``.
+
+    Its rows use :func:`row_seeds` of it.
     """
     return _hash(seed, _PURPOSE, PURPOSES.index(purpose))
 
 
 def row_seeds(seed: int, n: int) -> list[int]:
-    """The seeds of n rows, each for ``reset(seed=…)`` of one environment; row i's does not depend
-    on n.
+    """Return the seeds of n rows, each for ``reset(seed=…)`` of one environment.
 
-    They are below 2**53, which any file and any language keeps exactly.
+    The seed of row i does not depend on n. All are below 2**53, which any file format and any
+    language keep exactly.
     """
     return [_hash(seed, _ROW, row) for row in range(n)]
 
 
 def _hash(seed: int, *key: int) -> int:
-    return int(
-        np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0] >> np.uint64(11)
-    )
+    sequence = np.random.SeedSequence(seed, spawn_key=key)
+    # The upper 53 of 64 bits.
+    return int(sequence.generate_state(1, np.uint64)[0] >> np.uint64(11))

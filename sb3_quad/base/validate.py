@@ -1,4 +1,4 @@
-"""Validated data: one base class for records and settings, and errors of one line."""
+"""Validated data: one base class for records and settings, and one-line errors."""
 
 import json
 import typing
@@ -22,101 +22,107 @@ class Frozen(BaseModel):
 
 
 def validate(model: type[Model], data: Any, where: str | Callable[[str], str]) -> Model:
-    """``data`` as a ``model``.
+    """Return ``data`` as a ``model``.
 
-    :param where: what the message calls the data, such as the name of its file; or gives that for a
-        key.
-    :raises ConfigError: something does not fit; one line names each key, what is wrong, and the
-        nearest valid key. Where all that is wrong is an error of a kind of its own, such as
-        :class:`CannotHover`, that kind is raised.
+    :param where: The source of the data for the error message, such as the name of its file. It may
+        be a function that returns the source of a key.
+    :raises ConfigError: Something does not fit. One line names each key, what is wrong, and the
+        nearest valid key. If all errors are of one subclass of ConfigError, such as
+        :class:`CannotHover`, that subclass is raised.
     """
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
-        kind = next(
-            (each for each in kinds if len(kinds) == 1 and issubclass(each, ConfigError)),
-            ConfigError,
-        )
-        place = (
-            where if isinstance(where, str) else where(str((error.errors()[0]["loc"] or ("",))[0]))
-        )
-        raise kind(f"{place}: {explain(error, model)}") from None
+        if not isinstance(where, str):
+            location = error.errors()[0]["loc"] or ("",)
+            where = where(str(location[0]))
+        raise _kind(error)(f"{where}: {explain(error, model)}") from None
+
+
+def _kind(error: ValidationError) -> type[ConfigError]:
+    """Return the subclass of ConfigError that all errors are of, else ConfigError."""
+    kinds = {type(item.get("ctx", {}).get("error")) for item in error.errors()}
+    kind = kinds.pop()
+    if not kinds and issubclass(kind, ConfigError):
+        return kind
+    return ConfigError
 
 
 def read_record(path: Path, model: type[Model]) -> Model:
-    """The record in a JSON file.
+    """Return the record in a JSON file.
 
-    :raises ConfigError: the file is missing, holds no JSON, or no such record.
+    :raises ConfigError: The file is missing, is not JSON, or holds another record.
     """
     text = read_text(path)
     try:
         return validate(model, json.loads(text), "damaged, or of another version")
-    except (ValueError, RecursionError) as error:  # no JSON, or no such record
+    except (ValueError, RecursionError) as error:
+        # ValueError: the text is not JSON, or validate() raised its ConfigError.
         raise ConfigError(f"{path}: {error}; name another folder, or remove it") from None
 
 
 def explain(error: ValidationError, model: type[BaseModel]) -> str:
-    """What is wrong, in one line: each key with what is wrong about it, what it means, and the
-    nearest valid key.
+    """Return one line that says for each key what is wrong, what the key means, and the nearest
+    valid key.
     """
-    found: dict[str, str] = {}
+    lines: dict[str, str] = {}
     for item in error.errors():
-        inside, names, meaning = _walk(model, item["loc"])
-        key = ".".join(names)
+        inner, key, meaning = _locate(model, item["loc"])
         if item["type"] == "extra_forbidden":
-            text = unknown("key", item["loc"][-1], _fields(inside))
+            text = unknown("key", item["loc"][-1], _fields(inner))
+        elif meaning:
+            text = f"{_message(item)} ({meaning})"
         else:
-            text = _message(item) + (f" ({meaning})" if meaning else "")
-        found.setdefault(
-            key, text if text.startswith(key) else f"{key}: {text}"
-        )  # of a union only the first alternative
-    return "; ".join(found.values())
+            text = _message(item)
+        if not text.startswith(key):
+            text = f"{key}: {text}"
+        # Each alternative of a union has errors of its own. Only those of the first one are shown.
+        lines.setdefault(key, text)
+    return "; ".join(lines.values())
 
 
 def _message(item: Mapping[str, Any]) -> str:
-    given = item["input"]
-    if str(item["type"]).startswith(("float_", "int_")) and isinstance(given, str):
-        return f"{given!r} must be a number alone, its unit left out"
+    value = item["input"]
+    if str(item["type"]).startswith(("float_", "int_")) and isinstance(value, str):
+        return f"{value!r} must be a plain number, without a unit"
     if item["type"] == "missing":
         return "is missing"
     return str(item["msg"]).removeprefix("Value error, ")
 
 
-def _walk(
+def _locate(
     model: type[BaseModel], location: tuple[int | str, ...]
-) -> tuple[type[BaseModel], list[str], str]:
-    """The innermost model a location leads to, its keys (names of a union's alternatives left out),
-    the last one's meaning.
-    """
+) -> tuple[type[BaseModel], str, str]:
+    """Return the innermost model at a location, the dotted key, and the meaning of its field."""
     names: list[str] = []
     meaning = ""
     for part in location:
+        field = _fields(model).get(str(part))
         if isinstance(part, int):
             names.append(str(part))
-        elif part in _fields(model):
-            field = _fields(model)[part]
+        elif field is not None:
             names.append(part)
             meaning = field.description or ""
             model = _model_in(field.annotation) or model
-    return model, names, meaning
+        # Anything else is the name of a union's alternative, which the user does not know.
+    return model, ".".join(names), meaning
 
 
 def _fields(model: type[BaseModel]) -> dict[str, FieldInfo]:
-    """The fields of a model by the keys that its data have."""
-    return {
-        str(field.validation_alias or name): field for name, field in model.model_fields.items()
-    }
+    """Return the fields of a model by the keys that its data have."""
+    fields = {}
+    for name, field in model.model_fields.items():
+        fields[str(field.validation_alias or name)] = field
+    return fields
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if typing.get_origin(annotation) is None:
-        return (
-            annotation
-            if isinstance(annotation, type) and issubclass(annotation, BaseModel)
-            else None
-        )
-    return next(
-        (found for entry in typing.get_args(annotation) if (found := _model_in(entry)) is not None),
-        None,
-    )
+    """Return the first model in a type such as ``dict[str, Model]`` or ``Model | None``."""
+    arguments = typing.get_args(annotation)
+    if not arguments and isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    for argument in arguments:
+        inner = _model_in(argument)
+        if inner is not None:
+            return inner
+    return None

@@ -1,5 +1,6 @@
-"""Subcommands, errors and exit codes."""
+"""The commands, their errors and exit codes."""
 
+import argparse
 import importlib
 import io
 import pkgutil
@@ -8,27 +9,35 @@ import traceback
 from collections.abc import Container, Sequence
 from pathlib import Path
 
+from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, SB3QuadError, unknown
-from sb3_quad.base.signals import interrupts_leave
-from sb3_quad.base.trust import trusting
-from sb3_quad.base.version import __version__
+from sb3_quad.base.process import interrupts_leave, trusting
 from sb3_quad.cli import commands
 from sb3_quad.cli.parser import Parser
 
 EPILOG = """examples:
-  sb3-quad train                                                          imitation, then PPO, in random worlds
-  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6          a single training
-  sb3-quad tune --algo dagger -n 250000 --n-trials 30                     a search for its hyperparameters
-  sb3-quad evaluate pid agent.zip --suite quick                           an agent and an expert in one table
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs         its flights in a window
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -o film.mp4     or as a film
-  sb3-quad demo                                                           a page in which anyone can throw the quadcopter
-  sb3-quad train --help                                                   all options of a command, with examples
+  # imitation, then PPO, with domain randomization
+  sb3-quad train
+  # a single training
+  sb3-quad train --algo ppo_bc --env QuadStateRecovery-v0 -n 1e6
+  # search for hyperparameters
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30
+  # compare an agent and an expert in one table
+  sb3-quad evaluate pid agent.zip --suite quick
+  # watch the agent's flights in a window, or as a film
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -o film.mp4
+  # make a page where anyone can throw the quadcopter
+  sb3-quad demo
+  # show all options of a command, with examples
+  sb3-quad train --help
 
 exit codes:
   0    done
-  1    some controllers of an evaluation or runs of a sweep failed (one line each on stderr), or a vehicle cannot hover
-  2    bad input, a training that cannot continue, or any other error: one line on stderr says what
+  1    some controllers of an evaluation or runs of a sweep failed (each has a
+       line on stderr), or a vehicle cannot hover
+  2    bad input, a training that cannot continue, or any other error; one line
+       on stderr says what (--traceback after the command shows where)
   129  the terminal was closed (SIGHUP), after saving
   130  interrupted by Ctrl-C, after saving
   143  interrupted by SIGTERM, after saving
@@ -43,78 +52,98 @@ COMMANDS = {
 
 
 def make_parser() -> Parser:
-    """The parser of all commands."""
+    """Return the parser of all commands."""
     parser = Parser(prog="sb3-quad", description="Fly and train quadcopters.", epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"sb3_quad {__version__}")
-    subparsers = parser.add_subparsers(dest="command", metavar="{" + ",".join(COMMANDS) + "}")
+    subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND")
     siblings: dict[str, Container[str]] = {}
     for name, command in COMMANDS.items():
-        summary, _, rest = (command.__doc__ or "").partition("\n\n")
-        subparser = subparsers.add_parser(name, help=summary, description=summary, epilog=rest)
+        text, heading, rest = str(command.__doc__).partition("examples:\n")
+        summary = text.partition("\n\n")[0]
+        subparser = subparsers.add_parser(
+            name, help=summary, description=text, epilog=heading + rest
+        )
         command.add_arguments(subparser)
+        subparser.add_argument(
+            "--traceback", action="store_true", help="print the traceback of an error, too"
+        )
         subparser.siblings = siblings
         siblings[name] = subparser._option_string_actions
     return parser
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code."""
-    given = list(sys.argv[1:] if argv is None else argv)
+    """Run the command line. Returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    # Lines appear at once, also in a pipe.
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(line_buffering=True)  # lines appear at once, also in a pipe
+        sys.stdout.reconfigure(line_buffering=True)
     try:
-        parser = make_parser()
-        if any(
-            "\ud800" <= letter <= "\udfff" for letter in "".join(given)
-        ):  # how Python shows bytes that are no text
-            raise ConfigError(f"arguments {' '.join(given)!r}: not valid UTF-8")
-        if given and not given[0].startswith("-") and given[0] not in COMMANDS:
-            raise ConfigError(unknown("command", given[0], COMMANDS))
-        try:
-            options = parser.parse_args(given)
-        except SystemExit as leaving:  # argparse, after --help
-            return int(leaving.code or 0)
-        if options.command is None:
-            parser.print_help()
+        options = _parse(arguments)
+        if options is None:
             return 0
-        agent = getattr(options, "trained_agent", None)
-        if agent is not None and not any(
-            Path(f"{agent}{suffix}").is_file() for suffix in ("", ".zip")
-        ):  # SB3 adds it
-            raise ConfigError(
-                f"-i {agent}: no such file"
-            )  # at once: what the command imports takes seconds
-        with interrupts_leave():  # torch and the like, which every command needs, take seconds
+        # Ctrl-C ends the imports at once. All commands need these, which take seconds.
+        with interrupts_leave():
             importlib.import_module("sb3_quad.controllers.zips")
         with trusting(getattr(options, "trust", False)):
             return int(COMMANDS[options.command].run(options))
-    except SB3QuadError as error:
-        return _refuse(str(error))
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130
-    except BrokenPipeError:  # as in `sb3-quad train --help | head`
+    except BrokenPipeError:
+        # The reader has ended, as in `sb3-quad train --help | head`.
         sys.stderr.close()
         return 0
-    except (
-        Exception,
-        SystemExit,
-    ) as error:  # of a user's wrapper, environment or callback, a full disk, or a fault of ours
-        if sys.flags.dev_mode:
-            raise
-        return _refuse(_unexpected(error))
+    except (Exception, SystemExit) as error:
+        # A user's environment or callback, or a fault of this package, may raise anything.
+        if "--traceback" in arguments:
+            traceback.print_exc()
+        message = str(error) if isinstance(error, SB3QuadError) else _unexpected(error)
+        print(f"error: {' '.join(message.split())}", file=sys.stderr)
+        return 2
 
 
-def _refuse(message: str) -> int:
-    """Print what stops a command, in one line. Returns the exit code."""
-    print(f"error: {' '.join(message.split())}", file=sys.stderr)
-    return 2
+def _parse(arguments: list[str]) -> argparse.Namespace | None:
+    """Return the options of a command, or None after printing help.
+
+    :raises ConfigError: An unknown command or option, or a bad value.
+    """
+    parser = make_parser()
+    # Python represents bytes that are not text as lone surrogates.
+    if any("\ud800" <= letter <= "\udfff" for letter in "".join(arguments)):
+        raise ConfigError(f"arguments {' '.join(arguments)!r}: not valid UTF-8")
+    if arguments and not arguments[0].startswith("-") and arguments[0] not in COMMANDS:
+        raise ConfigError(unknown("command", arguments[0], COMMANDS))
+    try:
+        options = parser.parse_args(arguments)
+    except SystemExit:
+        # argparse has printed the help or the version.
+        return None
+    if options.command is None:
+        parser.print_help()
+        return None
+    _check_agent(getattr(options, "trained_agent", None))
+    return options
+
+
+def _check_agent(agent: str | None) -> None:
+    """Refuse a missing file at once, since the imports of a command take seconds.
+
+    :raises ConfigError: There is no such file.
+    """
+    if agent is None or Path(agent).is_file():
+        return
+    # SB3 adds the suffix, too.
+    if not Path(f"{agent}.zip").is_file():
+        raise ConfigError(f"-i {agent}: no such file")
 
 
 def _unexpected(error: BaseException) -> str:
-    """The message of an exception that no check foresaw, and where it was raised."""
+    """Return the message of an exception that no check foresaw, with the place that raised it."""
     if isinstance(error, OSError) and error.strerror:
         return f"{error.filename or 'a file'}: {error.strerror}"
-    told = "; ".join([f"{type(error).__name__}: {error}", *getattr(error, "__notes__", ())])
+    notes = getattr(error, "__notes__", ())
+    text = "; ".join([f"{type(error).__name__}: {error}", *notes])
     last = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{told} ({Path(last.filename).name}, line {last.lineno}; all of it: python -X dev -m sb3_quad.cli …)"
+    place = f"{Path(last.filename).name}, line {last.lineno}"
+    return f"{text} ({place}; add --traceback for all of it)"

@@ -1,10 +1,9 @@
-"""Where lines, tables and progress are shown."""
+"""Output of commands: tables, warnings and progress."""
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 from rich.progress import (
@@ -16,55 +15,62 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-FILE_WIDTH = 180  # columns where the output is no terminal: a table there need not wrap
+# Columns of a table in a file or a pipe, where lines need not wrap.
+FILE_WIDTH = 180
 Show = Callable[[int, "int | None", str], None]
 
 
 def console() -> Console:
-    """A console as wide as the terminal, or as wide as any table here needs in a file or pipe."""
+    """Return a console as wide as the terminal, or as wide as any table needs in a file."""
     return Console(width=None if sys.stdout.isatty() else FILE_WIDTH)
 
 
 def warn(line: str) -> None:
-    """Print a warning on stderr, if there is one."""
+    """Print a warning on stderr, unless it is empty."""
     if line:
         print(f"warning: {line}", file=sys.stderr)
 
 
 def shows_progress(wanted: bool | None) -> bool:
-    """Whether a progress bar is shown: in a terminal, unless asked otherwise."""
+    """Whether to show a progress bar: as ``wanted``, or with None, in a terminal."""
     return sys.stderr.isatty() if wanted is None else wanted
 
 
 def output_file(given: str | Path | None, name: str) -> Path:
-    """Where a command writes its one file: where ``-o`` says, if that is a file, else as ``name``
-    in that folder, or here.
+    """Return the file that ``-o`` names, or the file ``name`` in the folder that it names.
+
+    Without ``-o``, the folder is the working directory.
     """
     path = Path(given or "")
-    return path if path.suffix and not path.is_dir() else path / name
+    if path.suffix and not path.is_dir():
+        return path
+    return path / name
 
 
 @contextmanager
 def progress_bar(wanted: bool | None) -> Iterator[Show]:
-    """A progress bar on stderr, moved by what it yields: how much is done, of how much (None: not
-    known), what is under way.
+    """Show a progress bar on stderr within the block.
 
-    :param wanted: None: in a terminal; True: also where stderr is none.
+    It yields a function that moves the bar: what is done, the total (None if unknown), and a text.
+
+    :param wanted: Whether to show it. None: only in a terminal.
     """
-    columns = (
+    bar = Progress(
         BarColumn(),
         TaskProgressColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(elapsed_when_finished=True),
+        TextColumn("{task.description}", markup=False),
+        console=Console(file=sys.stderr, force_terminal=wanted or None),
+        disable=not shows_progress(wanted),
+        transient=True,
+        # Lines that are printed meanwhile appear above the bar.
+        redirect_stdout=sys.stdout.isatty(),
     )
-    description = TextColumn("{task.description}", markup=False)
-    where = Console(file=sys.stderr, force_terminal=wanted or None)
-    options: dict[str, Any] = {"console": where, "disable": not shows_progress(wanted)}
-    # Lines printed meanwhile appear above the bar, or go where stdout leads.
-    with Progress(
-        *columns, description, transient=True, redirect_stdout=sys.stdout.isatty(), **options
-    ) as bar:
+    with bar:
         task = bar.add_task("", total=None)
-        yield lambda done, total, text: bar.update(
-            task, completed=done, total=total, description=text
-        )
+
+        def show(done: int, total: int | None, text: str) -> None:
+            bar.update(task, completed=done, total=total, description=text)
+
+        yield show

@@ -1,6 +1,4 @@
-"""Argument parsing with one-line errors, kinds of arguments, and the flags that several commands
-have.
-"""
+"""Argument parsing with one-line errors, types of arguments, and flags of several commands."""
 
 import argparse
 import math
@@ -14,79 +12,92 @@ from pydantic import BaseModel
 from sb3_quad.base.errors import ConfigError, did_you_mean
 from sb3_quad.base.literals import parse_number, parse_value
 
-ELSEWHERE = dict.fromkeys(
-    ("-optimize", "--optimize", "--optimize-hyperparameters"), "the command sb3-quad tune does that"
-)
-"""Flags of rl_zoo3 that no command has, and what has their part."""
+# Flags of rl_zoo3's train.py, whose part sb3-quad tune has.
+SEARCH_FLAGS = ("-optimize", "--optimize", "--optimize-hyperparameters")
+
+
+class HelpFormatter(argparse.RawDescriptionHelpFormatter):
+    """Keeps the line breaks of examples, and shows the value of a number as N."""
+
+    def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
+        if action.type in (whole, natural, positive, seed):
+            return "N"
+        return super()._get_default_metavar_for_optional(action)
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser that raises ConfigError, and says what may be meant by an unknown option."""
+    """An ArgumentParser that raises ConfigError and gives advice on unknown options."""
 
-    siblings: Mapping[str, Container[str]] = {}  # by command: its options
+    siblings: Mapping[str, Container[str]] = {}
+    """The options of each command."""
 
     def __init__(self, **kwargs: Any) -> None:
-        super().__init__(
-            **{
-                "allow_abbrev": False,
-                "formatter_class": argparse.RawDescriptionHelpFormatter,
-                **kwargs,
-            }
-        )
+        super().__init__(allow_abbrev=False, formatter_class=HelpFormatter, **kwargs)
 
     def error(self, message: str) -> NoReturn:
-        """:raises ConfigError: always."""
+        """Raise the error instead of exiting.
+
+        :raises ConfigError: Always.
+        """
         raise ConfigError(message)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
-        """As argparse's, but an unknown option is an error here, where the options of the command
-        are known.
+        """Parse the arguments of a command, and refuse unknown ones here, where its options are
+        known.
 
-        :raises ConfigError: an unknown option, a missing or bad value.
+        :raises ConfigError: An unknown option, or a missing or bad value.
         """
         options, rest = super().parse_known_args(args, namespace)
         if rest:
             option, _, value = rest[0].partition("=")
+            if not value and len(rest) > 1:
+                value = rest[1]
             kind = "option" if option.startswith("-") else "argument"
-            raise ConfigError(
-                f"unknown {kind} {option!r}: {self._advice(option, value or [*rest, ''][1])}"
-            )
+            raise ConfigError(f"unknown {kind} {option!r}: {self._advice(option, value)}")
         return options, rest
 
     def _advice(self, option: str, value: str) -> str:
-        """What to give instead of an unknown option."""
+        """Say what the user may want instead of an unknown option."""
         valid = self._option_string_actions
-        owners = [
-            f"sb3-quad {name}" for name, options in self.siblings.items() if option in options
-        ]
-        if option in ELSEWHERE:
-            return ELSEWHERE[option]
-        if hint := did_you_mean(option, valid):
-            return hint.strip()
-        if owners:
-            return f"it belongs to {' and '.join(owners)}"
+        if option in SEARCH_FLAGS:
+            return "the command sb3-quad tune does that"
+        guess = did_you_mean(option, valid)
+        if guess:
+            return guess.strip()
+        commands = [name for name, options in self.siblings.items() if option in options]
+        if commands:
+            return "it belongs to " + " and ".join(f"sb3-quad {name}" for name in commands)
         if "--hyperparams" in valid and option.startswith("--"):
-            pair = f"{option.strip('-').replace('-', '_')}:{'VALUE' if value[:1] in ('', '-') else value}"
-            return f"a hyperparameter is given as --hyperparams {pair}, a keyword of the environment as --env-kwargs {pair}"
+            if value.startswith("-") or not value:
+                value = "VALUE"
+            pair = f"{option.strip('-').replace('-', '_')}:{value}"
+            return (
+                f"a hyperparameter is given as --hyperparams {pair}, "
+                f"a keyword of the environment as --env-kwargs {pair}"
+            )
         return "see --help, and docs/zoo.md for flags of rl_zoo3"
 
 
 class Pairs(argparse.Action):
-    """Keeps ``k:v`` entries as a mapping."""
+    """Stores ``k:v`` entries as a mapping."""
 
     def __call__(
         self, parser: Any, namespace: argparse.Namespace, values: Any, option: str | None = None
     ) -> None:
-        """:raises ConfigError: an entry without a colon."""
-        found = dict(getattr(namespace, self.dest) or {})
+        """Add the entries of one flag to those of the flags before it.
+
+        :raises ConfigError: An entry without a colon, or a key that is given twice.
+        """
+        pairs = dict(getattr(namespace, self.dest) or {})
         for entry in values:
             key, colon, value = entry.partition(":")
+            name = key.strip()
             if not colon or not key:
                 raise ConfigError(f"{option} {entry!r}: must be key:value, such as n_steps:500")
-            if (name := key.strip()) in found:
+            if name in pairs:
                 raise ConfigError(f"{option} {entry!r}: {name} is given twice")
-            found[name] = parse_value(value)
-        setattr(namespace, self.dest, found)
+            pairs[name] = parse_value(value)
+        setattr(namespace, self.dest, pairs)
 
 
 PAIRS: dict[str, Any] = {"action": Pairs, "nargs": "+", "metavar": "K:V"}
@@ -94,33 +105,36 @@ YES_OR_NO: dict[str, Any] = {"action": argparse.BooleanOptionalAction}
 
 
 def whole(text: str) -> int:
-    """A whole number, also as ``1e6``."""
+    """Return a whole number, also from a text such as ``1e6``."""
     number = parse_number(text)
     if isinstance(number, str) or not abs(number) < 2**63 or number != int(number):
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number below 2**63")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number below 2**63")
     return int(number)
 
 
 def natural(text: str, least: int = 0) -> int:
-    """A whole number of at least 0."""
-    if whole(text) < least:
+    """Return a whole number of at least 0."""
+    number = whole(text)
+    if number < least:
         raise argparse.ArgumentTypeError(f"{text}: must be at least {least}")
-    return whole(text)
+    return number
 
 
 def positive(text: str) -> int:
-    """A whole number of at least 1."""
+    """Return a whole number of at least 1."""
     return natural(text, least=1)
 
 
 def seed(text: str) -> int:
-    """A whole number; a negative one asks for a random one."""
+    """Return a whole number of at least 0, a random one for a negative number."""
     number = whole(text)
-    return number if number >= 0 else random.SystemRandom().randrange(2**31)
+    if number < 0:
+        number = random.SystemRandom().randrange(2**31)
+    return number
 
 
 def above_zero(text: str) -> float:
-    """A finite number above 0."""
+    """Return a finite number above 0."""
     number = float(text)
     if not 0 < number < math.inf:
         raise argparse.ArgumentTypeError(f"{text}: must be above 0, and finite")
@@ -133,32 +147,35 @@ def add_fields(
     *names: str,
     **changes: Mapping[str, Any],
 ) -> None:
-    """Add a flag for each field of a model, made from its name, type, description and default; not
-    given, it is None.
+    """Add a flag for each field of a model, from the field's name, type, description and default.
 
-    :param model: with fields as of :func:`sb3_quad.training.options.option`.
-    :param names: of the fields; all without any.
-    :param changes: by field, arguments of ``add_argument`` over those made from it.
+    A flag that is not given is None.
+
+    :param model: A model whose fields are made by :func:`sb3_quad.training.options.option`.
+    :param names: The fields; without any, all of them.
+    :param changes: Arguments of ``add_argument`` for a field, which replace those made from it.
     """
     for name in names or model.model_fields:
         field = model.model_fields[name]
         metadata: Any = field.json_schema_extra
-        default = "" if field.default is None or field.default is False else f" ({field.default})"
-        own: dict[str, Any] = {
-            "help": f"{field.description}{default}",
-            "metavar": metadata["metavar"],
-        }
+        # The alternatives of a union such as `int | None`, or the type itself.
         kinds = {field.annotation, *typing.get_args(field.annotation)}
-        if bool in kinds:
-            del own["metavar"]
-            own |= YES_OR_NO if name == "progress" else {"action": "store_true", "default": None}
+        arguments: dict[str, Any] = {"help": field.description, "metavar": metadata["metavar"]}
+        if field.default not in (None, False):
+            arguments["help"] += f" ({field.default})"
+        if name == "progress":
+            arguments |= YES_OR_NO
+        elif bool in kinds:
+            # argparse knows no metavar for a flag without a value.
+            arguments = {"help": arguments["help"], "action": "store_true", "default": None}
         elif dict[str, Any] in kinds:
-            own |= PAIRS
+            arguments |= PAIRS
+        elif float in kinds:
+            arguments["type"] = float
         elif str not in kinds:
-            own["type"] = float if float in kinds else whole
-        parser.add_argument(
-            *metadata["flags"], f"--{name.replace('_', '-')}", **{**own, **changes.get(name, {})}
-        )
+            arguments["type"] = whole
+        arguments |= changes.get(name, {})
+        parser.add_argument(*metadata["flags"], f"--{name.replace('_', '-')}", **arguments)
 
 
 def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
@@ -171,25 +188,23 @@ def add_common(parser: argparse.ArgumentParser, *names: str) -> None:
             "--executor",
             default="local",
             metavar="KIND",
-            help="local (worker processes here, default) or ray: docs/sweeps.md",
+            help="local (processes on this machine, default) or ray (docs/sweeps.md)",
         )
         add(
             "--address",
             metavar="WHERE",
-            help="Ray cluster: auto, host:port or ray://host:port (one is started without it)",
+            help="Ray cluster: auto, host:port or ray://host:port (a new one on this machine)",
         )
     if "trust" in names:
-        add(
-            "--trust",
-            action="store_true",
-            help="let zips run whatever is pickled in them, see docs/security.md",
-        )
+        trust = "let zips run code that is pickled in them; only for files you trust"
+        add("--trust", action="store_true", help=f"{trust} (docs/security.md)")
     if "overwrite" in names:
         add("--overwrite", action="store_true", help="replace existing files")
     if "progress" in names:
-        add("-P", "--progress", help="progress bar (in a terminal: yes)", **YES_OR_NO)
+        add("-P", "--progress", help="show a progress bar (yes in a terminal)", **YES_OR_NO)
 
 
 def given(options: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Those of some options that a command has and that are given."""
-    return {name: value for name in names if (value := getattr(options, name, None)) is not None}
+    """Return those of some options that the command has and that were given."""
+    values = {name: getattr(options, name, None) for name in names}
+    return {name: value for name, value in values.items() if value is not None}

@@ -30,9 +30,9 @@ from torch import nn, optim
 
 from sb3_quad.base.errors import ConfigError, MissingExtra
 from sb3_quad.base.imports import require
-from sb3_quad.base.trust import VARIABLE
+from sb3_quad.base.process import TRUST_VARIABLE
 
-WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {VARIABLE}=1)"
+WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
 Names = dict[tuple[str, str], Any]  # what stands for module and name
 
 

@@ -15,7 +15,7 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from sb3_quad.base.errors import ConfigError, SB3QuadError
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
-from sb3_quad.base.trust import trusted
+from sb3_quad.base.process import trusted
 from sb3_quad.controllers.unpickle import unpickle
 
 Algorithm = TypeVar("Algorithm", bound=BaseAlgorithm)

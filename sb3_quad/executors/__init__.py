@@ -1,42 +1,43 @@
-"""Where functions are executed: worker processes of this machine, or a Ray cluster; one small seam
-for both.
-"""
+"""Executors, which call functions in other processes: workers on this machine, or a Ray cluster."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.executors.local import LocalExecutor
 
 EXECUTORS = ("local", "ray")
-TICK = 1.0  # s between two looks for a signal
+# Time between two checks for a signal, s.
+TICK = 1.0
 Key = TypeVar("Key")
 
 if TYPE_CHECKING:
     from sb3_quad.executors.ray import RayExecutor
 
 Executor: TypeAlias = "LocalExecutor | RayExecutor"
-"""Calls functions in processes that each have one thread of PyTorch, by ``submit``.
+"""Calls functions by ``submit``, in processes that each have one thread of PyTorch.
 
-A function is given by the name of its module, so it stands at the top of one; arguments and results
-are pickled. Its future raises :class:`~sb3_quad.base.errors.WorkerDied` if the worker ended first.
+Functions are pickled by the name of their module, so they must be defined at its top level.
+Arguments and results are pickled too. A future raises
+:class:`~sb3_quad.base.errors.WorkerDied` if its worker ended first.
 """
 
 
 def start_executor(
     kind: str, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
 ) -> Executor:
-    """An executor, to be used as a context manager, at whose end all workers end at once.
+    """Return an executor to use as a context manager, at whose end all workers end at once.
 
     :param kind: ``local`` or ``ray``.
-    :param workers: calls side by side; a cluster at an ``address`` has as many as it has room for.
-    :param address: of a Ray cluster: ``auto``, ``host:port`` or ``ray://host:port``; None: one is
-        started on this machine.
-    :param num_cpus: cores that a call takes, for Ray to place it.
-    :param num_gpus: GPUs that a call takes.
-    :raises ConfigError: an unknown kind, fewer than one worker, an address that does not answer;
+    :param workers: Number of concurrent calls. A cluster at an ``address`` has as many as it has
+        room for.
+    :param address: Address of a Ray cluster: ``auto``, ``host:port`` or ``ray://host:port``. With
+        None, a cluster is started on this machine.
+    :param num_cpus: Cores that Ray reserves for a call.
+    :param num_gpus: GPUs that Ray reserves for a call.
+    :raises ConfigError: An unknown kind, fewer than one worker, or an address that does not answer.
         :class:`~sb3_quad.base.errors.MissingExtra` without Ray.
     """
     if kind not in EXECUTORS:
@@ -47,7 +48,8 @@ def start_executor(
         if address is not None:
             raise ConfigError(f"address {address}: goes with --executor ray")
         return LocalExecutor(workers)
-    from sb3_quad.executors.ray import RayExecutor  # only where it is asked for
+    # Ray is an extra.
+    from sb3_quad.executors.ray import RayExecutor
 
     return RayExecutor(workers, address, num_cpus, num_gpus)
 
@@ -58,21 +60,22 @@ def as_they_end(
     signals: StopSignals,
     report: Callable[[str], None],
 ) -> "Iterator[tuple[Key, Future[Any]]]":
-    """Calls as they end, by what they are called; after a signal the executor is stopped, and what
-    it cancelled left out.
+    """Yield the key and the future of each call when it ends.
 
-    :param calls: emptied; more may be put in on the way.
+    After a signal the executor is stopped. Calls that it cancels are not yielded.
+
+    :param calls: The key of each call. It is emptied, and you may add calls on the way.
     """
     stopped = False
     while calls:
         wait(calls, TICK, FIRST_COMPLETED)
-        for future in [
-            each for each in calls if each.done()
-        ]:  # those cancelled, too, which wait() does not see
-            key = calls.pop(future)
-            if not future.cancelled():
-                yield key, future
+        # wait() does not report cancelled calls.
+        for future in list(calls):
+            if future.done():
+                key = calls.pop(future)
+                if not future.cancelled():
+                    yield key, future
         if signals.received is not None and not stopped:
             stopped = True
-            report(f"{signals.name}: what is under way is saved and ends")
+            report(f"{signals.name}: running calls save their work and end")
             executor.stop()

@@ -14,21 +14,25 @@ from typing import Any
 import torch
 
 from sb3_quad.base.errors import WorkerDied
-from sb3_quad.base.signals import ignore_interrupts
+from sb3_quad.base.process import ignore_interrupts
+
+# Windows has no SIGKILL. Its SIGTERM ends a process at once.
+_KILL = getattr(signal, "SIGKILL", signal.SIGTERM)
 
 
 class LocalExecutor:
     """Up to ``workers`` processes, each started when it is first needed.
 
-    A thread of this process waits for each of them. Each is a pool of its own, so that one that
-    dies takes no other's call along. They end with the process that started them, also where that
-    is killed. Ctrl-C in a terminal is left to it.
+    A thread of this process waits for each worker. Each worker is a pool of its own, so that one
+    that dies does not take the calls of others with it. Workers end with the process that started
+    them, even if that is killed. They ignore Ctrl-C, which this process handles.
     """
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
         self._threads = ThreadPoolExecutor(workers)
-        self._own = threading.local()  # by thread: its pool and its process
+        # The pool and the process id of each thread's worker.
+        self._worker = threading.local()
         self._processes = set[int]()
         self._stopped = False
 
@@ -36,8 +40,9 @@ class LocalExecutor:
         return self._threads.submit(self._call, function, *arguments)
 
     def stop(self) -> None:
-        """Cancel the calls that have not begun; SIGTERM to those under way, by which a training
-        saves and ends.
+        """Cancel the calls that wait, and send SIGTERM to the running ones.
+
+        A training answers SIGTERM by saving.
         """
         self._end(signal.SIGTERM)
 
@@ -45,7 +50,7 @@ class LocalExecutor:
         return self
 
     def __exit__(self, *error: object) -> None:
-        self._end(signal.SIGKILL)
+        self._end(_KILL)
         self._threads.shutdown()
 
     def _end(self, number: int) -> None:
@@ -56,27 +61,28 @@ class LocalExecutor:
                 os.kill(process, number)
 
     def _call(self, function: Callable[..., Any], *arguments: Any) -> Any:
-        """In a thread: have its process call a function."""
-        own = self._own
+        """Call a function in the worker of the present thread."""
+        worker = self._worker
         try:
-            if not hasattr(own, "pool"):
-                own.pool = ProcessPoolExecutor(1, _context(), _begin)
-                own.process = own.pool.submit(os.getpid).result()
-                self._processes.add(own.process)
-            if self._stopped:  # before the process was known, which has had no signal then
+            if not hasattr(worker, "pool"):
+                worker.pool = ProcessPoolExecutor(1, _context(), _begin)
+                worker.process = worker.pool.submit(os.getpid).result()
+                self._processes.add(worker.process)
+            # A worker that was not known yet when the executor stopped has received no signal.
+            if self._stopped:
                 raise BrokenProcessPool
-            return own.pool.submit(function, *arguments).result()
+            return worker.pool.submit(function, *arguments).result()
         except BrokenProcessPool:
-            self._processes.discard(getattr(own, "process", 0))
-            own.__dict__.clear()
+            self._processes.discard(getattr(worker, "process", 0))
+            worker.__dict__.clear()
             raise WorkerDied("its worker process ended unexpectedly (out of memory?)") from None
 
 
 def _context() -> Any:
-    """How workers start: forked from a process that has imported what takes seconds and does
-    nothing else; else anew.
+    """Return how workers start: on Linux forked from a server that has imported what takes seconds,
+    elsewhere as new processes.
     """
-    if sys.platform != "linux":
+    if sys.platform != "linux" or not hasattr(os, "fork"):
         return multiprocessing.get_context("spawn")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["torch", "stable_baselines3", "numba"])
@@ -84,13 +90,13 @@ def _context() -> Any:
 
 
 def _begin() -> None:
-    ignore_interrupts()  # the process that started the workers ends them
+    ignore_interrupts()
     threading.Thread(target=_end_with_starter, daemon=True).start()
     torch.set_num_threads(1)
 
 
 def _end_with_starter() -> None:
-    """End this worker as soon as the process that it works for has ended, also by being killed."""
+    """End this worker as soon as the process that started it has ended, even by being killed."""
     starter = multiprocessing.parent_process()
     assert starter is not None
     starter.join()

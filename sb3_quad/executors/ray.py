@@ -1,4 +1,4 @@
-"""Calls on a Ray cluster: placement, retries and the package's code on its nodes are Ray's."""
+"""Calls on a Ray cluster. Ray places them, retries them, and copies this package to its nodes."""
 
 import os
 import platform
@@ -14,78 +14,90 @@ from typing import Any
 import torch
 
 from sb3_quad.base.errors import ConfigError, WorkerDied
+from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
-from sb3_quad.base.trust import VARIABLE, trusted
+from sb3_quad.base.process import TRUST_VARIABLE, trusted
 
-RETRIES = 3  # of a call whose node or worker process dies
+# Times that Ray repeats a call whose node or worker process dies.
+RETRIES = 3
 
 
 class RayExecutor:
-    """Calls on a cluster at an address, or on one that is started here for as long as this executor
-    lives.
+    """Calls on a cluster at an address, or on one that runs here for as long as this executor.
 
-    A call whose worker or node dies is begun again on another, by Ray, up to ``RETRIES`` times.
-    Workers of a cluster at an address get this package from here (``runtime_env``); what it depends
-    on is installed there. They work in this process's folder, so all machines need a disk that they
-    share.
+    If the worker or the node of a call dies, Ray starts the call again on another one, up to
+    ``RETRIES`` times. Workers of a cluster at an address get this package from here
+    (``runtime_env``); its dependencies must be installed there. Workers use the working directory
+    of this process, so all machines need a shared disk.
 
-    :raises ConfigError: an address at which no cluster answers.
+    :raises ConfigError: No cluster answers at the address.
     """
 
     def __init__(
         self, workers: int, address: str | None = None, num_cpus: float = 1, num_gpus: float = 0
     ) -> None:
-        ray = self._ray = require("ray", "ray", "--executor ray")
-        self._needs = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
+        self._ray = require("ray", "ray", "--executor ray")
+        self._options = {"num_cpus": num_cpus, "num_gpus": num_gpus, "max_retries": RETRIES}
         self._references = list[Any]()
-        variables = {
-            "PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path)),
-            **({VARIABLE: "1"} if trusted() else {}),
-        }
-        environment: dict[str, Any] = {"env_vars": variables}
-        options: dict[str, Any] = {
-            "log_to_driver": False,
-            "logging_level": "ERROR",
-            "runtime_env": environment,
-        }
         try:
             if address is None:
-                os.environ.setdefault(
-                    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0"
-                )  # Ray's warning about it is none of ours
-                os.environ.setdefault(
-                    "RAY_worker_niceness", "0"
-                )  # Ray's 15 leaves them nothing beside other work
-                ray.init(
-                    address="local", num_cpus=workers * num_cpus, include_dashboard=False, **options
-                )
+                self._start(workers * num_cpus)
             else:
-                _check_address(address)
-                with tempfile.TemporaryDirectory() as folder:  # which Ray uploads
-                    environment["py_modules"] = [str(_copy_package(Path(folder)))]
-                    ray.init(address=address, **options)
-            total = ray.cluster_resources()
+                self._connect(address)
+            total = self._ray.cluster_resources()
         except ConfigError:
             raise
-        except Exception as error:  # Ray raises what it likes
-            reason = " ".join(str(error).split())[:200]
+        except Exception as error:
+            # Ray raises exceptions of many kinds.
             raise ConfigError(
-                f"Ray cluster {address or 'on this machine'}: cannot be used ({reason})"
+                f"Ray cluster {address or 'on this machine'}: cannot be used ({one_line(error)})"
             ) from None
-        self.workers = max(1, int(total.get("CPU", 0) // num_cpus) if num_cpus else workers)
+        self.workers = workers
+        if num_cpus:
+            self.workers = max(1, int(total.get("CPU", 0) // num_cpus))
+
+    def _start(self, num_cpus: float) -> None:
+        """Start a cluster on this machine."""
+        # Ray warns about a variable that this package does not use.
+        os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+        # With Ray's niceness of 15, workers get no time next to other work.
+        os.environ.setdefault("RAY_worker_niceness", "0")
+        self._init("local", num_cpus=num_cpus, include_dashboard=False)
+
+    def _connect(self, address: str) -> None:
+        """Connect to a running cluster."""
+        _check_address(address)
+        # Ray uploads the package during init.
+        with tempfile.TemporaryDirectory() as folder:
+            self._init(address, py_modules=[str(_copy_package(Path(folder)))])
+
+    def _init(self, address: str, py_modules: list[str] | None = None, **options: Any) -> None:
+        variables = {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
+        if trusted():
+            variables[TRUST_VARIABLE] = "1"
+        environment: dict[str, Any] = {"env_vars": variables}
+        if py_modules is not None:
+            environment["py_modules"] = py_modules
+        self._ray.init(
+            address=address,
+            log_to_driver=False,
+            logging_level="ERROR",
+            runtime_env=environment,
+            **options,
+        )
 
     def submit(self, function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        call = self._ray.remote(_call).options(
-            name=getattr(function, "__name__", "call"), **self._needs
-        )
-        reference, future = call.remote(sys.argv, os.getcwd(), function, *arguments), Future[Any]()
+        name = getattr(function, "__name__", "call")
+        call = self._ray.remote(_call).options(name=name, **self._options)
+        reference = call.remote(sys.argv, os.getcwd(), function, *arguments)
         self._references.append(reference)
+        future = Future[Any]()
         reference.future().add_done_callback(lambda done: self._hand_over(done, future))
         return future
 
     def stop(self) -> None:
-        """Cancel all calls; those under way are interrupted as by Ctrl-C, by which a training saves
-        and ends.
+        """Cancel all calls. Running ones are interrupted as by Ctrl-C, which a training answers by
+        saving.
         """
         for reference in self._references:
             self._ray.cancel(reference)
@@ -100,40 +112,42 @@ class RayExecutor:
         self._ray.shutdown()
 
     def _hand_over(self, done: "Future[Any]", future: "Future[Any]") -> None:
-        """Give a future the outcome that Ray's has, with an error that is not of Ray's kinds."""
+        """Give a future the outcome of Ray's, with an error that is not one of Ray's classes."""
         error = done.exception()
         if error is None:
             future.set_result(done.result())
         elif isinstance(error, self._ray.exceptions.RayTaskError):
             future.set_exception(error.cause)
         else:
-            reason = " ".join(str(error).split())[:120]
-            future.set_exception(
-                WorkerDied(
-                    f"its worker on the cluster ended, and {RETRIES} more after it ({reason})"
-                )
-            )
+            ending = f"and {RETRIES} more after it ({one_line(error)[:120]})"
+            future.set_exception(WorkerDied(f"its worker on the cluster ended, {ending}"))
 
 
 def _check_address(address: str) -> None:
-    """See that somebody answers at an address, since Ray itself would wait for minutes, and then
-    end the process.
+    """Check that something answers at an address. Ray itself waits for minutes and then ends the
+    process.
+
+    :raises ConfigError: Nothing answers, or the address has another form.
     """
-    if address == "auto":  # Ray looks for one on this machine, and says at once that there is none
+    # Ray searches this machine for a cluster, and raises at once if it finds nothing.
+    if address == "auto":
         return
     host, _, port = address.removeprefix("ray://").rpartition(":")
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=4.0).close()
     except (ValueError, OSError, OverflowError):
-        way_out = "must be auto, host:port or ray://host:port; start one with: ray start --head --port 6379"
-        raise ConfigError(f"address {address}: no Ray cluster answers; {way_out}") from None
+        raise ConfigError(
+            f"address {address}: no Ray cluster answers; must be auto, host:port or "
+            "ray://host:port; start one with: ray start --head --port 6379"
+        ) from None
 
 
 def _copy_package(folder: Path) -> Path:
-    """This package as a wheel lays it out, so that nodes find a checkout's ``envs/`` and its like
-    inside of it.
+    """Copy this package into a folder as a wheel lays it out, with a checkout's ``envs/``,
+    ``callbacks/`` and ``zoo_configs/`` inside.
     """
-    package, target = Path(__file__).resolve().parents[1], folder / "sb3_quad"
+    package = Path(__file__).resolve().parents[1]
+    target = folder / "sb3_quad"
     ignored = shutil.ignore_patterns("*.pyc")
     shutil.copytree(package, target, ignore=ignored)
     for name in ("envs", "callbacks", "zoo_configs"):
@@ -143,12 +157,13 @@ def _copy_package(folder: Path) -> Path:
 
 
 def _call(argv: list[str], folder: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """On a worker: as in the process that asks, in its folder and with its command line, which runs
-    note.
+    """Call a function on a worker, in the folder and with the command line of the caller.
+
+    Runs record both.
     """
     if not Path(folder).is_dir():
         raise ConfigError(
-            f"{folder}: not seen by {platform.node()}; a Ray cluster needs a disk that all share"
+            f"{folder}: not seen by {platform.node()}; a Ray cluster needs a shared disk"
         )
     os.chdir(folder)
     sys.argv = argv

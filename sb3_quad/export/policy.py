@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError, unknown
-from sb3_quad.base.version import __version__
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model, saved_algorithm
 from sb3_quad.export import load

@@ -4,6 +4,7 @@ which numba lacks.
 
 import functools
 import hashlib
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from numba import types
 from numba.core import event
 from numba.extending import intrinsic
 
-from sb3_quad.base.notices import tell
+from sb3_quad.base.process import print_once
 
 # Rows of a block; a multiple of every vector width, small enough for a block to stay in the first
 # cache
@@ -37,7 +38,7 @@ def compiled(function: Callable[..., Any] | None = None, **options: Any) -> Any:
     except (
         RuntimeError
     ):  # neither the package's folder nor the user's folder for caches can be written
-        tell(
+        print_once(
             "compiled code cannot be kept and is made at every start, in about 15 s; set NUMBA_CACHE_DIR to a folder"
         )
     else:
@@ -57,7 +58,7 @@ def _source_stamp() -> str:
 
 class _Notice(event.Listener):
     def on_start(self, event: event.Event) -> None:
-        tell("compiling the simulation, once; it is kept for later runs (about 15 s)")
+        print_once("compiling the simulation, once; it is kept for later runs (about 15 s)")
 
     def on_end(self, event: event.Event) -> None:
         pass
@@ -79,5 +80,7 @@ def atomic_add(typing_context: Any, array: Any, index: Any, value: Any) -> Any:
     return types.int64(array, types.int64, types.int64), codegen
 
 
-give_way = types.ExternalFunction("sched_yield", types.int32())
+# The operating system's function that ends a thread's turn.
+_YIELD = "SwitchToThread" if sys.platform == "win32" else "sched_yield"
+give_way = types.ExternalFunction(_YIELD, types.int32())
 """Let another thread have this core; found by its name wherever the code was compiled."""

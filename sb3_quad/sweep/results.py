@@ -18,10 +18,10 @@ from typing import Any
 
 import numpy as np
 
+from sb3_quad.base import __version__
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import write_csv, write_text
-from sb3_quad.base.version import __version__
 from sb3_quad.evaluation.learning_curves import Curve, read_curve
 from sb3_quad.evaluation.statistics import RESAMPLES, Estimate
 from sb3_quad.evaluation.tables import Cell, Column, Row, Table

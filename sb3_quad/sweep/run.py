@@ -13,12 +13,11 @@ import numpy as np
 import yaml
 from stable_baselines3.common.evaluation import evaluate_policy
 
-from sb3_quad.base.cores import use_cpus
 from sb3_quad.base.errors import ConfigError, SB3QuadError, WorkerDied
 from sb3_quad.base.files import one_line, write_text
 from sb3_quad.base.imports import import_packages
+from sb3_quad.base.process import StopSignals, use_cpus
 from sb3_quad.base.seeds import row_seeds, seed_for
-from sb3_quad.base.signals import StopSignals
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec
 from sb3_quad.evaluation.evaluate import fly_scenario

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 
 import sb3_quad  # noqa: F401  (registers the environments, also in a worker process)
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
-from sb3_quad.base.signals import ignore_interrupts
+from sb3_quad.base.process import ignore_interrupts
 from sb3_quad.envs.vec_env import QuadcopterVecEnv, RowSeeds
 from sb3_quad.simulation.settings import ENDLESS
 from sb3_quad.training.config import TrainingConfig

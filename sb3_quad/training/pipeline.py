@@ -27,8 +27,8 @@ from sb3_quad.algorithms.offset_correction import correct_hover, correct_offset
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked, save_model, write_text
 from sb3_quad.base.literals import parse_mapping
+from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import LARGEST, seed_for
-from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.controllers.zips import load_zip
 from sb3_quad.evaluation.learning_curves import read_curve

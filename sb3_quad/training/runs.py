@@ -11,9 +11,9 @@ import stable_baselines3
 import torch
 import yaml
 
+from sb3_quad.base import __version__
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import make_folder, write_text
-from sb3_quad.base.version import __version__
 from sb3_quad.base.yaml_files import read_yaml
 from sb3_quad.controllers.pretrained import BEST, CORRECTED, run_agent
 from sb3_quad.controllers.zips import saved_data

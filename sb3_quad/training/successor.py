@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from sb3_quad.base.notices import tell
+from sb3_quad.base.process import print_once
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import unlike_trained
@@ -24,7 +24,7 @@ def as_agent(path: str | Path, config: TrainingConfig, changes: dict[str, Any]) 
     if source is None or config.task is None:
         return changes
     if notice := unlike_trained(str(path), own, first_vehicle(config.flight_settings.vehicle)):
-        tell(f"warning: {notice}; --env-kwargs vehicle:… says which")
+        print_once(f"warning: {notice}; --env-kwargs vehicle:… says which")
     seen = {
         name: own.observed[name]
         for name in ("last_action", "history", "observation_mean", "observation_std")

@@ -24,8 +24,8 @@ from stable_baselines3.common.vec_env import VecEnv
 from sb3_quad.algorithms.transfer import transfer_policy
 from sb3_quad.base.errors import ConfigError, SB3QuadError, TrainingError
 from sb3_quad.base.files import locked, make_folder, one_line, save_model, write_bytes
+from sb3_quad.base.process import StopSignals
 from sb3_quad.base.seeds import seed_for
-from sb3_quad.base.signals import StopSignals
 from sb3_quad.base.validate import validate
 from sb3_quad.callbacks.best_model import BestModel
 from sb3_quad.callbacks.episodes import EpisodeLog

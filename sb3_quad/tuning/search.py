@@ -24,6 +24,7 @@ from optuna.trial import FrozenTrial, TrialState
 from sb3_quad.base.errors import ConfigError, TrainingError, unknown
 from sb3_quad.base.files import one_line
 from sb3_quad.base.imports import require
+from sb3_quad.base.process import has_ended
 from sb3_quad.training.config import build_config
 from sb3_quad.training.job import TrainingJob
 from sb3_quad.training.trainer import train
@@ -293,14 +294,9 @@ def retry_dead_trials(study: optuna.Study) -> None:
     """Have the trials tried again whose process on this machine is gone."""
     for trial in study.get_trials(deepcopy=False, states=[TrialState.RUNNING]):
         machine, process = trial.user_attrs.get(OWNER, ["", 0])
-        if machine == platform.node():
-            try:
-                os.kill(process, 0)  # does nothing but fail where there is none
-            except ProcessLookupError:
-                study.tell(trial.number, state=TrialState.FAIL)
-                study.enqueue_trial(trial.params, AGAIN)
-            except PermissionError:  # another user's
-                pass
+        if machine == platform.node() and has_ended(process):
+            study.tell(trial.number, state=TrialState.FAIL)
+            study.enqueue_trial(trial.params, AGAIN)
 
 
 def score(success: float, reward: float, n_episodes: int) -> float:

@@ -12,7 +12,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import CannotHover, ConfigError
-from sb3_quad.base.notices import tell
+from sb3_quad.base.process import print_once
 from sb3_quad.base.validate import Frozen, validate
 from sb3_quad.base.yaml_files import YamlFolder
 from sb3_quad.vehicles.gains import GeometricGains
@@ -409,7 +409,7 @@ def load_vehicle(source: str | Path | Vehicle) -> Vehicle:
     data, where = VEHICLES.read(source if isinstance(source, Path) else str(source))
     vehicle = validate(Vehicle, data, where)
     if vehicle.inertia_fault and VEHICLES.is_path(source):
-        tell(
+        print_once(
             f"warning: {where}: inertia {list(vehicle.inertia)}: {vehicle.inertia_fault}; it is flown as it is"
         )
     return vehicle

@@ -112,7 +112,8 @@ BASES = {
     "report": "no_results",
     "sweep": "sweep.yaml --dry-run",
     "train": "--algo dagger --conf-file settings.yml --eval-episodes 0 --no-progress -f logs",
-    "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 --n-evaluations 1",
+    "tune": "--algo dagger --conf-file settings.yml -n 20 --n-trials 1 --eval-episodes 1 "
+    "--n-evaluations 1",
 }
 Case = tuple[str, list[str], dict[str, str]]  # what it is, a command, files
 
@@ -189,15 +190,14 @@ def attempt(case: Case, folder: Path) -> str:
         f"exit code {code}": code not in (0, 1, 2),
         "no line says why": code == 2 and not last.startswith("error: "),
         "a traceback": "Traceback (most recent call last)" in text,
-        "unforeseen": "python -X dev" in text,
+        "unforeseen": "add --traceback" in text,
         f"{usage.ru_maxrss / 2**20:.1f} GB": usage.ru_maxrss * 1024 > MEMORY,
         f"{time.monotonic() - start:.0f} s": time.monotonic() - start > SECONDS,
         "something outside": len(list(folder.iterdir())) > 2,
         "foreign code": (place / "escaped").exists(),
     }
-    return ", ".join(name for name, is_so in strange.items() if is_so) and (
-        f"{what}: {', '.join(name for name, is_so in strange.items() if is_so)}: {command} {last[-300:]}"
-    )
+    wrong = ", ".join(name for name, is_so in strange.items() if is_so)
+    return wrong and f"{what}: {wrong}: {command} {last[-300:]}"
 
 
 def campaign(folder: Path, count: int | None, seed: int) -> int:

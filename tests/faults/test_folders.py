@@ -108,7 +108,11 @@ def test_the_trial_of_a_search_that_was_killed_is_tried_again(tmp_path, monkeypa
     assert trials[2]["gamma"] == trials[1]["gamma"] != trials[0]["gamma"]
 
 
-SUITE = "name: one\nsource: paper\nscenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]\n"
+SUITE = """
+name: one
+source: paper
+scenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]
+"""
 codes = []
 
 

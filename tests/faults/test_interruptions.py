@@ -14,7 +14,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from sb3_quad.algorithms.dagger import DAgger
 from sb3_quad.base.errors import ConfigError, TrainingError
 from sb3_quad.base.files import locked
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.cli import main
 from sb3_quad.training import snapshots
 from sb3_quad.training.config import build_config

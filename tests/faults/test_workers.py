@@ -18,7 +18,11 @@ from sb3_quad.cli import main
 from sb3_quad.evaluation.results import load_results
 
 ROOT = Path(__file__).parents[2]
-SUITE = "name: one\nsource: paper\nscenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]\n"
+SUITE = """
+name: one
+source: paper
+scenarios: [{name: near, target: {distance: 1}, duration: 2, episodes: 2}]
+"""
 
 
 class KillLastWorker(BaseCallback):
@@ -39,7 +43,8 @@ class KillLastWorker(BaseCallback):
 @pytest.mark.timeout(100)
 def test_a_training_whose_worker_dies_ends_saves_and_leaves_none_behind(tmp_path, capsys):
     (tmp_path / "settings.yml").write_text(
-        "Pendulum-v1: {n_steps: 10, batch_size: 30, n_envs: 3, callback: test_workers.KillLastWorker}"
+        "Pendulum-v1: {n_steps: 10, batch_size: 30, n_envs: 3, "
+        "callback: test_workers.KillLastWorker}"
     )
     command = [
         "train",
@@ -102,7 +107,8 @@ class DropsInfo(gymnasium.Wrapper):
 @pytest.mark.timeout(100)
 def test_evaluations_that_would_never_end_say_why(tmp_path, capsys):
     (tmp_path / "settings.yml").write_text(
-        "Pendulum-v1: {n_steps: 10, batch_size: 10, vec_env: dummy, env_wrapper: test_workers.DropsInfo}"
+        "Pendulum-v1: {n_steps: 10, batch_size: 10, vec_env: dummy, "
+        "env_wrapper: test_workers.DropsInfo}"
     )
     command = [
         "train",

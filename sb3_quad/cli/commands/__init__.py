@@ -1,1 +1,1 @@
-"""What each command does, a module each; what is heavy is imported when it runs."""
+"""One module per command. Modules import what takes seconds only when they run."""

@@ -1,30 +1,32 @@
-"""Measure control steps per second: PyBullet, SB3's vectorised environments, the batch, and
-training loops.
+"""Measure control steps per second of environments and training loops.
+
+The environments are PyBullet's, alone and vectorised, and the compiled batch.
 
 examples:
-  sb3-quad benchmark                                   everything, about a minute
-  sb3-quad benchmark --sizes 240 4096 --no-training    the batch at two sizes, and PyBullet
-  sb3-quad benchmark --training                        rollouts and updates of trainings
+  # everything, about a minute
+  sb3-quad benchmark
+  # the batch at two sizes, and PyBullet
+  sb3-quad benchmark --sizes 240 4096 --no-training
+  # rollouts and updates of training loops only
+  sb3-quad benchmark --training
   sb3-quad benchmark --algo ppo_bc --conf-file robust/ppo_bc.yml
 """
 
 import argparse
 import itertools
 import time
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
-from functools import partial
 from timeit import Timer
 from typing import Any
 
 from sb3_quad.cli.parser import YES_OR_NO, Parser, above_zero, positive
 
 ENV_ID = "QuadTargetTracking-v0"
-TRAINED = "QuadStateRecovery-v0"  # in the training loops
+# The environment of the training loops.
+TRAINED = "QuadStateRecovery-v0"
 REPETITIONS = 5
-Rates = dict[
-    str, list[float]
-]  # control steps per second of each repetition, all environments together
+# What is measured, its rows, and control steps per second of all rows in each repetition.
+Measurement = tuple[str, int, list[float]]
 
 
 def add_arguments(parser: Parser) -> None:
@@ -34,14 +36,12 @@ def add_arguments(parser: Parser) -> None:
         nargs="+",
         type=positive,
         default=[64, 240, 1024, 4096, 16384],
-        metavar="N",
-        help="rows of the batch",
+        help="numbers of rows of the batch (64 240 1024 4096 16384)",
     )
     add(
         "--n-envs",
         type=positive,
         default=8,
-        metavar="N",
         help="environments of DummyVecEnv and SubprocVecEnv (8)",
     )
     add(
@@ -57,109 +57,103 @@ def add_arguments(parser: Parser) -> None:
         default=["dagger", "ppo_bc"],
         help="algorithms of the training loops (dagger ppo_bc)",
     )
-    add("-conf", "--conf-file", metavar="FILE", help="its settings (ALGO.yml)")
-    add("--training", help="only, or no, training loops: their rollouts and updates", **YES_OR_NO)
+    add("-conf", "--conf-file", metavar="FILE", help="settings of the training loops (ALGO.yml)")
+    add("--training", help="measure only, or no, training loops (both)", **YES_OR_NO)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Measure one way after another, print. Returns the exit code."""
+    """Measure and print. Returns the exit code."""
     import numpy as np
 
     from sb3_quad.cli.output import console
     from sb3_quad.evaluation.tables import text_table
     from sb3_quad.training.config import load_config
 
-    screen, found = console(), list[tuple[str, int, list[float]]]()
-    loops = (
-        []
-        if options.training is False
-        else [load_config(algo, TRAINED, options.conf_file) for algo in options.algo]
-    )
+    configs = []
+    if options.training is not False:
+        configs = [load_config(algo, TRAINED, options.conf_file) for algo in options.algo]
+    measurements: list[Measurement] = []
+    screen = console()
     with screen.status("measuring"):
         if options.training is not True:
-            for n_envs, rates in _steps(options.sizes, options.n_envs, options.seconds):
-                found += [(name, n_envs, each) for name, each in rates.items()]
-        for config in loops:
-            found += [
-                (f"{config.algo}, {part}", config.n_envs, each)
-                for part, each in _loop(config).items()
-            ]
-    median = [float(np.median(each)) for _, _, each in found]
-    texts = [(f"{rate:,.0f}", f"{rate / median[0]:,.1f} x") for rate in median]
-    rows = [(name, f"{n:,}", *text) for (name, n, _), text in zip(found, texts, strict=True)]
-    screen.print(
-        text_table(
-            "control steps per second (median of 5)",
-            ("", "rows", "steps/s", "to the first line"),
-            rows,
-        )
-    )
+            measurements += _measure_steps(options.sizes, options.n_envs, options.seconds)
+        for config in configs:
+            measurements += _measure_loop(config)
+    reference = np.median(measurements[0][2])
+    lines = []
+    for name, rows, rates in measurements:
+        rate = np.median(rates)
+        lines.append((name, f"{rows:,}", f"{rate:,.0f}", f"{rate / reference:,.1f} x"))
+    title = f"control steps per second (median of {REPETITIONS})"
+    screen.print(text_table(title, ("", "rows", "steps/s", "to the first line"), lines))
     return 0
 
 
-def _steps(sizes: list[int], n_envs: int, seconds: float) -> Iterator[tuple[int, Rates]]:
-    """Environments with random actions: physics, noise, reward, resets, infos. By their number, the
-    rates of each kind.
+def _measure_steps(sizes: list[int], n_envs: int, seconds: float) -> list[Measurement]:
+    """Step environments with random actions, including noise, rewards, resets and infos.
+
+    They take turns, since the speed of a shared machine changes by the second.
+
+    :param seconds: Duration for each environment, s.
     """
+    with ExitStack() as stack:
+        measurements: list[Measurement] = []
+        steps = []
+        for name, rows, env in _environments(stack, sizes, n_envs):
+            timer = _timer(env, rows)
+            # Compiles, and fills caches.
+            timer.timeit(3)
+            count, elapsed = timer.autorange()
+            steps.append((timer, max(1, round(count * seconds / REPETITIONS / elapsed))))
+            measurements.append((name, rows, []))
+        for _ in range(REPETITIONS):
+            for (_, rows, rates), (timer, count) in zip(measurements, steps, strict=True):
+                rates.append(rows * count / timer.timeit(count))
+    return measurements
+
+
+def _environments(stack: ExitStack, sizes: list[int], n_envs: int) -> list[tuple[str, int, Any]]:
+    """Return name, rows and environment of each measurement. ``stack`` closes them."""
     import gymnasium
     from gymnasium.wrappers import Autoreset
 
     from sb3_quad.training.config import build_config, load_config
     from sb3_quad.training.environments import make_environments
 
-    def vectorised(kind: str, n: int, **keywords: Any) -> Any:
-        settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": keywords}
-        return closing(make_environments(build_config("ppo", ENV_ID, settings), n, 0))
+    environments: list[tuple[str, int, Any]] = []
 
-    randomize = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
-    with closing(Autoreset(gymnasium.make(ENV_ID))) as env:
-        env.reset(seed=0)
-        yield 1, _rates({"PyBullet, one environment": env}, (4,), seconds)
-    for kind, name in (("dummy", "DummyVecEnv"), ("subproc", "SubprocVecEnv")):
-        with vectorised(kind, n_envs) as env:
-            env.reset()
-            yield n_envs, _rates({f"PyBullet, {name}": env}, (n_envs, 4), seconds)
+    def add(name: str, kind: str, rows: int, **env_kwargs: Any) -> None:
+        settings = {"n_timesteps": 1, "vec_env": kind, "env_kwargs": env_kwargs}
+        env = make_environments(build_config("ppo", ENV_ID, settings), rows, 0)
+        environments.append((name, rows, stack.enter_context(closing(env))))
+
+    single = stack.enter_context(closing(Autoreset(gymnasium.make(ENV_ID))))
+    environments.append(("PyBullet, one environment", 1, single))
+    add("PyBullet, DummyVecEnv", "dummy", n_envs)
+    add("PyBullet, SubprocVecEnv", "subproc", n_envs)
+    robust = load_config("dagger", TRAINED, "robust/dagger.yml").env_kwargs["randomize"]
     for size in sizes:
-        with ExitStack() as stack:
-            still, random = (
-                stack.enter_context(vectorised("batch", size, randomize=each))
-                for each in (None, randomize)
-            )
-            for env in (still, random):
-                env.reset()
-            yield size, _rates({"batch": still, "batch, random worlds": random}, (size, 4), seconds)
+        add("batch", "batch", size)
+        add("batch, domain randomization", "batch", size, randomize=robust)
+    for _, _, env in environments:
+        env.reset()
+    return environments
 
 
-def _rates(envs: dict[str, Any], shape: tuple[int, ...], seconds: float) -> Rates:
-    """Each environment for so many seconds; they take turns, since the speed of a shared machine
-    changes by the second.
-    """
+def _timer(env: Any, rows: int) -> Timer:
+    """Return a timer of one step with random actions."""
     import numpy as np
 
-    actions = itertools.cycle(
-        np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32)
-    )
-    timers = {
-        name: Timer(partial(lambda step: step(next(actions)), env.step))
-        for name, env in envs.items()
-    }
-    counts = {}
-    for name, timer in timers.items():
-        timer.timeit(3)  # compiles, fills caches
-        count, elapsed = timer.autorange()
-        counts[name] = max(1, round(count * seconds / REPETITIONS / elapsed))
-    found: Rates = {name: [] for name in envs}
-    for _ in range(REPETITIONS):
-        for name, timer in timers.items():
-            found[name].append(
-                counts[name] * int(np.prod(shape)) / shape[-1] / timer.timeit(counts[name])
-            )
-    return found
+    # One environment takes an action (4,), all others (rows, 4).
+    shape = env.action_space.shape if rows == 1 else (rows, 4)
+    actions = np.random.default_rng(0).uniform(-1, 1, (16, *shape)).astype(np.float32)
+    endless = itertools.cycle(actions)
+    return Timer(lambda: env.step(next(endless)))
 
 
-def _loop(config: Any) -> Rates:
-    """A whole training loop with the settings' own sizes; the first rollout and update, which
-    compile, are left out.
+def _measure_loop(config: Any) -> list[Measurement]:
+    """Train with the sizes of the settings. The first rollout and update, which compile, do not
+    count.
     """
     import numpy as np
     from stable_baselines3.common.callbacks import BaseCallback
@@ -170,7 +164,7 @@ def _loop(config: Any) -> Rates:
     from sb3_quad.training.trainer import build_model
 
     class Clock(BaseCallback):
-        """When rollouts begin and end; an update lies between two of them."""
+        """Notes when rollouts begin and end. An update lies between two of them."""
 
         def _note(self) -> None:
             times.append(time.perf_counter())
@@ -182,14 +176,17 @@ def _loop(config: Any) -> Rates:
 
     if config.is_off_policy:
         raise ConfigError(
-            f"{config.algo}: only loops of on-policy algorithms are measured, in rollouts and updates"
+            f"{config.algo}: only loops of on-policy algorithms are measured, "
+            "in rollouts and updates"
         )
     times: list[float] = []
+    steps = config.rollout_steps * config.n_envs
     with closing(make_environments(config, config.n_envs, 0)) as env:
-        steps = config.rollout_steps * config.n_envs
-        build_model(TrainingJob(config=config), env).learn(
-            steps * (REPETITIONS + 1), callback=Clock()
-        )
+        model = build_model(TrainingJob(config=config), env)
+        model.learn(steps * (REPETITIONS + 1), callback=Clock())
     rollout, update = np.diff(times).reshape(-1, 2)[1:].T
-    parts = {"whole loop": rollout + update, "rollout": rollout, "update": update}
-    return {name: (steps / each).tolist() for name, each in parts.items()}
+    seconds = {"whole loop": rollout + update, "rollout": rollout, "update": update}
+    return [
+        (f"{config.algo}, {part}", config.n_envs, (steps / durations).tolist())
+        for part, durations in seconds.items()
+    ]

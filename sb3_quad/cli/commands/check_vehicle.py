@@ -1,18 +1,23 @@
-"""Check whether a vehicle can hover, how much authority it has, and how well the experts fly it.
+"""Check whether a vehicle can hover, and how well the experts fly it.
+
+It also prints the vehicle's thrusts, accelerations and time constants.
 
 examples:
-  sb3-quad check-vehicle my.yaml            your own vehicle
-  sb3-quad check-vehicle crazyflie          one that comes with the package, such as itm or x500
-  sb3-quad check-vehicle my.yaml -n 0       from its parameters alone, without flying
+  # your own vehicle
+  sb3-quad check-vehicle my.yaml
+  # one that comes with the package, such as itm or x500
+  sb3-quad check-vehicle crazyflie
+  # from the parameters alone, without flying
+  sb3-quad check-vehicle my.yaml -n 0
 
-Exit code 1: the rotors cannot produce hover thrust. The contents of a vehicle file:
-docs/vehicles.md
+Exit code 1: the rotors cannot produce hover thrust. For the contents of a
+vehicle file, see docs/vehicles.md.
 """
 
 import argparse
 import math
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sb3_quad.base.errors import CannotHover
 from sb3_quad.cli.parser import Parser, natural
@@ -20,9 +25,12 @@ from sb3_quad.cli.parser import Parser, natural
 if TYPE_CHECKING:
     from sb3_quad.vehicles.vehicle import Vehicle
 
-SLIM_THRUST = 1.2  # thrust-to-weight ratio below which little is left to turn and brake with
-FASTEST_HOVER = 10_000.0  # rad/s, some 95,000 rpm; above it a unit must be wrong
-RPM = 60.0 / (2.0 * math.pi)  # rpm per rad/s
+# Below this thrust-to-weight ratio, little is left to turn and brake with.
+SLIM_THRUST = 1.2
+# Rotor speed, rad/s, some 95,000 rpm. Above it a unit must be wrong.
+FASTEST_HOVER = 10_000.0
+# rpm per rad/s.
+RPM = 60.0 / (2.0 * math.pi)
 
 
 def add_arguments(parser: Parser) -> None:
@@ -33,19 +41,18 @@ def add_arguments(parser: Parser) -> None:
         "--episodes",
         type=natural,
         default=480,
-        metavar="N",
-        help="episodes of each task, per expert, true state (480)",
+        help="episodes of each task and expert, with the true state (480)",
     )
     add(
         "--seed",
         type=natural,
         default=0,
-        help="seed of the episodes, which no search or training has seen (0)",
+        help="seed of the episodes, which no search or training uses (0)",
     )
 
 
 def run(options: argparse.Namespace) -> int:
-    """Check, fly, print. Returns the exit code: 1 if it cannot hover."""
+    """Check, fly, print. Returns the exit code: 1 if the vehicle cannot hover."""
     from sb3_quad.base.seeds import seed_for
     from sb3_quad.cli.closing import print_tables
     from sb3_quad.cli.output import console
@@ -64,40 +71,39 @@ def run(options: argparse.Namespace) -> int:
     for warning in warnings(vehicle):
         print(f"unusual: {warning}")
     if options.episodes:
-        gains = "derived from the parameters" if vehicle.geometric_gains is None else "of its file"
+        derived = vehicle.geometric_gains is None
+        gains = "derived from the parameters" if derived else "of its file"
         controllers = {
             "PID": PIDExpert(vehicle),
             f"geometric, gains {gains}": GeometricExpert(vehicle),
         }
         true_state = {"vehicle": vehicle, "noise": 0.0}
         print_tables(controllers, true_state, options.episodes, seed_for("expert", options.seed))
-        if vehicle.geometric_gains is None:
+        if derived:
             print(
-                f"to search for gains, which are mostly better: python examples/tune_expert.py {options.vehicle}"
+                "to search for gains, which are mostly better: "
+                f"python examples/tune_expert.py {options.vehicle}"
             )
     return 0
 
 
 def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
-    """What it weighs, lifts and how soon it answers."""
+    """Return the lines of the table: names and values."""
+    return [
+        *_thrust(vehicle),
+        *_acceleration(vehicle),
+        *_inertia(vehicle),
+        ("motors", _motors(vehicle)),
+    ]
+
+
+def _thrust(vehicle: "Vehicle") -> list[tuple[str, str]]:
     low, high = vehicle.thrust_range
     slow, fast = vehicle.rotor_speed_range
     hover = vehicle.hover_rotor_speed
-    action = f"{vehicle.hover_action:+.3f}" if abs(vehicle.hover_action) > 5e-4 else "0"
-    ixx, iyy, izz = vehicle.inertia
-    physical = "unphysical" if vehicle.inertia_fault else "physical"
-    share = (
-        f"{physical}: the largest moment is {vehicle.largest_moment:.2f} of the other two together"
-    )
-    ratios = ", ".join(f"{ratio:.2f}" for ratio in vehicle.gyration_ratios)
     least, most = vehicle.thrust_limits
-    up, down, sideways = (
-        vehicle.gravity * share for share in (most - 1.0, 1.0 - least, math.sqrt(most**2 - 1.0))
-    )
-    moments = vehicle.greatest_moments
-    turns = ", ".join(f"{each:.1f}" for each in moments / vehicle.inertia)
-    faster, slower = 1000.0 / vehicle.motor_gain_up, 1000.0 / vehicle.motor_gain_down
-    times = f"{faster:.1f} ms up, {slower:.1f} ms down" if faster != slower else f"{faster:.1f} ms"
+    # Rounding would print -0.000.
+    action = f"{vehicle.hover_action:+.3f}" if abs(vehicle.hover_action) > 5e-4 else "0"
     return [
         ("can hover", f"yes: thrust-to-weight ratio {most:.2f}, least {least:.2f}"),
         ("mass, weight", f"{vehicle.mass:g} kg, {vehicle.mass * vehicle.gravity:.4g} N"),
@@ -110,51 +116,85 @@ def _parameters(vehicle: "Vehicle") -> list[tuple[str, str]]:
             f"{slow:.0f} to {fast:.0f} rad/s, hover {hover:.0f} rad/s "
             f"({slow * RPM:.0f} to {fast * RPM:.0f} rpm, hover {hover * RPM:.0f} rpm)",
         ),
-        (
-            "acceleration",
-            f"up {up:.1f}, down while level {down:.1f}, sideways at constant height {sideways:.1f} m/s²",
-        ),
-        (
-            "greatest moments",
-            f"{', '.join(f'{each:.4g}' for each in moments)} N m about roll, pitch and yaw",
-        ),
-        ("", f"which accelerate it by {turns} rad/s²"),
-        ("inertia", f"{ixx:.4g}, {iyy:.4g}, {izz:.4g} kg m²"),
-        ("", f"{share}, at most 1 (triangle inequality)"),
-        ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
-        (
-            "motors",
-            f"time constant {times}; from command to thrust {1000 * vehicle.command_lag:.1f} ms",
-        ),
     ]
 
 
+def _acceleration(vehicle: "Vehicle") -> list[tuple[str, str]]:
+    least, most = vehicle.thrust_limits
+    up = vehicle.gravity * (most - 1.0)
+    down = vehicle.gravity * (1.0 - least)
+    # The vertical part of full thrust holds the weight.
+    horizontal = vehicle.gravity * math.sqrt(most**2 - 1.0)
+    moments = vehicle.greatest_moments
+    return [
+        (
+            "acceleration",
+            f"up {up:.1f}, down while level {down:.1f}, "
+            f"horizontal at constant height {horizontal:.1f} m/s²",
+        ),
+        ("greatest moments", f"{_list(moments, '.4g')} N m about roll, pitch and yaw"),
+        ("", f"which accelerate it by {_list(moments / vehicle.inertia, '.1f')} rad/s²"),
+    ]
+
+
+def _inertia(vehicle: "Vehicle") -> list[tuple[str, str]]:
+    physical = "unphysical" if vehicle.inertia_fault else "physical"
+    ratios = _list(vehicle.gyration_ratios, ".2f")
+    return [
+        ("inertia", f"{_list(vehicle.inertia, '.4g')} kg m²"),
+        (
+            "",
+            f"{physical}: the largest moment is {vehicle.largest_moment:.2f} of the other two "
+            "together, at most 1 (triangle inequality)",
+        ),
+        ("", f"radii of gyration {ratios} of the rotors' distance from the centre"),
+    ]
+
+
+def _motors(vehicle: "Vehicle") -> str:
+    up = 1000.0 / vehicle.motor_gain_up
+    down = 1000.0 / vehicle.motor_gain_down
+    times = f"{up:.1f} ms"
+    if up != down:
+        times = f"{up:.1f} ms up, {down:.1f} ms down"
+    lag = 1000 * vehicle.command_lag
+    return f"time constant {times}; from command to thrust {lag:.1f} ms"
+
+
+def _list(values: Any, form: str) -> str:
+    return ", ".join(format(value, form) for value in values)
+
+
 def _check_rotor_speed(vehicle: "Vehicle", where: str) -> None:
-    """:raises CannotHover: no rotor turns as fast as hover asks for, which limits in hover thrusts
-    do not show.
+    """Check the rotor speed in hover, which limits in multiples of the hover thrust do not show.
+
+    :raises CannotHover: No rotor is that fast.
     """
-    if (speed := vehicle.hover_rotor_speed) > FASTEST_HOVER:
-        units = "is the mass in kg, and thrust_coefficient in N s²?"
+    speed = vehicle.hover_rotor_speed
+    if speed > FASTEST_HOVER:
         raise CannotHover(
-            f"{where}: mass {vehicle.mass:g} kg: no rotor turns at the {speed * RPM:,.0f} rpm that hover takes; {units}"
+            f"{where}: mass {vehicle.mass:g} kg: no rotor reaches the {speed * RPM:,.0f} rpm that "
+            "hover needs; is the mass in kg, and thrust_coefficient in N s²?"
         )
 
 
 def warnings(vehicle: "Vehicle") -> list[str]:
-    """What is possible but unlikely: mostly a wrong unit."""
-    found = []
-    ratio = vehicle.gyration_ratios
-    if ratio.max() > 1.0 or ratio.min() < 0.05:
-        found.append(
-            f"inertia: radii of gyration of {ratio.min():.3g} to {ratio.max():.3g} of the rotors' distance are unusual "
-            "(0.2 to 0.6 is common); is it in kg m², and are the rotor positions in m?"
+    """Return a line for each value that is possible but unlikely, mostly due to a wrong unit."""
+    lines = []
+    ratios = vehicle.gyration_ratios
+    if ratios.max() > 1.0 or ratios.min() < 0.05:
+        lines.append(
+            f"inertia: radii of gyration of {ratios.min():.3g} to {ratios.max():.3g} "
+            "of the rotors' distance are unusual (0.2 to 0.6 is common); "
+            "is it in kg m², and are the rotor positions in m?"
         )
-    if (most := vehicle.thrust_limits[1]) < SLIM_THRUST:
-        found.append(
-            f"thrust: a thrust-to-weight ratio of {most:.2f} leaves little to turn and to brake with"
+    most = vehicle.thrust_limits[1]
+    if most < SLIM_THRUST:
+        lines.append(
+            f"thrust: a thrust-to-weight ratio of {most:.2f} leaves little to turn and brake with"
         )
     if vehicle.collision_radius > 2.0 * vehicle.arm_length:
-        found.append(
+        lines.append(
             "collision_radius: is more than twice the rotors' distance from the centre; is it in m?"
         )
-    return found
+    return lines

@@ -1,20 +1,23 @@
-"""Write a page in which quadcopters fly under several controllers side by side: throw them, push
-them, move the target.
+"""Write a web page where several controllers fly side by side.
 
-It is one file that needs no network and no other program than a browser. Weights, vehicles and a
-small simulation of the package's physics are in it. Other agents can be dropped onto the page as
-zips.
+You can throw the quadcopters, apply forces and move the target. The page is one
+file and needs only a browser, no network. It holds the agents' weights, the
+vehicles and a small simulation of the package's physics. You can drop zips of
+further agents onto it.
 
 examples:
-  sb3-quad demo                                                     PID, geometric, and agents of the package
+  # PID, geometric, and agents of the package
+  sb3-quad demo
   sb3-quad demo -o docs/demo.html --overwrite
-  sb3-quad demo logs/dagger/QuadStateRecovery-v0_1 pid geometric    your own agent beside the experts
+  # your own agent and both experts
+  sb3-quad demo logs/dagger/QuadStateRecovery-v0_1 pid geometric
   sb3-quad demo new=agent.zip old=path/to/agent.zip -o compare.html
   sb3-quad demo pid geometric any-quadcopter --vehicle my_vehicle.yaml
 
-A controller is pid, geometric, an agent of the package such as itm-recovery, the path of an SB3
-zip, or a run folder; name=… labels it. All fly the same vehicle, at first the first agent's; the
-page also has those of the package.
+A controller is pid, geometric, an agent of the package such as itm-recovery,
+the path of an SB3 zip, or a run folder. NAME=CONTROLLER labels it. All fly the
+same vehicle, first that of the first agent. The page also offers the vehicles
+of the package.
 """
 
 import argparse
@@ -28,20 +31,16 @@ def add_arguments(parser: Parser) -> None:
     add(
         "agents",
         nargs="*",
-        metavar="AGENT",
-        help="who flies (pid, geometric, and agents that come with the package)",
+        metavar="CONTROLLER",
+        help="controllers to show (pid, geometric, and agents of the package)",
     )
-    add("-o", "--output", default="demo.html", metavar="FILE", help="the page (demo.html)")
-    add(
-        "--vehicle",
-        metavar="VEHICLE",
-        help="name or YAML file of the vehicle at first (the first agent's)",
-    )
+    add("-o", "--output", default="demo.html", metavar="FILE", help="page to write (demo.html)")
+    add("--vehicle", help="first vehicle, by name or YAML file (that of the first agent)")
     add_common(parser, "trust", "overwrite")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Pack, write. Returns the exit code."""
+    """Make the page and write it. Returns the exit code."""
     from sb3_quad.cli.output import warn
     from sb3_quad.evaluation.controllers import parse_controllers
     from sb3_quad.show.demo.page import DEFAULT_AGENTS, make_page
@@ -55,7 +54,8 @@ def run(options: argparse.Namespace) -> int:
     write_text(options.output, page)
     if rounded:
         print(
-            f"weights of {' and '.join(rounded)} are rounded to half precision, to keep the page small"
+            f"weights of {' and '.join(rounded)} are rounded to half precision, "
+            "to keep the page small"
         )
     print(f"saved {options.output} ({len(page.encode())} bytes); open it in a browser")
     return 0

@@ -1,24 +1,33 @@
-"""Watch controllers fly: in PyBullet's window, as a film, or as poses in one picture; several side
-by side.
+r"""Watch controllers fly, in a window, as a film or as one picture.
+
+Several controllers fly the same episodes side by side.
 
 examples:
-  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs          the latest run's agent, in a window
+  # the agent of the latest run, in PyBullet's window
+  sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 -f logs
+  # the best agent of run 2
   sb3-quad enjoy --algo ppo_bc --env QuadStateRecovery-v0 --exp-id 2 --load-best
-  sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery --seed 13 -o recovery.mp4
+  # a film with a panel for each of three controllers
+  sb3-quad enjoy pid geometric agent=path/to/agent.zip --task state_recovery \
+    --seed 13 -o recovery.mp4
+  # a scenario as poses in one picture, and another one in slow motion
   sb3-quad enjoy agent.zip pid --scenario thesis:recovery_s1 -o s1.png
   sb3-quad enjoy agent.zip --scenario thesis:side_hit -o hit.mp4 --speed 0.5
-  sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml -n 3000 --no-render
+  # your own vehicle without noise, printed only
+  sb3-quad enjoy geometric --env-kwargs noise:0 vehicle:my_vehicle.yaml \
+    -n 3000 --no-render
 
-A controller is pid, geometric, the path of an SB3 zip or a run folder, or package.module:factory;
-name=… labels it. The first agent says which vehicle, task and observation all fly with, unless
---env, --task, --scenario or --env-kwargs do. Without --load-…, the agent of a run is
+A controller is pid, geometric, the path of an SB3 zip or a run folder, or
+package.module:factory. NAME=CONTROLLER labels it. The settings of the first
+agent (vehicle, task and observation) hold for all, unless you give --env,
+--task, --scenario or --env-kwargs. Without --load-…, the agent of a run is
 corrected_model.zip, else best_model.zip, else <Env>.zip.
 """
 
 import argparse
 import io
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,92 +37,60 @@ from sb3_quad.cli.parser import PAIRS, Parser, above_zero, add_common, natural, 
 from sb3_quad.envs.registration import ENVIRONMENTS
 
 DEFAULT_ENV = "QuadTargetTracking-v0"
-LAST = "last checkpoint"
-SINGLE, PANEL = (
-    (640, 480),
-    (480, 480),
-)  # width and height of the only panel, and of one of several, pixels
+# Width and height of the only panel, and of one of several, pixels.
+SINGLE = (640, 480)
+PANEL = (480, 480)
 
 
 def add_arguments(parser: Parser) -> None:
-    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of what is flown and
-    how it is shown.
-    """
+    """Add the flags of rl-zoo's ``enjoy.py``, with their meanings, and those of this command."""
     add = parser.add_argument
     add(
         "controllers",
         nargs="*",
         metavar="CONTROLLER",
-        help="who flies, besides the agent of --algo",
+        help="controllers to fly, in addition to the agent of --algo",
     )
-    add("--algo", help="algorithm of a trained agent, looked up in the log folder")
+    _add_run_arguments(parser)
     task = parser.add_mutually_exclusive_group()
     task.add_argument("--env", help=f"environment id ({DEFAULT_ENV})")
-    task.add_argument(
-        "--task", metavar="NAME", help="a task such as target_tracking, instead of --env"
-    )
+    task.add_argument("--task", help="a task such as target_tracking, instead of --env")
     task.add_argument(
         "--scenario",
         metavar="SUITE:NAME",
-        help="a scenario, such as thesis:side_hit, instead of --env",
+        help="a scenario such as thesis:side_hit, instead of --env",
     )
-    add(
-        "-f",
-        "--folder",
-        "--log-folder",
-        default="logs",
-        metavar="DIR",
-        help="folder that holds the run folders (logs)",
-    )
-    add(
-        "--exp-id",
-        type=int,
-        default=0,
-        metavar="N",
-        help="number of the run; 0: the latest with an agent (0)",
-    )
-    which = parser.add_mutually_exclusive_group()
-    best: dict[str, Any] = {"dest": "which", "action": "store_const", "const": "best"}
-    which.add_argument("--load-best", help="the best agent of the evaluations", **best)
-    which.add_argument(
-        "--load-checkpoint",
-        dest="which",
-        type=whole,
-        metavar="N",
-        help="the checkpoint after N timesteps",
-    )
-    which.add_argument("--load-last-checkpoint", help=f"the {LAST}", **{**best, "const": LAST})
     add(
         "-n",
         "--n-timesteps",
         type=positive,
-        metavar="N",
         help="control steps, in as many episodes as needed (one episode)",
     )
     add(
         "--n-envs",
         type=positive,
         default=1,
-        metavar="N",
-        help="episodes side by side, with consecutive seeds (1)",
+        help="number of parallel episodes, with consecutive seeds (1)",
     )
     add(
-        "--seed",
-        type=natural,
-        default=0,
-        metavar="N",
-        help="seed of the first episode (0); later ones count up",
+        "--seed", type=natural, default=0, help="seed of the first episode; later ones count up (0)"
     )
     actions = parser.add_mutually_exclusive_group()
     actions.add_argument(
         "--deterministic", action="store_true", help="fly the mean of a policy's actions (default)"
     )
-    actions.add_argument("--stochastic", action="store_true", help="sample from a policy's actions")
+    actions.add_argument("--stochastic", action="store_true", help="sample a policy's actions")
     add("--env-kwargs", default={}, help="environment keywords, such as noise:0", **PAIRS)
-    add("--target", nargs=3, type=float, metavar=("X", "Y", "Z"), help="where to fly to, m")
-    add("--no-render", action="store_true", help="only fly and print how it went")
-    output = "write films (.mp4, .webp, .gif) or the first episode as poses in one picture (.png) instead of opening a window"
-    add("-o", "--output", nargs="+", default=[], metavar="FILE", help=output)
+    add("--target", nargs=3, type=float, metavar=("X", "Y", "Z"), help="target to fly to, m")
+    add("--no-render", action="store_true", help="only fly and print the results")
+    add(
+        "-o",
+        "--output",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help="write films (.mp4, .webp, .gif) or a picture of the first episode (.png)",
+    )
     add("--size", type=_size, metavar="WxH", help="size of one controller's panel, pixels")
     add(
         "--speed",
@@ -125,18 +102,60 @@ def add_arguments(parser: Parser) -> None:
     add_common(parser, "trust", "overwrite", "progress")
 
 
+def _add_run_arguments(parser: Parser) -> None:
+    """Add the flags that name the agent of a run folder."""
+    add = parser.add_argument
+    add("--algo", help="algorithm of a trained agent, which is looked up in the log folder")
+    add(
+        "-f",
+        "--folder",
+        "--log-folder",
+        default="logs",
+        metavar="DIR",
+        help="folder that holds the run folders (logs)",
+    )
+    add(
+        "--exp-id",
+        type=whole,
+        default=0,
+        help="number of the run (0: the latest one that has an agent)",
+    )
+    add = parser.add_mutually_exclusive_group().add_argument
+    add(
+        "--load-best",
+        dest="which",
+        action="store_const",
+        const="best",
+        help="fly the best agent of the evaluations",
+    )
+    add(
+        "--load-checkpoint",
+        dest="which",
+        type=whole,
+        metavar="N",
+        help="fly the checkpoint after N timesteps",
+    )
+    add(
+        "--load-last-checkpoint",
+        dest="which",
+        action="store_const",
+        const="last",
+        help="fly the last checkpoint",
+    )
+
+
 def _size(text: str) -> tuple[int, int]:
     try:
-        width, height = (int(part) for part in text.lower().split("x"))
+        width, height = text.lower().split("x")
+        return int(width), int(height)
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"{text}: must be width and height in pixels, such as 640x480"
         ) from None
-    return width, height
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly, show, print how it went. Returns the exit code."""
+    """Fly, print the results, show the flights. Returns the exit code."""
     from rich.console import Console
 
     from sb3_quad.show.episodes import fly_all
@@ -145,18 +164,24 @@ def run(options: argparse.Namespace) -> int:
     window = not (options.no_render or options.output)
     _check(options, window)
     setting, controllers = _setting(options)
-    how = options.seed, options.n_timesteps, not options.stochastic, options.n_envs
     with Console(file=sys.stderr).status("flying"):
-        episodes = list(fly_all(controllers, setting, *how))
+        flights = fly_all(
+            controllers,
+            setting,
+            options.seed,
+            options.n_timesteps,
+            deterministic=not options.stochastic,
+            n_envs=options.n_envs,
+        )
+        episodes = list(flights)
     for number, episode in enumerate(episodes, 1):
+        prefix = f"episode {number}, " if len(episodes) > 1 else ""
         for recording in episode:
-            end = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
-            head = f"episode {number}, {recording.name}" if len(episodes) > 1 else recording.name
-            print(f"{head}: {end} after {recording.times[-1]:.2f} s, reward {recording.reward:.2f}")
+            print(prefix + _result(recording))
     size = options.size or (PANEL if len(episodes[0]) > 1 else SINGLE)
     for file in options.output:
-        if file.lower().endswith(".png"):
-            _write_sequence(file, episodes[0], size)
+        if _is_picture(file):
+            _write_picture(file, episodes[0], size)
         else:
             _write_film(file, episodes, size, options)
     if window:
@@ -165,108 +190,140 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _agent_of_run(options: argparse.Namespace, env_id: str) -> tuple[str, str]:
-    """Name and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
-    ``--load-…`` name.
-
-    :raises ConfigError: no such run or file, settings that cannot be read, or a wrapper that enjoy
-        does not have.
-    """
-    from sb3_quad.training.algorithms import get_algorithm
-    from sb3_quad.training.runs import find_run
-
-    if not (Path(options.folder) / options.algo).is_dir():
-        get_algorithm(options.algo)  # raises if there is none of that name
-    run = find_run(options.folder, options.algo, env_id, options.exp_id)
-    if isinstance(options.which, int):
-        path = run.checkpoint(options.which)
-    elif options.which == LAST:
-        path = run.latest_checkpoint()
-    else:
-        path = run.best_model if options.which == "best" else run.result
-    if not path.is_file():
-        zips = ", ".join(sorted(each.name for each in run.path.glob("*.zip")))
-        raise ConfigError(f"{path}: no such file; the run holds {zips}")
-    settings, _ = run.read_yaml()
-    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
-        if settings.get(key):
-            raise ConfigError(
-                f"{run.path}: was trained with {key}, which enjoy does not put around the environment"
-            )
-    return f"{options.algo} {path.name}", str(path)
-
-
 def _check(options: argparse.Namespace, window: bool) -> None:
-    """Refuse what can be refused before anything is flown."""
+    """Refuse what can be refused before anything flies.
+
+    :raises ConfigError: No controller, a bad size or file, or no display for a window.
+    """
     from sb3_quad.envs.rendering.window import has_display
     from sb3_quad.show.film import check_film
     from sb3_quad.simulation.checks import check_size
 
     if not (options.controllers or options.algo):
         raise ConfigError(
-            "nobody to fly: name a controller, such as pid or agent.zip, or a run by --algo and --env"
+            "no controller given: name one, such as pid or agent.zip, or a run by --algo and --env"
         )
+    env_id = options.env or DEFAULT_ENV
+    if env_id not in ENVIRONMENTS:
+        message = unknown("environment", env_id, ENVIRONMENTS)
+        raise ConfigError(f"{message}; rl_zoo3.enjoy shows others")
     if options.size:
         check_size(*options.size)
     for file in options.output:
-        if not file.lower().endswith(".png"):
+        if not _is_picture(file):
             check_film(Path(file))
         refuse_existing(file, options.overwrite)
     if window and not has_display():
         raise ConfigError(
-            "no display to open a window on (DISPLAY is not set); -o flight.mp4 makes a film instead"
+            "no display to open a window on (DISPLAY is not set); "
+            "-o flight.mp4 makes a film instead"
         )
 
 
+def _is_picture(file: str) -> bool:
+    return file.lower().endswith(".png")
+
+
 def _setting(options: argparse.Namespace) -> tuple[Any, dict[str, Any]]:
-    """What is flown, a :class:`~sb3_quad.show.episodes.Setting`, and who flies, by label."""
+    """Return the :class:`~sb3_quad.show.episodes.Setting` of all, and the controllers by label."""
     from sb3_quad.cli.output import warn
     from sb3_quad.controllers.resolve import resolve_expert
     from sb3_quad.evaluation.controllers import ControllerSpec, parse_controllers
     from sb3_quad.show.episodes import fixed_setting, scenario_setting
-    from sb3_quad.simulation.settings import FlightSettings
     from sb3_quad.vehicles.vehicle import first_vehicle
 
-    env_id, specs = options.env or DEFAULT_ENV, parse_controllers(options.controllers)
-    if env_id not in ENVIRONMENTS:
-        raise ConfigError(
-            unknown("environment", env_id, ENVIRONMENTS) + "; others are shown by rl_zoo3.enjoy"
-        )
+    specs = parse_controllers(options.controllers)
     if options.algo:
-        specs.insert(0, ControllerSpec(*_agent_of_run(options, env_id)))
+        specs.insert(0, ControllerSpec(*_agent_of_run(options)))
         print(f"agent: {specs[0].spec}")
-    agents = [
-        spec.own for spec in specs if spec.own is not None
-    ]  # the first says how all are flown
-    if options.scenario is not None:
-        if options.env_kwargs or options.target:
-            raise ConfigError(
-                "--scenario says all about a flight; leave --env-kwargs and --target away"
-            )
-        setting = scenario_setting(options.scenario, agents[0].vehicle if agents else None)
+    # The settings of the first agent hold for all.
+    own_settings = [spec.own for spec in specs if spec.own is not None]
+    first = own_settings[0] if own_settings else None
+    if options.scenario is None:
+        setting = fixed_setting(_flight_settings(options, first), options.target)
+    elif options.env_kwargs or options.target:
+        raise ConfigError("--scenario describes a whole flight; remove --env-kwargs and --target")
     else:
-        kept = agents[0] if agents else FlightSettings(task=ENVIRONMENTS[env_id])
-        task = options.task or (
-            ENVIRONMENTS[env_id] if options.env and not options.algo else kept.task
-        )
-        changes = (
-            {"task": task}
-            | ({} if task == kept.task else {"task_kwargs": None})
-            | options.env_kwargs
-        )
-        setting = fixed_setting(kept.with_changes(**changes), options.target)
-    controllers, own = {}, {}
+        setting = scenario_setting(options.scenario, first and first.vehicle)
+    controllers = {}
+    # What an agent observes stays as in its training, unless the command line says otherwise.
+    observed: dict[str, dict[str, Any]] = {}
     vehicle = first_vehicle(setting.vehicle, options.env_kwargs.get("rotor_layout"))
     for spec in specs:
         warn(spec.notice(vehicle))
         controllers[spec.label] = resolve_expert(spec.spec, vehicle, "controller")
-        own[spec.label] = {
-            name: value for name, value in spec.observed.items() if name not in options.env_kwargs
-        }
-    return setting._replace(own=own), controllers
+        observed[spec.label] = dict(spec.observed)
+        for name in options.env_kwargs:
+            observed[spec.label].pop(name, None)
+    return setting._replace(own=observed), controllers
 
 
-def _write_sequence(file: str, episode: Sequence[Any], size: tuple[int, int]) -> None:
+def _flight_settings(options: argparse.Namespace, first: Any) -> Any:
+    """Return the :class:`~sb3_quad.simulation.settings.FlightSettings` of all flights.
+
+    :param first: Those of the first agent, or None.
+    """
+    from sb3_quad.simulation.settings import FlightSettings
+
+    env_task = ENVIRONMENTS[options.env or DEFAULT_ENV]
+    settings = first or FlightSettings(task=env_task)
+    # With --algo, --env names the environment of the run rather than the task.
+    if options.task:
+        task = options.task
+    elif options.env and not options.algo:
+        task = env_task
+    else:
+        task = settings.task
+    changes = {"task": task}
+    if task != settings.task:
+        # The agent's changes to its own task do not fit another one.
+        changes["task_kwargs"] = None
+    return settings.with_changes(**changes | options.env_kwargs)
+
+
+def _agent_of_run(options: argparse.Namespace) -> tuple[str, str]:
+    """Return label and path of the agent of the run that ``--algo``, ``--env``, ``--exp-id`` and
+    ``--load-…`` name.
+
+    :raises ConfigError: No such run or file, settings that cannot be read, or a wrapper that this
+        command does not have.
+    """
+    from sb3_quad.training.algorithms import get_algorithm
+    from sb3_quad.training.runs import find_run
+
+    if not (Path(options.folder) / options.algo).is_dir():
+        # Raises if there is no such algorithm.
+        get_algorithm(options.algo)
+    run = find_run(options.folder, options.algo, options.env or DEFAULT_ENV, options.exp_id)
+    if isinstance(options.which, int):
+        path = run.checkpoint(options.which)
+    elif options.which == "last":
+        path = run.latest_checkpoint()
+    elif options.which == "best":
+        path = run.best_model
+    else:
+        path = run.result
+    if not path.is_file():
+        zips = sorted(file.name for file in run.path.glob("*.zip"))
+        raise ConfigError(f"{path}: no such file; the run holds {', '.join(zips)}")
+    settings, _ = run.read_yaml()
+    for key in ("env_wrapper", "vec_env_wrapper", "frame_stack", "normalize"):
+        if settings.get(key):
+            raise ConfigError(
+                f"{run.path}: was trained with {key}, which enjoy does not put around the "
+                "environment"
+            )
+    return f"{options.algo} {path.name}", str(path)
+
+
+def _result(recording: Any) -> str:
+    """Return the result of a flight in one line."""
+    end = recording.lost or f"{recording.state.distance[-1]:.3f} m from its target"
+    seconds = recording.times[-1]
+    return f"{recording.name}: {end} after {seconds:.2f} s, reward {recording.reward:.2f}"
+
+
+def _write_picture(file: str, episode: Sequence[Any], size: tuple[int, int]) -> None:
     from PIL import Image
 
     from sb3_quad.show.sequence import sequence
@@ -280,20 +337,19 @@ def _write_sequence(file: str, episode: Sequence[Any], size: tuple[int, int]) ->
 def _write_film(
     file: str, episodes: Sequence[Sequence[Any]], size: tuple[int, int], options: argparse.Namespace
 ) -> None:
-    from rich.console import Console
-    from rich.progress import track
-
-    from sb3_quad.cli.output import shows_progress
+    from sb3_quad.cli.output import progress_bar
     from sb3_quad.show.film import FPS, film_frames, frame_times, write_film
 
     total = sum(len(frame_times(episode, options.speed)) for episode in episodes)
-    frames = (frame for episode in episodes for frame in film_frames(episode, *size, options.speed))
-    where: dict[str, Any] = {
-        "console": Console(file=sys.stderr, force_terminal=options.progress or None),
-        "transient": True,
-    }
-    write_film(
-        Path(file),
-        track(frames, "frames", total, disable=not shows_progress(options.progress), **where),
-    )
+
+    def frames() -> Iterator[Any]:
+        done = 0
+        for episode in episodes:
+            for frame in film_frames(episode, *size, options.speed):
+                yield frame
+                done += 1
+                show(done, total, "frames")
+
+    with progress_bar(options.progress) as show:
+        write_film(Path(file), frames())
     print(f"saved {file}, {total / FPS:.1f} s")

@@ -1,24 +1,36 @@
-"""Fly controllers through scenarios, side by side on the same episodes; tables, results.json and
-episodes.csv.
+r"""Fly controllers through scenarios and compare them in tables.
+
+All controllers fly the same episodes.
 
 controllers:
-  pid, geometric          the experts
-  path/to/agent.zip       an agent of any Stable-Baselines3 algorithm, or the run folder of one
-  package.module:factory  a function that takes the vehicle and returns a controller
-  name=…                  any of these, under that name in the tables
+  pid, geometric          an expert
+  path/to/agent.zip       an agent of any Stable-Baselines3 algorithm, or its
+                          run folder
+  package.module:factory  a function that takes the vehicle and returns a
+                          controller
+  NAME=CONTROLLER         any of these, with a name for the tables
 
 examples:
-  sb3-quad evaluate pid geometric                              the thesis's chapter 4 for both experts
-  sb3-quad evaluate pid "agent=logs/ppo_bc/QuadStateRecovery-v0_1/corrected_model.zip" --suite thesis -o evaluations/mine
-  sb3-quad evaluate pid agent.zip --suite quick                a quick look, in less than a minute
+  # chapter 4 of the thesis for both experts
+  sb3-quad evaluate pid geometric
+  sb3-quad evaluate pid agent=logs/ppo_bc/QuadStateRecovery-v0_1 \
+    --suite thesis -o evaluations/mine
+  # a quick look, in less than a minute
+  sb3-quad evaluate pid agent.zip --suite quick
+  # in two processes, or on a Ray cluster
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
+  # your own controller and scenarios
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
-  sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
-  sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
+  # the same episodes on PyBullet
+  sb3-quad evaluate pid --suite quick --backend pybullet
+  # two scenarios with another vehicle
+  sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery \
+    --vehicle crazyflie -o evaluations/crazyflie
 
-A folder holds the results of one command: give all controllers at once. The same command goes on
-where it was interrupted.
+The folder receives results.json, episodes.csv and a report. It holds the
+results of one command, so give all controllers at once. After an interruption,
+the same command continues where it stopped.
 """
 
 import argparse
@@ -32,42 +44,32 @@ DEFAULT_FOLDER = "evaluations"
 
 def add_arguments(parser: Parser) -> None:
     add = parser.add_argument
-    add("controllers", nargs="+", metavar="CONTROLLER", help="who flies, see below")
+    add("controllers", nargs="+", metavar="CONTROLLER", help="controllers to fly, see below")
     add(
         "--suite",
         default="thesis",
-        metavar="SUITE",
-        help="thesis (default), robustness, wind, quadcopters, quick or a file",
+        help="suite of scenarios: thesis (default), robustness, wind, quadcopters, quick or a file",
     )
-    add("-o", "--output", metavar="FOLDER", help=f"where the results go ({DEFAULT_FOLDER}/SUITE)")
+    add("-o", "--output", metavar="FOLDER", help=f"folder for the results ({DEFAULT_FOLDER}/SUITE)")
     add(
         "--scenario",
         nargs="+",
         default=[],
         metavar="NAME",
-        help="only these scenarios of the suite",
+        help="fly only these scenarios of the suite",
     )
-    add(
-        "--episodes",
-        type=whole,
-        metavar="N",
-        help="episodes per scenario, instead of its own number",
-    )
-    add("--seed", type=whole, metavar="N", help="seed of each scenario, instead of its own")
-    add(
-        "--vehicle",
-        metavar="V",
-        help="vehicle for all, by name or YAML file (each agent's own, where the suite names none)",
-    )
+    add("--episodes", type=whole, help="episodes of each scenario (the suite's number)")
+    add("--seed", type=whole, help="seed of each scenario (the suite's seed)")
+    add("--vehicle", help="vehicle, by name or YAML file (the suite's, else each agent's own)")
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
-    add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
+    add("--workers", type=whole, default=1, help="number of parallel processes (1)")
     add("--overwrite", action="store_true", help="remove the results that the folder holds")
     add("--report", default=True, help="update report.html and its plots (yes)", **YES_OR_NO)
     add_common(parser, "executor", "trust", "progress")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Fly, print the table, print where everything is. Returns the exit code."""
+    """Fly, print the table and the failures. Returns the exit code."""
     from sb3_quad.cli.commands.report import report
     from sb3_quad.cli.output import console, progress_bar, warn
     from sb3_quad.evaluation.controllers import parse_controllers
@@ -83,27 +85,34 @@ def run(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
-        how = options.backend, options.workers, options.overwrite
         results = evaluate(
-            suite, controllers, folder, *how, show, warn, options.executor, options.address
+            suite,
+            controllers,
+            folder,
+            options.backend,
+            options.workers,
+            options.overwrite,
+            show,
+            warn,
+            options.executor,
+            options.address,
         )
-    asked, flown = (
-        {spec.label for spec in controllers},
-        {entry.controller for entry in results.entries},
-    )
-    if asked & flown:
-        labels = [spec.label for spec in controllers if spec.label in flown]
-        console().print(
-            overview(results.model_copy(update={"scenarios": list(suite.scenarios)}), labels)
-        )
+    # The folder may hold the results of further controllers, from an earlier command.
+    flown = {entry.controller for entry in results.entries}
+    labels = [spec.label for spec in controllers]
+    columns = [label for label in labels if label in flown]
+    if columns:
+        scenarios = {"scenarios": list(suite.scenarios)}
+        console().print(overview(results.model_copy(update=scenarios), columns))
     if flown:
-        print(
-            f"{time.perf_counter() - start:.1f} s; results in {folder}: results.json, episodes.csv, flights/"
-        )
-    if options.report and flown:
+        seconds = time.perf_counter() - start
+        print(f"{seconds:.1f} s; results in {folder}: results.json, episodes.csv, flights/")
+    if flown and options.report:
         report(folder, overwrite=True)
-    failures = [failure for failure in results.failures if failure.controller in asked]
+    failures = [failure for failure in results.failures if failure.controller in labels]
     for failure in failures:
-        where = "" if failure.scenario is None else f", scenario {failure.scenario}"
-        print(f"failed: {failure.controller}{where}: {failure.message}", file=sys.stderr)
+        where = failure.controller
+        if failure.scenario is not None:
+            where += f", scenario {failure.scenario}"
+        print(f"failed: {where}: {failure.message}", file=sys.stderr)
     return 1 if failures else 0

@@ -1,11 +1,17 @@
-"""Draw learning curves: success, reward and losses over timesteps and wall-clock time, with mean
-and range over seeds.
+r"""Draw learning curves with mean and range over seeds.
+
+They show success, reward and losses over timesteps and wall-clock time.
 
 examples:
   sb3-quad plot logs/ppo_bc/QuadStateRecovery-v0_1
+  # all runs of an agent as one curve
   sb3-quad plot "RL-agent=logs/ppo_bc/QuadStateRecovery-v0_*" -o curves.png
-  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" --line expert:32.25:-16.1 --title "state recovery" -o curves.svg
-  sb3-quad plot "PPO+BC=logs/ppo_bc/QuadStateRecovery-v0_*" --thesis state_recovery --show survival reward losses
+  # two agents and the expert's success and reward
+  sb3-quad plot "PPO+BC=logs/ppo_bc/*" "PPO only=logs/ppo/*" \
+    --line expert:32.25:-16.1 --title "state recovery" -o curves.svg
+  # with the thesis's results
+  sb3-quad plot "PPO+BC=logs/ppo_bc/QuadStateRecovery-v0_*" \
+    --thesis state_recovery --show survival reward losses
 """
 
 import argparse
@@ -18,7 +24,8 @@ from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import Parser, add_common
 
 PANELS = ("success", "survival", "reward", "losses")
-THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}  # its scenarios by task
+# The scenario of each task in the suite "thesis".
+THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}
 
 
 def add_arguments(parser: Parser) -> None:
@@ -27,25 +34,32 @@ def add_arguments(parser: Parser) -> None:
         "groups",
         nargs="+",
         metavar="RUN",
-        help="a run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
+        help="run folder, or NAME=PATTERN: an agent's name and its runs; quote a *",
     )
-    lines = "horizontal lines: success in %%, reward"
     add(
-        "--line", action="append", default=[], type=_line, metavar="NAME:SUCCESS:REWARD", help=lines
+        "--line",
+        action="append",
+        default=[],
+        type=_line,
+        metavar="NAME:SUCCESS:REWARD",
+        help="draw horizontal lines at a success in %% and a reward",
     )
-    thesis = f"draw what the thesis prints of {', '.join(THESIS)} as horizontal lines"
-    add("--thesis", choices=[*THESIS], metavar="TASK", help=thesis)
+    add(
+        "--thesis",
+        choices=[*THESIS],
+        metavar="TASK",
+        help=f"draw the thesis's results for {' or '.join(THESIS)} as horizontal lines",
+    )
     add(
         "--show",
         nargs="+",
         choices=PANELS,
         default=[],
         metavar="PANEL",
-        help=f"of {', '.join(PANELS)} (success reward)",
+        help=f"panels to draw, of {', '.join(PANELS)} (success reward)",
     )
     add(
-        "--task",
-        help="show the evaluations on this one of the runs' eval_tasks instead of on their own task",
+        "--task", help="one of the runs' eval_tasks, whose evaluations to draw (the runs' own task)"
     )
     add("--title", default="", help="title of the picture")
     add(
@@ -61,11 +75,8 @@ def add_arguments(parser: Parser) -> None:
 def _line(text: str) -> tuple[str, dict[str, float]]:
     try:
         name, success, reward = text.split(":")
-        return name, {
-            "success": float(success) / 100,
-            "survival": float(success) / 100,
-            "reward": float(reward),
-        }
+        share = float(success) / 100
+        return name, {"success": share, "survival": share, "reward": float(reward)}
     except ValueError:
         raise argparse.ArgumentTypeError(
             f"{text!r}: give NAME:SUCCESS:REWARD, such as expert:32.25:-16.1"
@@ -81,34 +92,45 @@ def run(options: argparse.Namespace) -> int:
 
     groups: dict[str, Any] = {}
     for text in options.groups:
-        bare = Path(text).is_dir() or "=" not in text
-        name, _, pattern = (
-            ("/".join(Path(text).parts[-2:]), "", text) if bare else text.partition("=")
-        )
-        folders = [pattern] if Path(pattern).is_dir() else sorted(glob.glob(pattern))
-        if not name or not folders:
-            raise ConfigError(
-                f"{text!r}: no such folder; give run folders, or NAME=PATTERN such as 'RL-agent=logs/ppo_bc/*'"
-            )
+        name, folders = _group(text)
         if name in groups:
-            raise ConfigError(
-                f"{name!r}: two are called so; give NAME=PATTERN with names of their own"
-            )
+            raise ConfigError(f"{name!r}: two groups have this name; give NAME=PATTERN")
         groups[name] = [read_curve(folder, options.task) for folder in folders]
     kind = Path(options.output).suffix.removeprefix(".")
     if kind not in ("png", "svg", "pdf"):
         raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
-    lines = {}
-    if options.thesis:  # its success is our survival
-        for name, reference in (
-            load_suite("thesis").scenario(THESIS[options.thesis]).reference.items()
-        ):
-            lines[f"thesis: {name}"] = reference.model_dump(
-                include={"survival", "reward"}, exclude_none=True
-            )
-    show = options.show or (["survival", "reward"] if options.thesis else [])
-    curves = plot_curves(groups, {**lines, **dict(options.line)}, options.title, show)
+    show = options.show
+    lines: dict[str, Any] = {}
+    if options.thesis:
+        # The thesis calls survival success.
+        show = show or ["survival", "reward"]
+        scenario = load_suite("thesis").scenario(THESIS[options.thesis])
+        for name, reference in scenario.reference.items():
+            numbers = reference.model_dump(include={"survival", "reward"}, exclude_none=True)
+            lines[f"thesis: {name}"] = numbers
+    lines.update(options.line)
     refuse_existing(options.output, options.overwrite)
+    curves = plot_curves(groups, lines, options.title, show)
     write_bytes(options.output, picture(curves, kind, dpi=130))
     print(f"saved {options.output}")
     return 0
+
+
+def _group(text: str) -> tuple[str, list[str]]:
+    """Return the name and the run folders of an argument.
+
+    :raises ConfigError: No such folder, or no name.
+    """
+    path = Path(text)
+    name, equals, pattern = text.partition("=")
+    if path.is_dir() or not equals:
+        name = "/".join(path.parts[-2:])
+        pattern = text
+    # A folder's own name may hold a *.
+    folders = [pattern] if Path(pattern).is_dir() else sorted(glob.glob(pattern))
+    if not name or not folders:
+        raise ConfigError(
+            f"{text!r}: no such folder; give run folders, "
+            "or NAME=PATTERN such as 'RL-agent=logs/ppo_bc/*'"
+        )
+    return name, folders

@@ -1,9 +1,11 @@
-"""Make report.html from a results folder of evaluate: tables and plots; one file that needs no
-network.
+"""Make report.html from a results folder of evaluate, with tables and plots.
+
+The page is one file and needs no network.
 
 examples:
   sb3-quad report evaluations/thesis
-  sb3-quad report evaluations/thesis --overwrite      again
+  # replace the report
+  sb3-quad report evaluations/thesis --overwrite
 """
 
 import argparse
@@ -18,15 +20,15 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Write the page, print where it is. Returns the exit code."""
+    """Write the page. Returns the exit code."""
     report(options.folder, options.overwrite)
     return 0
 
 
 def report(folder: str | Path, overwrite: bool) -> None:
-    """Write the page of a folder of results, with a spinner in a terminal; print where it is.
+    """Write the page of a results folder, with a spinner in a terminal, and print its path.
 
-    :raises ConfigError: see :func:`sb3_quad.report.results_page.write_report`.
+    :raises ConfigError: See :func:`sb3_quad.report.results_page.write_report`.
     """
     from sb3_quad.cli.output import console
     from sb3_quad.report.page import PICTURES

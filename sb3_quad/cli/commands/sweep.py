@@ -1,22 +1,29 @@
-"""Train many seeds and settings, here or on a Ray cluster; compare all on the same fresh episodes.
+r"""Train many seeds and settings, and compare all agents on the same episodes.
+
+Runs are trained in worker processes here, or on a Ray cluster.
 
 examples:
-  sb3-quad sweep my_sweep.yaml --dry-run                   lists the runs
-  sb3-quad sweep my_sweep.yaml --workers 4                 four worker processes, one core each
-  sb3-quad sweep pid                                       a sweep of the package, such as nominal or random_worlds
+  # list the runs of your sweep, then train them in four worker processes
+  sb3-quad sweep my_sweep.yaml --dry-run
+  sb3-quad sweep my_sweep.yaml --workers 4
+  # a sweep of the package, such as pid or nominal
+  sb3-quad sweep pid
+  # a sweep without a file
   sb3-quad sweep --seed 0 1 2 --conf-file two_stage.yml thesis.yml
-  sb3-quad sweep --seed 0 1 2 --algo dagger --env QuadStateRecovery-v0 -n 240000 --suite quick
+  sb3-quad sweep --seed 0 1 2 --algo dagger --env QuadStateRecovery-v0 \
+    -n 240000 --suite quick
+  # on a Ray cluster
   sb3-quad sweep my_sweep.yaml --executor ray --address auto
-  sb3-quad sweep --resume logs/sweep/my_sweep_1            goes on after Ctrl-C or a crash
+  # continue after Ctrl-C or a crash
+  sb3-quad sweep --resume logs/sweep/my_sweep_1
 
-A folder is left: run folders, results.csv, results.json, report.md and report.html. The file's
-keys: docs/sweeps.md.
+The new folder receives the run folders, results.csv, results.json, report.md
+and report.html. For the keys of the file, see docs/sweeps.md.
 """
 
 import argparse
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +40,9 @@ def add_arguments(parser: Parser) -> None:
         "sweep",
         nargs="?",
         metavar="SWEEP",
-        help="YAML file, or a name; the flags below go before what it says",
+        help="YAML file, or the name of a sweep of the package; the flags below replace its keys",
     )
-    add("--seed", nargs="+", type=seed, metavar="N", help="seeds of each configuration (0)")
+    add("--seed", nargs="+", type=seed, help="seeds of each configuration (0)")
     add(
         "-conf",
         "--conf-file",
@@ -47,33 +54,24 @@ def add_arguments(parser: Parser) -> None:
     add("--env", help="environment id of single runs (QuadTargetTracking-v0)")
     add_fields(parser, SettingsOptions)
     add("-params", "--hyperparams", help="settings to change, such as n_steps:500", **PAIRS)
-    add_fields(
-        parser,
-        JobOptions,
-        *RunOptions.model_fields,
-        "log_folder",
-        trained_agent={"type": agent_path},
-    )
-    add(
-        "--suite",
-        metavar="SUITE",
-        help="what the agents fly in the end (fresh episodes of both tasks, 240 each)",
-    )
-    add("--episodes", type=positive, metavar="N", help="episodes of each scenario in the end")
+    fields = (*RunOptions.model_fields, "log_folder")
+    add_fields(parser, JobOptions, *fields, trained_agent={"type": agent_path})
+    add("--suite", help="suite for the comparison (240 fresh episodes of each task)")
+    add("--episodes", type=positive, help="episodes of each scenario in the comparison")
     add(
         "--gym-packages",
         nargs="+",
         metavar="MODULE",
         help="modules that register further environments",
     )
-    add("--workers", type=positive, metavar="N", help="runs side by side (the cores)")
-    add("--dry-run", action="store_true", help="list the runs, train nothing")
-    add("--resume", metavar="FOLDER", help="go on with a sweep: what is not finished in its folder")
+    add("--workers", type=positive, help="number of parallel runs (one per core)")
+    add("--dry-run", action="store_true", help="list the runs and train nothing")
+    add("--resume", metavar="FOLDER", help="continue the sweep in its folder")
     add_common(parser, "executor", "trust", "progress")
 
 
 def run(options: argparse.Namespace) -> int:
-    """Train, compare, print where everything is. Returns the exit code."""
+    """Train and compare, or list the runs. Returns the exit code."""
     from sb3_quad.base.imports import import_packages
     from sb3_quad.sweep.expand import expand, suite_of
     from sb3_quad.sweep.folder import Plan, SweepFolder
@@ -81,30 +79,34 @@ def run(options: argparse.Namespace) -> int:
 
     if options.resume is not None:
         for name in given(options, "sweep", *SweepSpec.model_fields, "suite", "episodes"):
-            raise ConfigError(
-                f"--resume keeps the sweep's own settings; leave {name.replace('_', '-')} away"
-            )
-        place = SweepFolder(options.resume)
-        return _go_on(options, place.read(), place)
+            flag = "SWEEP" if name == "sweep" else f"--{name.replace('_', '-')}"
+            raise ConfigError(f"--resume keeps the sweep's own settings; remove {flag}")
+        folder = SweepFolder(options.resume)
+        return _execute(options, folder.read(), folder)
     spec = _spec(options)
     import_packages(spec.gym_packages, "gym_packages:")
     plan = Plan(spec=spec, runs=tuple(expand(spec)), suite=suite_of(spec))
-    if not options.dry_run:
-        return _go_on(options, plan, None)
-    for each in plan.runs:
-        stages = (
+    if options.dry_run:
+        _print_runs(plan)
+        return 0
+    return _execute(options, plan, None)
+
+
+def _print_runs(plan: Any) -> None:
+    for run in plan.runs:
+        stages = [
             f"{stage.algo} on {stage.env}, {stage.settings['n_timesteps']} timesteps"
-            for stage in each.stages
-        )
-        print(f"{each.name}: {', then '.join(stages)}")
-    configurations = len({each.configuration for each in plan.runs})
-    print(f"{_count(len(plan.runs), 'run')} of {_count(configurations, 'configuration')}")
-    return 0
+            for stage in run.stages
+        ]
+        print(f"{run.name}: {', then '.join(stages)}")
+    configurations = {run.configuration for run in plan.runs}
+    print(f"{_count(len(plan.runs), 'run')} of {_count(len(configurations), 'configuration')}")
 
 
 def _spec(options: argparse.Namespace) -> Any:
-    """The :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line: a file's, with the flags over
-    it.
+    """Return the :class:`~sb3_quad.sweep.spec.SweepSpec` of a command line.
+
+    Flags replace the keys of the file.
     """
     from sb3_quad.base.validate import validate
     from sb3_quad.sweep.spec import SweepSpec, load_sweep
@@ -113,97 +115,115 @@ def _spec(options: argparse.Namespace) -> Any:
     if options.sweep is not None:
         data = load_sweep(options.sweep).model_dump(mode="json", exclude_defaults=True)
     flags = given(options, *SweepSpec.model_fields)
-    for name in {"hyperparams", "env_kwargs"} & flags.keys():
-        flags[name] = {**data.get(name, {}), **flags[name]}
     grid = {key: values for key, values in data.get("grid", {}).items() if key not in flags}
+    # The pairs of a flag are added to those of the file.
+    for name in ("hyperparams", "env_kwargs"):
+        if name in flags:
+            flags[name] = {**data.get(name, {}), **flags[name]}
+    # Several values make a grid.
     for name in ("conf_file", "algo"):
-        if isinstance(values := flags.get(name), list):
+        values = flags.get(name, [])
+        if len(values) == 1:
+            flags[name] = values[0]
+        elif values:
             data.pop(name, None)
-            flags.pop(name)
-            (grid if len(values) > 1 else flags)[name] = values if len(values) > 1 else values[0]
+            grid[name] = flags.pop(name)
     evaluation = {**data.get("evaluation", {}), **given(options, "suite", "episodes")}
-    return validate(
-        SweepSpec,
-        _with_defaults({**data, **flags, "grid": grid, "evaluation": evaluation}),
-        options.sweep or "command line",
-    )
+    data |= {**flags, "grid": grid, "evaluation": evaluation}
+    _add_defaults(data)
+    return validate(SweepSpec, data, options.sweep or "command line")
 
 
-def _with_defaults(data: Mapping[str, Any]) -> Mapping[str, Any]:
-    """A sweep that trains, where nothing is said, what ``train`` does: its pipeline, or its
-    algorithm in its environment.
+def _add_defaults(data: dict[str, Any]) -> None:
+    """Let a sweep without settings train what ``train`` does by default: its pipeline, or its
+    algorithm and environment.
     """
     from sb3_quad.training.pipeline import is_pipeline
 
-    said = {**data, **data["grid"]}
-    files = said.get("conf_file") or []
-    if data.get("configurations") or any(
-        is_pipeline(file) for file in ([files] if isinstance(files, str) else files)
-    ):
-        return data
-    if not said.keys() & {"conf_file", "algo", "env"}:
-        return {**data, "conf_file": DEFAULT_PIPELINE}
-    return {"algo": DEFAULT_ALGO, "env": DEFAULT_ENV, **data}
+    keys = {**data, **data["grid"]}
+    files = keys.get("conf_file", [])
+    if isinstance(files, str):
+        files = [files]
+    if data.get("configurations") or any(is_pipeline(file) for file in files):
+        return
+    if not keys.keys() & {"conf_file", "algo", "env"}:
+        data["conf_file"] = DEFAULT_PIPELINE
+        return
+    data.setdefault("algo", DEFAULT_ALGO)
+    data.setdefault("env", DEFAULT_ENV)
 
 
-def _go_on(options: argparse.Namespace, plan: Any, place: Any) -> int:
-    """Do what is left of a sweep's Plan, in its SweepFolder (None: a new one). Returns the exit
-    code.
+def _execute(options: argparse.Namespace, plan: Any, folder: Any) -> int:
+    """Do what is left of a sweep. Returns the exit code.
+
+    :param plan: The sweep's Plan.
+    :param folder: Its SweepFolder, None for a new one.
     """
-    from sb3_quad.base.cores import available_cpus
     from sb3_quad.base.files import locked
-    from sb3_quad.base.signals import StopSignals
-    from sb3_quad.cli.output import console, progress_bar
+    from sb3_quad.base.process import StopSignals, available_cpus
+    from sb3_quad.cli.output import progress_bar
     from sb3_quad.executors import start_executor
-    from sb3_quad.sweep.folder import SweepFolder
-    from sb3_quad.sweep.results import evaluate, tables, write_report, write_results
     from sb3_quad.sweep.run import execute
-    from sb3_quad.training.runs import claim_folder
 
-    start, needs = time.perf_counter(), plan.spec.resources
+    start = time.perf_counter()
     workers = min(options.workers or available_cpus(), len(plan.runs))
+    needs = plan.spec.resources
+    runs = _count(len(plan.runs), "run")
     with start_executor(
         options.executor, workers, options.address, needs.num_cpus, needs.num_gpus
     ) as executor:
-        if place is None:
-            place = SweepFolder(
-                claim_folder(
-                    Path(options.log_folder or "logs") / "sweep", plan.spec.name or "sweep"
-                )
-            )
-            place.write(plan)
-        where = f"{executor.workers} side by side, executor {options.executor}"
-        print(f"sweep {place.path}: {_count(len(plan.runs), 'run')}, {where}")
+        # A new folder only once it is known that the executor starts.
+        if folder is None:
+            folder = _new_folder(options, plan)
+        parallel = f"{executor.workers} in parallel, executor {options.executor}"
+        print(f"sweep {folder.path}: {runs}, {parallel}")
         with (
-            locked(place.path, "sweep folder"),
+            locked(folder.path, "sweep folder"),
             StopSignals() as signals,
             progress_bar(options.progress) as show,
         ):
-            records = execute(place, plan, executor, signals, show, print)
+            records = execute(folder, plan, executor, signals, show, print)
+            # Nothing interrupts the results.
             signals.hold()
-            found = evaluate(plan, records)
-            write_results(place, found)
-            if found.groups:
-                shown = tables(found)
-                for table in (table for each in shown.values() for table in each):
-                    console().print(table)
-                write_report(place, found, shown)
+            results = _write_results(folder, plan, records)
     failures = [record for record in records.values() if record.state == "failed"]
-    finished = (
-        f"{found.finished} of {_count(len(plan.runs), 'run')} finished, {len(failures)} failed"
-    )
-    print(f"{finished}; {time.perf_counter() - start:.1f} s")
-    print(
-        f"saved in {place.path}: results.csv, results.json, runs/"
-        + (", report.md, report.html" if found.groups else "")
-    )
+    seconds = time.perf_counter() - start
+    print(f"{results.finished} of {runs} finished, {len(failures)} failed; {seconds:.1f} s")
+    report = ", report.md, report.html" if results.groups else ""
+    print(f"saved in {folder.path}: results.csv, results.json, runs/{report}")
     for record in failures:
         print(f"failed: {record.name}: {record.message}", file=sys.stderr)
     if signals.received is not None:
-        print(f"to go on: --resume {place.path}")
+        print(f"to continue: --resume {folder.path}")
         return signals.exit_code
     return 1 if failures else 0
 
 
+def _new_folder(options: argparse.Namespace, plan: Any) -> Any:
+    from sb3_quad.sweep.folder import SweepFolder
+    from sb3_quad.training.runs import claim_folder
+
+    parent = Path(options.log_folder or "logs") / "sweep"
+    folder = SweepFolder(claim_folder(parent, plan.spec.name or "sweep"))
+    folder.write(plan)
+    return folder
+
+
+def _write_results(folder: Any, plan: Any, records: Any) -> Any:
+    """Write and print the comparison of the finished runs, and return it."""
+    from sb3_quad.cli.output import console
+    from sb3_quad.sweep.results import evaluate, tables, write_report, write_results
+
+    results = evaluate(plan, records)
+    write_results(folder, results)
+    if results.groups:
+        sections = tables(results)
+        for section in sections.values():
+            for table in section:
+                console().print(table)
+        write_report(folder, results, sections)
+    return results
+
+
 def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")
+    return f"{number} {noun}" if number == 1 else f"{number} {noun}s"

@@ -1,17 +1,30 @@
-"""Search for hyperparameters: train with one choice after another, and write the best as a settings
-file.
+r"""Search for hyperparameters, and write the best ones as a settings file.
+
+Each trial trains an agent with other settings. The first one uses the settings
+unchanged.
 
 examples:
-  sb3-quad tune --algo dagger -n 250000 --n-trials 30               around zoo_configs/dagger.yml
-  sb3-quad tune --algo ppo_bc --env QuadStateRecovery-v0 -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip -n 3e6
-  sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler random --pruner none --seed 1
-  sb3-quad tune --algo dagger --storage logs/my_study.log           again or in another terminal: continues that study
-  sb3-quad tune --algo dagger --storage sqlite:///study.db --study-name noise_free --env-kwargs noise:0
-  sb3-quad tune --algo dagger --search-space my_space.yml --hyperparams n_epochs:4
-  sb3-quad train --algo dagger --env QuadTargetTracking-v0 --conf-file logs/tune/dagger/QuadTargetTracking-v0_1/best.yml
+  # around the settings in zoo_configs/dagger.yml
+  sb3-quad tune --algo dagger -n 250000 --n-trials 30
+  # from a trained agent
+  sb3-quad tune --algo ppo_bc --env QuadStateRecovery-v0 \
+    -i logs/dagger/QuadTargetTracking-v0_1/best_model.zip -n 3e6
+  # random search without a pruner
+  sb3-quad tune --algo ppo --env QuadStateRecovery-v0 --sampler random \
+    --pruner none --seed 1
+  # the same command again, or in another terminal, continues the study
+  sb3-quad tune --algo dagger --storage logs/my_study.log
+  sb3-quad tune --algo dagger --storage sqlite:///study.db \
+    --study-name noise_free --env-kwargs noise:0
+  # your own search space
+  sb3-quad tune --algo dagger --search-space my_space.yml \
+    --hyperparams n_epochs:4
+  # train with the best settings
+  sb3-quad train --algo dagger --env QuadTargetTracking-v0 \
+    --conf-file logs/tune/dagger/QuadTargetTracking-v0_1/best.yml
 
-The first trial uses the settings unchanged. Ctrl-C keeps the finished trials. Needs: pip install
-'.[tune]' from a clone.
+Ctrl-C keeps the finished trials. Needs Optuna: pip install '.[tune]' from a
+clone.
 """
 
 import argparse
@@ -20,11 +33,12 @@ from pathlib import Path
 from typing import Any
 
 from sb3_quad.base.errors import SB3QuadError
-from sb3_quad.base.signals import StopSignals
+from sb3_quad.base.process import StopSignals
 from sb3_quad.cli.commands.train import add_settings, make_config, prepare
 from sb3_quad.cli.parser import Parser, given, natural, positive, seed, whole
 
 JOURNAL = "study.log"
+# Episodes per evaluation by --vec-env.
 EPISODES = {"batch": 240, "dummy": 48, "subproc": 48}
 
 
@@ -36,39 +50,35 @@ def add_arguments(parser: Parser) -> None:
         "--n-trials",
         type=natural,
         default=500,
-        metavar="N",
-        help="trials of this process (500); 0: only write results",
+        help="trials of this process; 0 only writes the results (500)",
     )
     add(
         "--max-total-trials",
         type=positive,
-        metavar="N",
-        help="trials of the whole study, failed ones excluded (no limit)",
+        help="trials of the whole study, without failed ones (no limit)",
     )
     add(
         "--sampler",
         default="tpe",
         metavar="NAME",
-        help="proposes the trials: tpe (default), random or cmaes",
+        help="method that proposes trials: tpe (default), random or cmaes",
     )
     add(
         "--pruner",
         default="median",
         metavar="NAME",
-        help="cuts poor trials short: median (default), halving or none",
+        help="method that stops poor trials early: median (default), halving or none",
     )
     add(
         "--n-startup-trials",
         type=whole,
         default=10,
-        metavar="N",
         help="random trials before sampler and pruner start (10)",
     )
     add(
         "--n-evaluations",
         type=whole,
         default=10,
-        metavar="N",
         help="evaluations per trial, for the pruner (10)",
     )
     add(
@@ -80,7 +90,7 @@ def add_arguments(parser: Parser) -> None:
     add(
         "--search-space",
         metavar="FILE",
-        help="YAML file of what is varied (the package's, for the algorithm)",
+        help="YAML file of the settings to vary (the package's file for the algorithm)",
     )
     add(
         "-f",
@@ -89,18 +99,8 @@ def add_arguments(parser: Parser) -> None:
         metavar="DIR",
         help="results go to DIR/tune/ALGO/ENV_N (logs)",
     )
-    add(
-        "--seed",
-        type=seed,
-        metavar="N",
-        help="seed of trainings and sampler (0); negative: a random one",
-    )
-    add(
-        "--eval-episodes",
-        type=whole,
-        metavar="N",
-        help="episodes per evaluation (batch: 240, else 48)",
-    )
+    add("--seed", type=seed, help="seed of trainings and sampler, negative for a random one (0)")
+    add("--eval-episodes", type=whole, help="episodes per evaluation (batch: 240, else 48)")
 
 
 def run(options: argparse.Namespace) -> int:
@@ -111,21 +111,19 @@ def run(options: argparse.Namespace) -> int:
     prepare(options)
     with StopSignals() as signals:
         search = _make_search(options)
-        print(
-            f"study {search.name} in {search.storage}: {count_trials(search)}; results go to {search.job.log_folder}"
-        )
-        ended = list[Any]()
+        where = f"results go to {search.job.log_folder}"
+        print(f"study {search.name} in {search.storage}: {count_trials(search)}; {where}")
         with progress_bar(options.progress) as show:
             try:
-                show(0, options.n_trials, "trials")
-                while len(ended) < options.n_trials and signals.received is None:
+                for number in range(options.n_trials):
+                    show(number, options.n_trials, "trials")
+                    if signals.received is not None:
+                        break
                     trial = search.try_one(options.max_total_trials)
                     if trial is None:
                         break
-                    ended.append(trial)
                     write_results(search)
                     print(trial_line(search, trial))
-                    show(len(ended), options.n_trials, "trials")
             finally:
                 write_results(search)
     _print_results(search)
@@ -133,8 +131,8 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _make_search(options: argparse.Namespace) -> Any:
-    """The :class:`~sb3_quad.tuning.search.Search` that a command line describes; the folder of its
-    results is new.
+    """Return the :class:`~sb3_quad.tuning.search.Search` of a command line, with a new folder for
+    its results.
     """
     from sb3_quad.base.validate import validate
     from sb3_quad.training.config import build_config
@@ -144,23 +142,30 @@ def _make_search(options: argparse.Namespace) -> Any:
     from sb3_quad.tuning.space import load_space
 
     config = make_config(options)
-    if options.eval_env_kwargs is not None:  # into the settings, so that the best ones have it too
+    if options.eval_env_kwargs is not None:
+        # As a part of the settings, so that the best settings have it, too.
         evaluation = {**config.eval_env_kwargs, **options.eval_env_kwargs}
-        config = build_config(
-            config.algo, config.env_id, {**config.settings, "eval_env_kwargs": evaluation}
-        )
+        settings = {**config.settings, "eval_env_kwargs": evaluation}
+        config = build_config(config.algo, config.env_id, settings)
     space = load_space(config.algo, config.settings, options.search_space)
-    episodes = EPISODES[config.vec_env] if options.eval_episodes is None else options.eval_episodes
+    episodes = options.eval_episodes
+    if episodes is None:
+        episodes = EPISODES[config.vec_env]
     arguments = given(options, "device", "trained_agent", "n_eval_envs", "seed")
-    job = validate(
-        TrainingJob, {**arguments, "config": config, "eval_episodes": episodes}, "command line"
-    )
+    arguments |= {"config": config, "eval_episodes": episodes}
+    job = validate(TrainingJob, arguments, "command line")
     folder = claim_folder(Path(options.log_folder) / "tune" / config.algo, file_name(config.env_id))
-    name = options.study_name or f"{config.algo}_{config.env_id}"
-    study = options.sampler, options.pruner, options.n_startup_trials, options.n_evaluations
     try:
-        job = job.model_copy(update={"log_folder": str(folder)})
-        return Search(job, space, name, options.storage or folder / JOURNAL, *study)
+        return Search(
+            job.model_copy(update={"log_folder": str(folder)}),
+            space,
+            options.study_name or f"{config.algo}_{config.env_id}",
+            options.storage or folder / JOURNAL,
+            options.sampler,
+            options.pruner,
+            options.n_startup_trials,
+            options.n_evaluations,
+        )
     except SB3QuadError:
         with suppress(OSError):
             folder.rmdir()
@@ -168,9 +173,7 @@ def _make_search(options: argparse.Namespace) -> Any:
 
 
 def _print_results(search: Any) -> None:
-    """Print the best trial, its agent on episodes by which nothing was chosen, and where everything
-    is.
-    """
+    """Print the best trial, its agent on fresh episodes, and where everything is."""
     from sb3_quad.cli.closing import agent_and_expert
     from sb3_quad.cli.output import console
     from sb3_quad.controllers.zips import load_model
@@ -179,18 +182,19 @@ def _print_results(search: Any) -> None:
     from sb3_quad.tuning.results import count_trials, settings_of, train_command, trial_line
     from sb3_quad.tuning.search import RUN
 
-    known, best = search.job.config, search.best
+    config = search.job.config
+    best = search.best
     if best is not None:
         print(f"the best: {trial_line(search, best)}")
         path = Path(best.user_attrs[RUN])
-        if known.task is not None and path.is_dir():  # a process elsewhere may have trained it
-            run, config = open_run(path), build_config(known.algo, known.env_id, settings_of(best))
-            console().print(
-                agent_and_expert(
-                    search.job.model_copy(update={"config": config}), load_model(run.model)
-                )
-            )
-            print(f"agent: {run.model}")
+        # A process on another machine may have trained it.
+        if config.task is not None and path.is_dir():
+            model = open_run(path).model
+            flown = build_config(config.algo, config.env_id, settings_of(best))
+            job = search.job.model_copy(update={"config": flown})
+            console().print(agent_and_expert(job, load_model(model)))
+            print(f"agent: {model}")
         print(f"to train: {train_command(search)}")
     print(f"{count_trials(search)}; saved in {search.job.log_folder}")
-    print(f"to go on, the same command with --storage {search.storage} --study-name {search.name}")
+    study = f"--storage {search.storage} --study-name {search.name}"
+    print(f"to continue, run the same command with {study}")

@@ -16,10 +16,10 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from sb3_quad.base import __version__
 from sb3_quad.base.arrays import Float32Array
 from sb3_quad.base.colours import COLOURS, colours_of
 from sb3_quad.base.errors import ConfigError
-from sb3_quad.base.version import __version__
 from sb3_quad.controllers.agent_settings import agent_settings
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.evaluation.controllers import ControllerSpec

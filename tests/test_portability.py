@@ -1,0 +1,104 @@
+"""Windows has no fcntl, no SIGHUP and no fork: without them the package is imported, flies, trains
+and resumes.
+"""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sb3_quad.base.errors import ConfigError
+from sb3_quad.base.files import LOCK, locked
+
+ROOT = Path(__file__).resolve().parent.parent
+WITHOUT_POSIX = """
+import os, signal, sys
+sys.modules["fcntl"] = sys.modules["resource"] = sys.modules["pwd"] = None
+for module, name in [
+    (signal, "SIGHUP"), (signal, "SIGKILL"), (os, "fork"),
+    (os, "sched_getaffinity"),
+]:
+    if hasattr(module, name):
+        delattr(module, name)
+"""
+SETTINGS = "n_timesteps: 200, n_envs: 4, n_steps: 25, batch_size: 50, gradient_steps: 2"
+TRAIN = f"""
+from pathlib import Path
+from sb3_quad.base.files import locked
+from sb3_quad.cli import main
+
+Path("tiny.yml").write_text("QuadTargetTracking-v0: {{{SETTINGS}}}")
+command = ["train", "--algo", "dagger", "--conf-file", "tiny.yml", "--eval-episodes", "0"]
+assert main([*command, "--no-progress"]) == 0
+run = Path("logs/dagger/QuadTargetTracking-v0_1")
+assert main(["train", "--resume", str(run)]) == 0
+with locked(run, "run folder"):
+    assert main(["train", "--resume", str(run)]) == 2
+evaluate = "evaluate pid geometric --suite quick --episodes 2 --scenario recovery --no-report"
+assert main([*evaluate.split(), "--workers", "2"]) == 0
+"""
+DAGGER = """
+from sb3_quad import DAgger
+from sb3_quad.envs import QuadcopterVecEnv
+
+env = QuadcopterVecEnv(4, seed=0)
+DAgger("MlpPolicy", env, expert="pid", n_steps=25, batch_size=50, gradient_steps=2).learn(100)
+"""
+MAKE = """
+import gymnasium
+import sb3_quad
+
+env = gymnasium.make("QuadTargetTracking-v0")
+env.reset(seed=0)
+env.step(env.action_space.sample())
+"""
+HELP = "from sb3_quad.cli import main; assert main(['--help']) == main(['train', '--help']) == 0"
+
+
+@pytest.mark.parametrize(
+    "code",
+    [HELP, DAGGER, pytest.param(MAKE, id="make"), pytest.param(TRAIN, marks=pytest.mark.slow)],
+    ids=("help", "dagger", "make", "train"),
+)
+def test_nothing_needs_posix(code, tmp_path):
+    if code is MAKE:
+        pytest.importorskip("pybullet")
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_POSIX + f"sys.path.insert(0, {str(ROOT)!r})\n" + code],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    if code is TRAIN:
+        assert "another process is writing to it" in done.stderr
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from sb3_quad.base.files import locked
+with locked(Path(sys.argv[1]), "run folder"):
+    print("locked", flush=True)
+    time.sleep(100)
+"""
+
+
+def test_a_lock_refuses_a_second_process_and_ends_with_the_first(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout.readline() == "locked\n"
+        with pytest.raises(ConfigError) as caught, locked(tmp_path, "run folder"):
+            pass
+        assert str(caught.value).startswith(f"run folder {tmp_path}: another process is writing")
+    finally:
+        process.kill()
+        process.wait()
+    (tmp_path / ".half.tmp").touch()
+    with locked(tmp_path, "run folder"):
+        assert [path.name for path in tmp_path.iterdir()] == [LOCK]
+    assert list(tmp_path.iterdir()) == []
