@@ -16,7 +16,8 @@ from sb3_quad.base.imports import import_packages
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY, QuadcopterState

@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains, privileged_derived
+from sb3_quad.experts.geometric import GeometricExpert, privileged_derived
+from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.simulation.state import (
     BODY_RATES,
     POSITION,
