@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.batch_env import FlightKeywords
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.settings import FlightSettings
@@ -371,6 +372,10 @@ def test_the_manual_lists_every_argument() -> None:
     cells = [line.split("|")[1] for line in table.splitlines() if line.strip().startswith("| `")]
     listed = {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
     drawn = {"render_mode", "render_width", "render_height"}
-    assert listed == {*FlightSettings.model_fields, *drawn} - {
-        "max_episode_steps"
-    }  # an argument of gymnasium.make
+    # max_episode_steps is an argument of gymnasium.make.
+    assert listed == {*FlightSettings.model_fields, *drawn} - {"max_episode_steps"}
+
+
+def test_the_typed_keywords_are_the_flight_settings() -> None:
+    typed = {"task", "task_kwargs", *FlightKeywords.__annotations__}
+    assert typed == FlightSettings.model_fields.keys()
