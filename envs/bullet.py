@@ -188,7 +188,7 @@ class Renderer:
     def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
         """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,). Call it every control step.
 
-        :return: uint8 (height, width, 3). If there is a window, None: it is drawn WINDOW_FPS times a
+        :return: uint8 (height, width, 3). If there is a window, None: it shows WINDOW_FPS frames a
             second, and this call waits until real time has caught up.
         """
         control_step = self.vehicle.control_step

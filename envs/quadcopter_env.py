@@ -175,7 +175,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
     | Method | Sets |
     |--------|------|
     | `set_target(position)` | r_T, (3,), world frame, m |
-    | `set_wrench(force, torque, …)` | an external force, N, and torque, N m, at the centre of mass |
+    | `set_wrench(force, torque, …)` | an external force, N, and torque, N m, at the mass centre |
     | `set_wind(velocity)` | the velocity of the air, (3,), world frame, m/s |
     | `set_noise(level)` | the relative standard deviation of the observation noise |
 

@@ -57,7 +57,7 @@ class Controller:
     :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
     :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
     :param made_for: the ``expert=`` argument and the environment that :meth:`for_env` compares.
-    :raises ConfigError: the source is none of the three, or its spaces do not fit (of an expert:
+    :raises ConfigError: the source is of no kind above, or its spaces do not fit (of an expert:
         ``ExpertError``).
     """
 

@@ -34,7 +34,7 @@ from sb3_quad.base.trust import VARIABLE
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {VARIABLE}=1)"
 Names = dict[tuple[str, str], Any]
-"""What stands for a module and a name in it."""
+"""Objects by module and name."""
 
 
 def unpickle(text: str, where: str) -> Any:

@@ -20,7 +20,7 @@ _LATE_TO = 0.125
 
 
 class LawConstants(NamedTuple):
-    """What the law knows of n vehicles, one column for each."""
+    """Constants of n vehicles, one column for each."""
 
     gains: FloatArray
     """Shape (len(GAIN_NAMES), n), in the order of ``GAIN_NAMES``."""
