@@ -76,9 +76,9 @@ class BatchEnv:
         n: int,
         seed: int | None,
         n_threads: int | None,
-        autoreset: bool,
         task: TaskSpec,
         task_kwargs: Mapping[str, Any] | None,
+        autoreset: bool,
         **keywords: Unpack[FlightKeywords],
     ) -> None:
         """Make the batch of n rows that fly as the keywords say.
@@ -87,6 +87,7 @@ class BatchEnv:
             environment's class.
         """
         name = type(self).__name__
+        # Check the names first, so that a slip in one of the constructor's own is recognised, too.
         own = inspect.signature(type(self)).parameters.keys() - {"keywords"}
         valid = own | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
@@ -98,6 +99,7 @@ class BatchEnv:
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
         """Return a copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""
+        # A single column stands for all rows where they do not differ.
         return np.broadcast_to(columns.T, (self.batch.n, *columns.shape[:-1])).copy()
 
     def true_state(self) -> QuadcopterState:

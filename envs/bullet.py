@@ -68,6 +68,7 @@ class BulletBody:
         # garbage-collected without close(), and when the interpreter exits.
         self._close = weakref.finalize(self, disconnect, client)
 
+        # A sphere without damping by PyBullet itself; drag is added in :meth:`fly`.
         p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=client)
         p.setPhysicsEngineParameter(
             fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=client
@@ -80,6 +81,7 @@ class BulletBody:
             self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=client
         )
         self.become(vehicle.parameters())
+        # The body must not collide with the ground or a target that is drawn.
         p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=client)
 
     def become(self, parameters: FloatArray) -> None:
@@ -100,6 +102,7 @@ class BulletBody:
 
     def place(self, state: QuadcopterState) -> None:
         """Put the body where the first vehicle of ``state`` is."""
+        # PyBullet's quaternions end with w, and its angular velocities are in the world frame.
         w, x, y, z = state.quaternion[0].tolist()
         rates = state.rotation[0] @ state.body_rates[0]
         p.resetBasePositionAndOrientation(
@@ -123,6 +126,7 @@ class BulletBody:
         body = self.body
         world_force = wrench[FORCE_WORLD].tolist()
         world_torque = wrench[TORQUE_WORLD].tolist()
+        # Calls of PyBullet are slow, so leave out those that do nothing.
         is_disturbed = any(world_force) or any(world_torque)
         for force, torque in wrenches.tolist():
             if is_disturbed:
@@ -132,6 +136,7 @@ class BulletBody:
                     body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client
                 )
                 p.applyExternalTorque(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+            # Drag depends on the velocity, which differs by physics step.
             if drag is not None:
                 force = np.add(force, self._drag(drag, wind))
             p.applyExternalForce(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
@@ -198,6 +203,7 @@ class Renderer:
             self._place(state, wrench)
             return self.scene.picture(camera)
 
+        # Draw only so many frames, and wait for real time in each control step.
         self.frames_due += WINDOW_FPS * control_step
         if self.frames_due >= 1.0:
             self.frames_due %= 1.0

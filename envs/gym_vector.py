@@ -62,8 +62,9 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
-        self._make_batch(num_envs, seed, n_threads, False, task, task_kwargs, **keywords)
+        self._make_batch(num_envs, seed, n_threads, task, task_kwargs, autoreset=False, **keywords)
         self.num_envs = self.batch.n
+        # The batch does not reset rows by itself, since both modes need their last observations.
         # Rows that the next step resets, in mode NextStep.
         self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         self.single_observation_space, self.single_action_space = quadcopter_spaces(
@@ -88,6 +89,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
                 f"reset option {key!r}: the batched environment takes none; "
                 "call set_target after it"
             )
+        # Rows whose seed is None continue with their stream.
         if isinstance(seed, (int, np.integer)):
             self.batch.seed(row_seeds(int(seed), self.num_envs))
         elif seed is not None:
@@ -111,6 +113,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         :return: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos.
         """
         observations, rewards, done = self.batch.step(actions)
+        # In mode NextStep a step of a row that has ended is its reset, without reward.
         if self._mode is AutoresetMode.NEXT_STEP and self._ended.any():
             observations = self._begin(self._ended)
             rewards[self._ended] = 0.0
@@ -145,6 +148,7 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
 
         The other rows are zeros.
         """
+        # Gymnasium's form: values of all rows, and a mask of those that have one.
         mask = np.ones(self.num_envs, dtype=np.bool_) if rows is None else rows.copy()
         infos = {key: self.batch.outcome[field] * mask for key, field in INFOS.items()}
         return infos | {f"_{key}": mask for key in infos}

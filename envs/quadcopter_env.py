@@ -19,6 +19,7 @@ from sb3_quad.simulation.state import BODY_RATES, POSITION, QUATERNION, TARGET, 
 from sb3_quad.simulation.tasks import TaskSpec
 from sb3_quad.vehicles.vehicle import Vehicle
 
+# Parts of the state that ``reset`` can fix, and their rows.
 _START = {
     "position": POSITION,
     "quaternion": QUATERNION,
@@ -206,13 +207,14 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         if render_mode is not None and render_mode not in RENDER_MODES:
             raise ConfigError(unknown("render_mode", render_mode, RENDER_MODES))
         check_size(render_width, render_height)
+        # Gymnasium's TimeLimit truncates, so the batch must not.
         steps = keywords.setdefault("max_episode_steps", ENDLESS)
         if steps != ENDLESS:
             raise ConfigError(
                 f"max_episode_steps {steps}: give it to gymnasium.make, whose TimeLimit truncates"
             )
         # One row of the batched environment. PyBullet moves its body.
-        self._make_batch(1, seed, 1, False, task, task_kwargs, **keywords)
+        self._make_batch(1, seed, 1, task, task_kwargs, autoreset=False, **keywords)
         self._ready = False
         self.observation_space, self.action_space = quadcopter_spaces(self.batch.observation.size)
         self.render_mode = render_mode
@@ -247,8 +249,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         for rows, values in fixed:
             batch.state[rows, 0] = values
 
+        # The simulation was closed, or the user has shut its window.
         if not self._body.connected:
             self._open()
+        # Each episode may have another vehicle.
         self._body.become(batch.vehicles[:, 0])
         self._body.place(self.true_state())
         self._ready = True
@@ -256,6 +260,7 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             self._renderer.reset(batch.state[:, 0])
         if self.render_mode == "human":
             self._draw()
+        # The outcome that an info shows is that of the new episode.
         batch.clear_outcome()
         return self.observe(), self._info()
 
@@ -274,9 +279,11 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
             )
         if not self._ready:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
+        # The sum is finite only if all numbers are; this is faster than NumPy for four of them.
         if not math.isfinite(sum(array.tolist())):
             raise ValueError(f"action {array.tolist()}: every number must be finite")
 
+        # The batch turns the rotors and scores; between them PyBullet moves the body.
         batch = self.batch
         drag = batch.vehicles[P.drag_x : P.drag_z + 1, 0] if batch.has_drag else None
         rotor_wrenches = batch.turn_rotors(array[None])

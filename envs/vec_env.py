@@ -77,9 +77,11 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         n_threads: int | None = None,
         **keywords: Unpack[FlightKeywords],
     ) -> None:
-        self._make_batch(n_envs, seed, n_threads, True, task, task_kwargs, **keywords)
-        self.render_mode = None  # only QuadcopterEnv draws
+        self._make_batch(n_envs, seed, n_threads, task, task_kwargs, autoreset=True, **keywords)
+        # Only QuadcopterEnv draws.
+        self.render_mode = None
         self._staggered = staggered
+        # The list is reused in every step; only rows that end or have just ended change.
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
@@ -88,6 +90,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, 18)."""
+        # SB3 passes options through a method of their own, before the reset.
         if any(self._options):
             self._reset_options()
             raise ConfigError(
@@ -107,7 +110,11 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Fly one control step: observations (n, 18), rewards (n,), done (n,), infos."""
+        """Fly one control step.
+
+        :return: observations (n, 18), rewards (n,), done (n,), infos.
+        """
+        # An info holds until the next step.
         for row in self._ended:
             self._infos[row] = {}
         observations, rewards, dones = self.batch.step(self._actions)
@@ -143,6 +150,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Return an attribute of the given rows, one value per row."""
         rows = self.batch.rows(indices)
+        # Attributes of rows differ by row; all others belong to the environment.
         if attr_name == "vehicle":
             return [self.batch.vehicle_list[row] for row in rows]
         value = getattr(self, attr_name)

@@ -26,10 +26,12 @@ def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
     :raises ConfigError: a zip or settings that cannot be read or do not fit; settings of several
         runs next to the zip; or statistics of VecNormalize, which a zip does not hold.
     """
+    # Zips of this package say it themselves.
     record = saved_data(zip_file).get(KEY)
     if isinstance(record, dict):
         return _settings_of_zip(record, f"{zip_file}: {KEY}"), Path(zip_file)
 
+    # Other zips, such as those of rl_zoo3, lie in a run folder.
     folder = Path(zip_file).parent
     for statistics in sorted(folder.glob("*/vecnormalize.pkl")):
         raise ConfigError(
@@ -68,6 +70,7 @@ def _settings_of_run(config: Path) -> FlightSettings:
         if evaluated is not None:
             parts = [evaluated]
 
+    # The folder has the name of the environment, which says the task.
     where = f"{config}: env_kwargs"
     given: dict[str, Any] = {}
     if config.parent.name in ENVIRONMENTS:
@@ -82,6 +85,7 @@ def _refuse_paths(record: dict[str, Any], where: str) -> None:
 
     :raises ConfigError: the record holds a path where a name may stand.
     """
+    # Both a vehicle and a distribution may be given by a name, which could be a path.
     distribution = record.get("vehicles")
     if isinstance(distribution, dict):
         distribution = distribution.get("distribution")

@@ -81,6 +81,7 @@ class Controller:
         error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
         who = f"{kind} {self.name}"
 
+        # Refuse a controller that cannot work at once, not in the first step of a training.
         if isinstance(source, type):
             raise error(f"{who}: is a class; give an instance, such as {self.name}()")
         if not isinstance(action_space, spaces.Box):
@@ -91,6 +92,7 @@ class Controller:
                 f"{kind} {source!r}: needs actions(state) or predict(observation), "
                 "or must be a function of observations"
             )
+        # SB3's models and policies have spaces. Other controllers need none.
         for name, ours in (
             ("observation_space", observation_space),
             ("action_space", action_space),
@@ -105,6 +107,7 @@ class Controller:
         if not (self.needs_state or has_predict or callable(source)):
             raise error(f"{who}: needs the true state, and this environment has no true_state()")
 
+        # Actions are checked and clipped as flat rows.
         self._action_shape = action_space.shape
         self._low: Float32Array = action_space.low.reshape(-1).astype(np.float32)
         self._high: Float32Array = action_space.high.reshape(-1).astype(np.float32)
@@ -129,6 +132,7 @@ class Controller:
                 "no expert: give expert=... when building or loading the model, "
                 "or call set_expert(expert)"
             )
+        # A recurrent expert keeps its state as long as it labels the same environment.
         if present is not None and present.made_for is not None:
             present_expert, present_env = present.made_for
             if present_expert is expert and present_env is env:
@@ -168,6 +172,7 @@ class Controller:
         except (Exception, SystemExit) as failure:  # a user's controller may raise anything
             raise error(f"{who}: fails with {type(failure).__name__}: {failure}") from failure
 
+        # Floats, integers and booleans.
         if raw.dtype.kind not in "fiub":
             raise error(f"{who}: gives actions of type {raw.dtype}, must be real numbers")
         # Dictionary observations have a batch axis in each entry.
@@ -180,6 +185,7 @@ class Controller:
             raise error(f"{who}: gives actions of shape {raw.shape}, must be {shape}")
         actions = raw.reshape(flat_shape).astype(np.float32)
 
+        # Rows that do not matter may hold anything, such as labels of a finished flight.
         if rows is not None:
             actions[~rows] = 0.0
         finite = np.isfinite(actions).all(axis=1)
@@ -204,6 +210,7 @@ class Controller:
             return self.source.actions(self._true_state())
         if not hasattr(self.source, "predict"):
             return self.source(observation)
+        # Without a state yet, the policy begins by itself. Many policies take no such keywords.
         keywords: dict[str, Any] = {}
         if self._predict_state is not None:
             keywords["state"] = self._predict_state
@@ -217,6 +224,7 @@ class Controller:
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
     """Return a function that returns the true state of all rows; None if ``env`` has no state."""
+    # The batched environment has the state of all rows; others have one for each environment.
     base: Any = env.unwrapped
     if hasattr(base, "true_state"):
         return cast(Callable[[], QuadcopterState], base.true_state)

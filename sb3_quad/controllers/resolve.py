@@ -10,6 +10,7 @@ from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
+# Experts by name, and their factories, which are imported when they are asked for.
 EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
@@ -43,6 +44,7 @@ def resolve_expert(
     if not isinstance(spec, (str, Path)):
         return spec
     text = str(spec)
+    # A policy of the package and a run folder stand for a zip.
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)

@@ -332,6 +332,7 @@ def _interpret(content: bytes) -> Any:
         if name in _LITERALS:
             stack.append(argument)
         elif name in _OPERATIONS or name in _MARK_OPERATIONS:
+            # Take the items off the stack, and push the result.
             above: list[Any] = []
             if name in _OPERATIONS:
                 count, operation = _OPERATIONS[name]
@@ -342,6 +343,7 @@ def _interpret(content: bytes) -> Any:
             stack.append(operation(*reversed(items), *above))
         elif name == "GLOBAL":
             stack.append(_find(*argument.split(" ")))
+        # A mark begins a new stack on top of the present one.
         elif name == "MARK":
             below.append(stack)
             stack = []
@@ -349,6 +351,7 @@ def _interpret(content: bytes) -> Any:
             stack = below.pop()
         elif name == "POP":
             stack.pop()
+        # The memo is how a pickle names an object twice.
         elif name == "MEMOIZE":
             memo[len(memo)] = stack[-1]
         elif name in ("BINPUT", "LONG_BINPUT"):

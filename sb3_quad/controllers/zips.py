@@ -118,6 +118,7 @@ def load_zip(
     :raises ConfigError: a missing or damaged file, or one that may run code of its own.
     """
     where = where or f"model {path}"
+    # What stands in ``custom_objects`` is not unpickled by SB3.
     objects: dict[str, Any] = {}
     data = {} if trusted() else saved_data(path, where)
     for key, entry in data.items():
@@ -128,6 +129,7 @@ def load_zip(
                 objects[key] = _STAND_INS.get(key)
             else:
                 objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
+    # SB3 sets variables by their names, on any part of the model.
     try:
         if data:
             variables = load_from_zip_file(path, load_data=False, device="cpu")[2] or {}
@@ -161,6 +163,7 @@ def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
     for stock, _, ours in _OURS:
         if name == ours:
             name = stock
+    # ``predict`` of this package's algorithms is that of the stock ones.
     library = stable_baselines3
     if name == "RecurrentPPO":
         library = require("sb3_contrib", "", f"model {path}")

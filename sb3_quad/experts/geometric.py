@@ -88,6 +88,7 @@ class GeometricExpert(Expert):
             )
         self.reserve = reserve
         self.gains = gains or self.vehicle.geometric_gains or derived_gains(self.vehicle)
+        # The law's constants for the vehicle as designed, and if they are known, for the true ones.
         self._nominal = constants_of(
             self.vehicle.parameters()[:, None],
             self.vehicle.control_step,
@@ -113,9 +114,10 @@ class GeometricExpert(Expert):
         """Return the external wrench less a part of the vehicles' own drag."""
         if state.vehicles is None or not state.vehicles[P.drag_x : P.drag_z + 1].any():
             return wrench
-        still_air = np.zeros((3, 1))
+        # Drag against the air at rest is that of the vehicle's own motion.
+        at_rest = np.zeros((3, 1))
         wrench = wrench.copy()
-        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, still_air)
+        wrench[FORCE_WORLD] -= _DRAG_LEFT * drag_forces(state.array, state.vehicles, at_rest)
         return wrench
 
 

@@ -59,6 +59,7 @@ def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
 
     :param v: parameters of n vehicles, (len(PARAMETER_NAMES), n).
     """
+    # How quickly the vehicle can turn: the weaker of roll and pitch counts.
     gravity = v[P.gravity]
     lag = _command_lag(v, control_step)
     roll_pitch_arms = v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)
@@ -106,6 +107,7 @@ def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawCo
     :param v: parameters, (len(PARAMETER_NAMES), n).
     :param gains: (len(GAIN_NAMES), n).
     """
+    # [ΣF; Mx; My; Mz] = mixer · F: ones, then the arms of the rotors about each axis.
     arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
     mixers = np.concatenate([np.ones_like(arms[:1]), arms])
     constants = LawConstants(
@@ -142,6 +144,7 @@ class TrueConstants:
 
     def of(self, vehicles: FloatArray) -> LawConstants:
         """Return the constants for parameters (len(PARAMETER_NAMES), n)."""
+        # Another number of vehicles is another environment.
         if self._seen.shape != vehicles.shape:
             self._seen = vehicles.copy()
             self._constants = self._compute(vehicles)

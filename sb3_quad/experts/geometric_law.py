@@ -32,6 +32,7 @@ def fly_geometric(state, constants, wrench, reserve, actions):
     :param wrench: the external wrench to compensate, (WRENCH_SIZE, n) or (WRENCH_SIZE, 1).
     :param reserve: thrust kept back for braking a descent, in weights.
     """
+    # Each vehicle's gains are copied, so that they lie side by side. One column stands for all.
     gains = np.empty(constants.gains.shape[0])
     for i in range(actions.shape[0]):
         k = min(i, constants.gains.shape[1] - 1)
@@ -63,6 +64,7 @@ def fly_geometric(state, constants, wrench, reserve, actions):
         b = divided(rotated(rotation_inverse, f), size)
         b = seen_later(b, omega, constants.lag[k])
 
+        # Moments for the turn, against the yaw rate, and against the external torque.
         mx, my = turn_moments(b, omega, gains, inertia)
         mz = -gains[G.yaw_rate] * inertia[2] * omega[2]
         moments = difference((mx, my, mz), torque)
@@ -237,6 +239,7 @@ def allocate(thrust, moments, mixer_inverse, low, high, actions):
         if abs(yaw) * share > room:
             share = max(0.0, room / abs(yaw))
 
+    # Eq. 3.18: actions are thrusts between the limits, as numbers from -1 to 1.
     for rotor in range(4):
         without_yaw = common + scale * tilting_thrust(mixer_inverse, moments, rotor)
         rotor_thrust = without_yaw + share * mixer_inverse[rotor, 3] * moments[2]

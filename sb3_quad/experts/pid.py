@@ -52,6 +52,7 @@ class PIDExpert(Expert):
                 raise ConfigError(
                     f"PIDExpert: {name} is {value}, must be a finite number of at least 0"
                 )
+        # Table A.1, for any inertia (Eq. 3.15).
         v = self.vehicle
         inertia = np.asarray(v.inertia)
         position_gains = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
@@ -91,6 +92,7 @@ def _pid(state, gains, attitude_gains, mixer_inverse, limits, actions):  # type:
     half = (high - low) / 2
     for i in range(actions.shape[0]):
         position_error = difference(vector_at(state, X.target, i), vector_at(state, X.position, i))
+        # The velocity in the body frame, and the Euler angles Z-Y-X.
         rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
         velocity = rotated(rotation_inverse, vector_at(state, X.velocity, i))
         p, q, r = vector_at(state, X.body_rates, i)

@@ -75,6 +75,7 @@ class Expert(ABC):
                 f"{type(self).__name__}: observation of shape {array.shape}, "
                 f"expected ({OBSERVATION_SIZE},) or (n, {OBSERVATION_SIZE})"
             )
+        # One observation is a batch of one.
         rows = np.atleast_2d(array)
         actions = self.actions(observed_state(rows, self.observation_mean, self.observation_std))
         return actions.reshape(*array.shape[:-1], -1), state
@@ -94,6 +95,7 @@ def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -
     array[POSITION] = part["position"].T
     array[QUATERNION] = _nearest_quaternion(body_to_world).T
     array[BODY_RATES] = part["body_rates"].T
+    # The feature is in the body frame, the state in the world frame.
     state = QuadcopterState(array)
     array[VELOCITY] = np.einsum("nij,nj->in", state.rotation, part["velocity"])
     return state
