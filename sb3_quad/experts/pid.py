@@ -73,20 +73,16 @@ class PIDExpert(Expert):
 
 
 @compiled
-def _rotor_thrust(mixer_row, thrust, roll_moment, pitch_moment, yaw_moment):  # type: ignore[no-untyped-def]
-    return (
-        mixer_row[0] * thrust
-        + mixer_row[1] * roll_moment
-        + mixer_row[2] * pitch_moment
-        + mixer_row[3] * yaw_moment
-    )
+def _rotor_thrust(mixer_row, u1, u2, u3, u4):  # type: ignore[no-untyped-def]
+    """Return the thrust of a rotor, N, for a thrust u1 and moments u2, u3, u4 (Eq. 2.7)."""
+    return mixer_row[0] * u1 + mixer_row[1] * u2 + mixer_row[2] * u3 + mixer_row[3] * u4
 
 
 @compiled
-def _pid(state, gains, attitude_gains, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
+def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
     """Write the actions of n vehicles, (n, 4), from their state, (STATE_SIZE, n)."""
     kp, kd, ki_dt, mass, g = gains
-    proportional, derivative = attitude_gains
+    proportional, derivative = attitude
     low, high = limits
     middle = (high + low) / 2
     half = (high - low) / 2
