@@ -296,8 +296,10 @@ class QuadcopterEnv(BatchEnv, gymnasium.Env[Float32Array, Float32Array]):
         return observations[0], float(batch.outcome["reward"][0]), not info["survival"], False, info
 
     def _info(self) -> dict[str, Any]:
-        outcome = self.batch.outcome[0]
-        return {key: outcome[field].item() for key, field in INFOS.items()}
+        # One item() for all fields takes less time than one for each.
+        fields = self.batch.outcome.dtype.names or ()
+        outcome = dict(zip(fields, self.batch.outcome[0].item(), strict=True))
+        return {key: outcome[field] for key, field in INFOS.items()}
 
     def render(self) -> Image | None:
         """Return a picture, uint8 (height, width, 3), in render mode ``"rgb_array"``.
