@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TASKS", "QuadcopterEnv", "QuadcopterVecEnv", "QuadcopterVectorEnv", "Task"]
 
-# Imported on first use: `import sb3_quad` waits neither for pybullet nor for numba nor for torch
+# Imported on first use, so that `import sb3_quad` need not wait for pybullet, numba and torch.
 _LAZY = {
     "QuadcopterEnv": "sb3_quad.envs.quadcopter_env",
     "QuadcopterVecEnv": "sb3_quad.envs.vec_env",

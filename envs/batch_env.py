@@ -1,88 +1,160 @@
-"""What all environments have in common: their spaces, and what they can be asked and told in
-flight.
-"""
+"""The part that all environments share: spaces, keywords, and reading and setting in flight."""
 
-import functools
 import inspect
-from collections.abc import Callable
-from typing import Any, Concatenate, ParamSpec, TypeVar
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypedDict
 
 import numpy as np
+import numpy.typing as npt
 from gymnasium import spaces
+from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import FloatArray
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.validate import validate
-from sb3_quad.simulation.batch import QuadcopterBatch
+from sb3_quad.simulation.batch import QuadcopterBatch, Rows
+from sb3_quad.simulation.frames import PositionIntegral
 from sb3_quad.simulation.observation import OBSERVATION_SIZE
-from sb3_quad.simulation.settings import FlightSettings
-from sb3_quad.simulation.state import TARGET
+from sb3_quad.simulation.randomization import Randomization
+from sb3_quad.simulation.settings import FlightSettings, Noise
+from sb3_quad.simulation.state import TARGET, QuadcopterState
 from sb3_quad.simulation.tasks import TaskSpec
+from sb3_quad.simulation.vehicle_distribution import VehicleDistribution
 from sb3_quad.vehicles.vehicle import Vehicle
 
-P = ParamSpec("P")
-T = TypeVar("T")
-INFOS = {"is_success": "success", "survival": "truncated"} | {
-    key: key for key in ("distance", "collision", "out_of_range")
+# Keys of an info, and the fields of ``batch.outcome`` that they show.
+INFOS = {
+    "is_success": "success",
+    "survival": "truncated",
+    "distance": "distance",
+    "collision": "collision",
+    "out_of_range": "out_of_range",
 }
-"""Keys of an info, and the fields of ``batch.outcome`` that they show."""
 
 
-def _of_batch(
-    method: Callable[Concatenate[QuadcopterBatch, P], T],
-) -> Callable[Concatenate["BatchEnv", P], T]:
-    """The method of an environment that is this one of its batch."""
+class FlightKeywords(TypedDict, total=False):
+    """Keywords of the environments for editors and type checkers.
 
-    @functools.wraps(method)
-    def call(self: "BatchEnv", /, *args: P.args, **kwargs: P.kwargs) -> T:
-        return method(self.batch, *args, **kwargs)
+    :class:`~sb3_quad.simulation.settings.FlightSettings` declares them, with their defaults and
+    meanings. Each constructor adds ``task`` and ``task_kwargs``, and a test holds both lists equal.
+    """
 
-    return call
+    vehicle: str | Path | Vehicle | Sequence[str | Path | Vehicle]
+    rotor_layout: str | Path | Vehicle | None
+    noise: float | Sequence[float] | npt.NDArray[Any] | Mapping[str, float] | Noise
+    observation_mean: npt.ArrayLike | None
+    observation_std: npt.ArrayLike | None
+    last_action: bool
+    history: Sequence[int] | None
+    position_integral: Mapping[str, Any] | PositionIntegral | None
+    vehicles: Mapping[str, Any] | VehicleDistribution | None
+    randomize: Mapping[str, Any] | Randomization | None
+    max_episode_steps: int | Sequence[int]
 
 
 def quadcopter_spaces(size: int = OBSERVATION_SIZE) -> "tuple[spaces.Box[Any], spaces.Box[Any]]":
-    """Observation and action space of one quadcopter; made anew, since each space has random
-    numbers of its own.
+    """Return new observation and action spaces of one quadcopter.
+
+    They are not shared, since each space has random numbers of its own.
     """
     observations = spaces.Box(-np.inf, np.inf, (size,), np.float32)
     return observations, spaces.Box(-1.0, 1.0, (4,), np.float32)
 
 
 class BatchEnv:
-    """An environment whose rows are those of ``batch``; ``QuadcopterEnv`` has one, and its values
-    are without a row axis.
+    """An environment whose rows are those of ``batch``.
 
-    ``indices`` says which rows are set: a number, several, a slice, or None for all. What is set
-    holds until it is set anew, a target until its row's next reset. A value that does not fit
-    raises :class:`~sb3_quad.base.errors.ConfigError`.
+    ``QuadcopterEnv`` has one row, and its values have no row axis. The setters take ``indices``,
+    the rows that are set: a number, several, a slice, or None for all.
     """
 
     batch: QuadcopterBatch
 
     def _make_batch(
-        self, n: int, seed: int | None, n_threads: int | None, autoreset: bool, **keywords: Any
+        self,
+        n: int,
+        seed: int | None,
+        n_threads: int | None,
+        task: TaskSpec,
+        task_kwargs: Mapping[str, Any] | None,
+        autoreset: bool,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
-        """Make the batch of n rows that fly as the keywords say; errors name the environment's
-        class.
+        """Make the batch of n rows that fly as the keywords say.
+
+        :raises ConfigError: an unknown keyword, or a value that does not fit. It names the
+            environment's class.
         """
-        own = inspect.signature(type(self)).parameters.values()
-        valid = {
-            each.name for each in own if each.kind is each.POSITIONAL_OR_KEYWORD
-        } | FlightSettings.model_fields.keys()
+        name = type(self).__name__
+        # Check the names first, so that a slip in one of the constructor's own is recognised, too.
+        own = inspect.signature(type(self)).parameters.keys() - {"keywords"}
+        valid = own | FlightSettings.model_fields.keys()
         for key in keywords.keys() - valid:
-            raise ConfigError(f"{type(self).__name__}: {unknown('keyword', key, valid)}")
-        settings = validate(FlightSettings, keywords, type(self).__name__)
-        self.batch = QuadcopterBatch(n, settings, seed, n_threads, autoreset)
+            raise ConfigError(f"{name}: {unknown('keyword', key, valid)}")
+        settings = {"task": task, "task_kwargs": task_kwargs, **keywords}
+        self.batch = QuadcopterBatch(
+            n, validate(FlightSettings, settings, name), seed, n_threads, autoreset
+        )
 
     def _by_row(self, columns: FloatArray) -> FloatArray:
-        """A copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""
+        """Return a copy of ``columns``, (..., n) or (..., 1) for all rows together, as (n, ...)."""
+        # A single column stands for all rows where they do not differ.
         return np.broadcast_to(columns.T, (self.batch.n, *columns.shape[:-1])).copy()
 
-    true_state = _of_batch(QuadcopterBatch.true_state)
-    set_target = _of_batch(QuadcopterBatch.set_target)
-    set_wrench = _of_batch(QuadcopterBatch.set_wrench)
-    set_wind = _of_batch(QuadcopterBatch.set_wind)
-    set_noise = _of_batch(QuadcopterBatch.set_noise)
+    def true_state(self) -> QuadcopterState:
+        """Return the true state of all rows, free of noise.
+
+        It is a live view: the next step changes it. Its wrench is a copy if there are gusts or
+        drag, which it includes.
+        """
+        return self.batch.true_state()
+
+    def set_target(self, position: npt.ArrayLike, indices: Rows = None) -> None:
+        """Move targets. They stay there until the next reset of their rows.
+
+        :param position: r_T, (3,) for all these rows or (rows, 3), world frame, m.
+        :raises ConfigError: a wrong shape, or a number that is not finite.
+        """
+        self.batch.set_target(position, indices)
+
+    def set_wrench(
+        self,
+        force: npt.ArrayLike = (0.0, 0.0, 0.0),
+        torque: npt.ArrayLike = (0.0, 0.0, 0.0),
+        force_frame: str = "world",
+        torque_frame: str = "body",
+        indices: Rows = None,
+    ) -> None:
+        """Apply an external force and torque at the centre of mass.
+
+        They act until you set others; if ``randomize`` samples a force or torque, until the next
+        episode. Without arguments you remove them.
+
+        :param force: (3,) for all these rows or (rows, 3), N.
+        :param torque: likewise, N m.
+        :param force_frame: axes of ``force``, ``"world"`` or ``"body"``.
+        :param torque_frame: axes of ``torque``, likewise.
+        :raises ConfigError: a wrong shape, a number that is not finite, or an unknown frame.
+        """
+        self.batch.set_wrench(force, torque, force_frame, torque_frame, indices)
+
+    def set_wind(self, velocity: npt.ArrayLike = (0.0, 0.0, 0.0), indices: Rows = None) -> None:
+        """Set the velocity of the air until you set another. It acts on vehicles with ``drag``.
+
+        :param velocity: (3,) for all these rows or (rows, 3), world frame, m/s.
+        :raises ConfigError: a wrong shape, or a number that is not finite.
+        """
+        self.batch.set_wind(velocity, indices)
+
+    def set_noise(self, level: Any, indices: Rows = None) -> None:
+        """Set the observation noise until you set another.
+
+        :param level: the relative standard deviation, one number or one for each of these rows; or
+            a :class:`~sb3_quad.simulation.settings.Noise` or its fields. 0: no noise.
+        :raises ConfigError: a wrong shape, or a level below 0 or above 100.
+        """
+        self.batch.set_noise(level, indices)
 
     @property
     def vehicle(self) -> Vehicle:
@@ -96,8 +168,10 @@ class BatchEnv:
 
     @property
     def wrench(self) -> FloatArray:
-        """What was set or sampled, without gusts, (n, 12): force world, force body, torque world,
-        torque body; N, N m.
+        """The external wrench that was set or sampled, without gusts, (n, 12).
+
+        Force in the world frame, force in the body frame, torque in the world frame, torque in the
+        body frame; N and N m.
         """
         return self._by_row(self.batch.wrench)
 

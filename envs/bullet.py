@@ -31,56 +31,61 @@ from sb3_quad.simulation.state import (
 from sb3_quad.vehicles.vehicle import Vehicle
 
 RENDER_MODES = ("human", "rgb_array")
-WINDOW_FPS = 25.0  # frames a second; PyBullet's window lets the simulation wait for each
+# PyBullet's window makes the simulation wait for each frame, so it draws only so many per second.
+WINDOW_FPS = 25.0
 _ORIGIN = (0.0, 0.0, 0.0)
 
 
 class BulletBody:
-    """The rigid body of a vehicle in a PyBullet client of its own; several live side by side.
+    """The rigid body of a vehicle in a PyBullet client of its own; several can exist at once.
 
     PyBullet integrates a floating multibody base, which is what specification section 1 describes:
-    explicit velocities, then the pose by the new velocities. The body is the only one in the
-    simulation that can move or be touched; contact with the ground is decided by the task from the
-    position, not here.
+    explicit velocities, then the pose by the new velocities. Nothing else in the simulation can
+    move or be touched. The task decides on contact with the ground by the position, not PyBullet.
 
     :param vehicle: mass, inertia, gravity, collision radius and physics step.
-    :param window: width and height in pixels of PyBullet's window, of which it allows one per
-        process; None: no window. Without a display there is none either, and a line on stderr says
-        so.
+    :param window: width and height in pixels of PyBullet's window, one per process; None: no
+        window. Without a display no window opens either, and a line on stderr tells so.
     :raises ConfigError: the window cannot be opened.
     """
 
     def __init__(self, vehicle: Vehicle, window: tuple[int, int] | None = None) -> None:
-        self.has_window = window is not None and has_display()
-        if window is not None and not self.has_window:
-            print(
-                "sb3_quad: DISPLAY is not set, so no window opens; render_mode='rgb_array' makes pictures",
-                file=sys.stderr,
-            )
-        self.client = (
-            open_window(*window)
-            if window is not None and self.has_window
-            else int(p.connect(p.DIRECT))
-        )
-        # Also runs when the object is forgotten without close() and at interpreter exit: PyBullet's
-        # clients are limited.
-        self._close = weakref.finalize(self, disconnect, self.client)
-        p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=self.client)
+        self.has_window = False
+        if window is not None:
+            self.has_window = has_display()
+            if not self.has_window:
+                print(
+                    "sb3_quad: DISPLAY is not set, so no window opens; "
+                    "render_mode='rgb_array' makes pictures",
+                    file=sys.stderr,
+                )
+        if window is not None and self.has_window:
+            client = open_window(*window)
+        else:
+            client = int(p.connect(p.DIRECT))
+        self.client = client
+        # The number of PyBullet's clients is limited, so this one is also closed if the object is
+        # garbage-collected without close(), and when the interpreter exits.
+        self._close = weakref.finalize(self, disconnect, client)
+
+        # A sphere without damping by PyBullet itself; drag is added in :meth:`fly`.
+        p.setGravity(0.0, 0.0, -vehicle.gravity, physicsClientId=client)
         p.setPhysicsEngineParameter(
-            fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=self.client
+            fixedTimeStep=vehicle.physics_step, numSubSteps=1, physicsClientId=client
         )
         ball = p.createCollisionShape(
-            p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=self.client
+            p.GEOM_SPHERE, radius=vehicle.collision_radius, physicsClientId=client
         )
-        self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=self.client)
+        self.body = p.createMultiBody(vehicle.mass, ball, physicsClientId=client)
         p.changeDynamics(
-            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=self.client
+            self.body, -1, linearDamping=0.0, angularDamping=0.0, physicsClientId=client
         )
         self.become(vehicle.parameters())
-        p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=self.client)
+        # The body must not collide with the ground or a target that is drawn.
+        p.setCollisionFilterGroupMask(self.body, -1, 0, 0, physicsClientId=client)
 
     def become(self, parameters: FloatArray) -> None:
-        """Have the mass and inertia that a vehicle's ``parameters()`` say."""
+        """Take on the mass and inertia in a vehicle's ``parameters()``."""
         inertia = parameters[[P.ixx, P.iyy, P.izz]].tolist()
         p.changeDynamics(
             self.body,
@@ -92,11 +97,12 @@ class BulletBody:
 
     @property
     def connected(self) -> bool:
-        """Whether the simulation is still there: neither closed nor its window shut."""
+        """Whether the simulation exists: it was not closed, and its window was not shut."""
         return self._close.alive and bool(p.isConnected(self.client))
 
     def place(self, state: QuadcopterState) -> None:
         """Put the body where the first vehicle of ``state`` is."""
+        # PyBullet's quaternions end with w, and its angular velocities are in the world frame.
         w, x, y, z = state.quaternion[0].tolist()
         rates = state.rotation[0] @ state.body_rates[0]
         p.resetBasePositionAndOrientation(
@@ -109,32 +115,36 @@ class BulletBody:
     def fly(
         self, wrenches: FloatArray, wrench: FloatArray, drag: FloatArray | None, wind: FloatArray
     ) -> None:
-        """One physics step for each force and torque at the centre of mass, (steps, 2, 3), body
-        frame.
+        """Simulate one physics step for each of ``wrenches``.
 
-        :param wrench: (WRENCH_SIZE,), of which the world-frame parts act besides.
-        :param drag: (3,), d of the vehicle, N s/m; None: there is none.
+        :param wrenches: (steps, 2, 3), force and torque at the centre of mass, body frame.
+        :param wrench: (WRENCH_SIZE,), the external wrench; its world-frame parts act as well.
+        :param drag: (3,), d of the vehicle, N s/m; None: no drag.
         :param wind: (3,), velocity of the air, world frame, m/s.
         """
-        client, body = self.client, self.body
-        push, twist, step = p.applyExternalForce, p.applyExternalTorque, p.stepSimulation
-        world_force, world_torque = wrench[FORCE_WORLD].tolist(), wrench[TORQUE_WORLD].tolist()
+        client = self.client
+        body = self.body
+        world_force = wrench[FORCE_WORLD].tolist()
+        world_torque = wrench[TORQUE_WORLD].tolist()
+        # Calls of PyBullet are slow, so leave out those that do nothing.
         is_disturbed = any(world_force) or any(world_torque)
         for force, torque in wrenches.tolist():
             if is_disturbed:
-                # A world-frame force acts at a point of the world: the centre of mass, where it is
-                # now.
+                # A world-frame force acts at a point of the world: where the centre of mass is now.
                 position, _ = p.getBasePositionAndOrientation(body, physicsClientId=client)
-                push(body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client)
-                twist(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+                p.applyExternalForce(
+                    body, -1, world_force, position, p.WORLD_FRAME, physicsClientId=client
+                )
+                p.applyExternalTorque(body, -1, world_torque, p.WORLD_FRAME, physicsClientId=client)
+            # Drag depends on the velocity, which differs by physics step.
             if drag is not None:
                 force = np.add(force, self._drag(drag, wind))
-            push(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
-            twist(body, -1, torque, p.LINK_FRAME, physicsClientId=client)
-            step(physicsClientId=client)
+            p.applyExternalForce(body, -1, force, _ORIGIN, p.LINK_FRAME, physicsClientId=client)
+            p.applyExternalTorque(body, -1, torque, p.LINK_FRAME, physicsClientId=client)
+            p.stepSimulation(physicsClientId=client)
 
     def _drag(self, drag: FloatArray, wind: FloatArray) -> FloatArray:
-        """The drag at the present velocity, (3,), body frame, N."""
+        """Return the drag at the current velocity, (3,), body frame, N."""
         _, quaternion = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
         velocity, _ = p.getBaseVelocity(self.body, physicsClientId=self.client)
         rotation = np.array(p.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
@@ -142,12 +152,9 @@ class BulletBody:
 
     def read(self, state: FloatArray) -> None:
         """Write the body's pose and velocity into column 0 of ``state``, (STATE_SIZE, n)."""
-        position, quaternion = p.getBasePositionAndOrientation(
-            self.body, physicsClientId=self.client
-        )
-        write_body(
-            state, position, quaternion, *p.getBaseVelocity(self.body, physicsClientId=self.client)
-        )
+        pose = p.getBasePositionAndOrientation(self.body, physicsClientId=self.client)
+        velocity = p.getBaseVelocity(self.body, physicsClientId=self.client)
+        write_body(state, *pose, *velocity)
 
     def close(self) -> None:
         """Disconnect this client, and no other; calling it twice is fine."""
@@ -155,18 +162,21 @@ class BulletBody:
 
 
 class Renderer:
-    """Draws one vehicle, its target and the wrench that acts on it; the flight is the same with and
-    without it.
+    """Draws one vehicle, its target and the wrench that acts on it. It does not change the flight.
 
-    :param width: of the pictures, pixels; ``height`` likewise.
-    :param body: the simulation. If it has a window, that is drawn into, in real time.
+    :param width: width of the pictures, pixels.
+    :param height: height of the pictures, pixels.
+    :param body: the simulation. If it has a window, the renderer draws into it, in real time.
     """
 
     def __init__(self, vehicle: Vehicle, width: int, height: int, body: BulletBody) -> None:
-        self.vehicle, self.scene = vehicle, Scene(vehicle, body.client)
-        self.size, self.human = (width, height), body.has_window
-        self.shown_at, self.frames_due = time.perf_counter(), 1.0
-        # PyBullet would draw the collision sphere.
+        self.vehicle = vehicle
+        self.scene = Scene(vehicle, body.client)
+        self.size = (width, height)
+        self.human = body.has_window
+        self.shown_at = time.perf_counter()
+        self.frames_due = 1.0
+        # Otherwise PyBullet draws the collision sphere.
         p.changeVisualShape(
             body.body, -1, rgbaColor=(0.0, 0.0, 0.0, 0.0), physicsClientId=body.client
         )
@@ -175,35 +185,37 @@ class Renderer:
             start_drawing(self.scene.client)
 
     def reset(self, state: FloatArray) -> None:
-        """A new episode: the camera jumps to where ``state``, (STATE_SIZE,), says."""
+        """Begin an episode: the camera jumps to the vehicle in ``state``, (STATE_SIZE,)."""
         self.rotor_angles = np.zeros(4)
         self.chase = ChaseCamera(self.scene.scale, *self.size)
         self.chase.follow(state, 1.0)
 
     def render(self, state: FloatArray, wrench: FloatArray) -> Image | None:
-        """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,); once for each control step.
+        """Draw a state, (STATE_SIZE,), and the wrench that acts, (12,). Call it every control step.
 
-        :return: uint8 (height, width, 3). None if there is a window: it is drawn WINDOW_FPS times a
+        :return: uint8 (height, width, 3). If there is a window, None: it shows WINDOW_FPS frames a
             second, and this call waits until real time has caught up.
         """
+        control_step = self.vehicle.control_step
         camera = self.chase.follow(state, 0.04)
-        self.rotor_angles += (
-            rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * self.vehicle.control_step
-        )
+        self.rotor_angles += rotor_turning(self.vehicle, state[ROTOR_SPEEDS]) * control_step
         if not self.human:
             self._place(state, wrench)
             return self.scene.picture(camera)
-        self.frames_due += WINDOW_FPS * self.vehicle.control_step
+
+        # Draw only so many frames, and wait for real time in each control step.
+        self.frames_due += WINDOW_FPS * control_step
         if self.frames_due >= 1.0:
             self.frames_due %= 1.0
             self._place(state, wrench)
             point_window(self.scene.client, camera, state[POSITION])
-        self.shown_at += self.vehicle.control_step
+        self.shown_at += control_step
         ahead = self.shown_at - time.perf_counter()
         if ahead > 0:
             time.sleep(ahead)
         else:
-            self.shown_at -= ahead  # too slow for real time: do not hurry afterwards
+            # Too slow for real time: do not hurry afterwards.
+            self.shown_at -= ahead
         return None
 
     def _place(self, state: FloatArray, wrench: FloatArray) -> None:

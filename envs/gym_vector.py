@@ -1,17 +1,18 @@
 """``QuadcopterVectorEnv``: n quadcopters as one Gymnasium vector environment."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
+from typing_extensions import Unpack
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
 from sb3_quad.base.errors import ConfigError, unknown
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs.batch_env import INFOS, BatchEnv, quadcopter_spaces
+from sb3_quad.envs.batch_env import INFOS, BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 
@@ -20,25 +21,24 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
 
     ``gymnasium.make_vec("QuadTargetTracking-v0", num_envs=8,
     vectorization_mode="vector_entry_point")`` makes one. The learning problem, the arguments and
-    the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i of
+    the setters are those of :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`. Row i of
     ``reset(seed=s)`` flies as that environment does after ``reset(seed=row_seeds(s, n)[i])``, see
     :func:`~sb3_quad.base.seeds.row_seeds`.
 
     The infos of every step hold ``is_success``, ``survival``, ``distance``, ``collision`` and
-    ``out_of_range``, (n,) each, and as ``_is_success`` and so on the mask of the rows that they are
-    of.
+    ``out_of_range``, (n,) each. ``_is_success`` and so on are masks of the rows for which they
+    hold.
 
-    :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. ``"SameStep"``: a row
-        that ends returns the first observation and infos of its next episode, and the last ones are
-        in ``final_obs[i]`` and ``final_info``. ``"NextStep"``: it returns its last ones, and the
-        next step begins its next episode, whatever its action is.
+    Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
+
+    :param autoreset_mode: a ``gymnasium.vector.AutoresetMode``, or its value. With ``"SameStep"`` a
+        row that ends returns the first observation and infos of its next episode; the last ones are
+        in ``final_obs[i]`` and ``final_info``. With ``"NextStep"`` it returns the last ones, and
+        the next step begins its next episode, whatever its action is.
     :raises ConfigError: an argument that does not fit.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
-        "render_modes": [],
-        "autoreset_mode": AutoresetMode.SAME_STEP,
-    }  # type: ignore[misc]
+    metadata: dict[str, Any] = {"render_modes": [], "autoreset_mode": AutoresetMode.SAME_STEP}
 
     def __init__(
         self,
@@ -49,29 +49,24 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
         autoreset_mode: AutoresetMode | str = AutoresetMode.SAME_STEP,
         seed: int | None = None,
         n_threads: int | None = None,
-        **keywords: Any,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
         if render_mode is not None:
             raise ConfigError(
-                f"render_mode {render_mode!r}: the batched environment draws nothing; use QuadcopterEnv"
+                f"render_mode {render_mode!r}: the batched environment draws nothing; "
+                "use QuadcopterEnv"
             )
         modes = {mode.value: mode for mode in (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP)}
         name = getattr(autoreset_mode, "value", autoreset_mode)
         if name not in modes:
             raise ConfigError(unknown("autoreset_mode", name, modes))
         self._mode = modes[name]
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode}  # type: ignore[misc]
-        self._make_batch(
-            num_envs,
-            seed,
-            n_threads,
-            autoreset=False,
-            task=task,
-            task_kwargs=task_kwargs,
-            **keywords,
-        )
+        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        self._make_batch(num_envs, seed, n_threads, task, task_kwargs, autoreset=False, **keywords)
         self.num_envs = self.batch.n
-        self._ended = np.zeros(self.num_envs, dtype=np.bool_)  # rows to be reset at the next step
+        # The batch does not reset rows by itself, since both modes need their last observations.
+        # Rows that the next step resets, in mode NextStep.
+        self._ended = np.zeros(self.num_envs, dtype=np.bool_)
         self.single_observation_space, self.single_action_space = quadcopter_spaces(
             self.batch.observation.size
         )
@@ -86,41 +81,50 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
     ) -> tuple[Float32Array, dict[str, Any]]:
         """Begin new episodes in all rows.
 
-        :param seed: one number, from which each row gets its own stream, or a number for each row;
-            None: the next episodes.
+        :param seed: one number, from which each row gets its own stream, or a number or None for
+            each row. None: continue with the current streams.
         """
-        n = self.num_envs
         for key in options or {}:
             raise ConfigError(
-                f"reset option {key!r}: the batched environment takes none; call set_target after it"
+                f"reset option {key!r}: the batched environment takes none; "
+                "call set_target after it"
             )
-        seeds = [None] * n if seed is None else seed
-        seeds = row_seeds(int(seeds), n) if isinstance(seeds, (int, np.integer)) else list(seeds)
-        if len(seeds) != n:
-            raise ConfigError(
-                f"seed: {len(seeds)} numbers for {n} environments; give one, or one for each"
-            )
-        rows = [row for row, each in enumerate(seeds) if each is not None]
-        if rows:
-            self.batch.seed([seeds[row] for row in rows], rows)
+        # Rows whose seed is None continue with their stream.
+        if isinstance(seed, (int, np.integer)):
+            self.batch.seed(row_seeds(int(seed), self.num_envs))
+        elif seed is not None:
+            if len(seed) != self.num_envs:
+                raise ConfigError(
+                    f"seed: {len(seed)} numbers for {self.num_envs} environments; "
+                    "give one, or one for each"
+                )
+            for row, number in enumerate(seed):
+                if number is not None:
+                    self.batch.seed([number], row)
         self._ended[:] = False
         return self._begin(~self._ended), self._infos()
 
     def step(
         self, actions: npt.NDArray[Any]
     ) -> tuple[Float32Array, Float32Array, BoolArray, BoolArray, dict[str, Any]]:
-        """Fly one control step: observations (n, 18), rewards (n,), terminated (n,), truncated
-        (n,), infos.
+        """Fly one control step.
+
+        :param actions: (n, 4), clipped to [-1, 1].
+        :return: observations (n, 18), rewards (n,), terminated (n,), truncated (n,), infos.
         """
-        before, final = self._ended, {}
         observations, rewards, done = self.batch.step(actions)
-        if self._mode is AutoresetMode.NEXT_STEP and before.any():
-            observations = self._begin(before)
-            rewards[before], done[before] = 0.0, False
+        # In mode NextStep a step of a row that has ended is its reset, without reward.
+        if self._mode is AutoresetMode.NEXT_STEP and self._ended.any():
+            observations = self._begin(self._ended)
+            rewards[self._ended] = 0.0
+            done[self._ended] = False
         truncated = done & self.batch.outcome["truncated"]
-        if self._mode is not AutoresetMode.SAME_STEP:
+        terminated = done & ~truncated
+        final: dict[str, Any] = {}
+        if self._mode is AutoresetMode.NEXT_STEP:
             self._ended = done
         elif done.any():
+            # Gymnasium wants an array of objects, with None for the rows that continue.
             last = np.full(self.num_envs, None, dtype=object)
             for row in np.flatnonzero(done):
                 last[row] = observations[row]
@@ -131,16 +135,20 @@ class QuadcopterVectorEnv(BatchEnv, VectorEnv[Float32Array, Float32Array, npt.ND
                 "_final_info": done,
             }
             observations = self._begin(done)
-        return observations, rewards, done & ~truncated, truncated, {**self._infos(), **final}
+        return observations, rewards, terminated, truncated, {**self._infos(), **final}
 
     def _begin(self, rows: BoolArray) -> Float32Array:
-        """Begin the next episodes of rows, (n,); the observations of all."""
+        """Begin the next episodes of rows, bool (n,), and return the observations of all rows."""
         observations = self.batch.reset(rows)
         self.batch.clear_outcome(rows)
         return observations
 
     def _infos(self, rows: BoolArray | None = None) -> dict[str, Any]:
-        """What the last step of some rows, (n,), was; None: of all. Elsewhere zeros."""
+        """Return the infos of the last step of some rows, bool (n,); None: of all.
+
+        The other rows are zeros.
+        """
+        # Gymnasium's form: values of all rows, and a mask of those that have one.
         mask = np.ones(self.num_envs, dtype=np.bool_) if rows is None else rows.copy()
         infos = {key: self.batch.outcome[field] * mask for key, field in INFOS.items()}
         return infos | {f"_{key}": mask for key in infos}

@@ -1,5 +1,6 @@
-"""Registers the environments with Gymnasium, by module paths, so that nothing heavy is imported
-before it is used.
+"""Registration of the environments with Gymnasium.
+
+It names modules by their paths, so that nothing heavy is imported before it is used.
 """
 
 import gymnasium
@@ -13,8 +14,9 @@ ENVIRONMENTS = {
 
 
 def register_environments() -> None:
-    """Register ``QuadTargetTracking-v0`` and ``QuadStateRecovery-v0``; called when ``sb3_quad`` is
-    imported.
+    """Register ``QuadTargetTracking-v0`` and ``QuadStateRecovery-v0``.
+
+    It is called when ``sb3_quad`` is imported.
     """
     for env_id, task in ENVIRONMENTS.items():
         if env_id not in gymnasium.registry:

@@ -11,10 +11,11 @@ from gymnasium import Wrapper
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvObs, VecEnvStepReturn
+from typing_extensions import Unpack
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.seeds import row_seeds
-from sb3_quad.envs.batch_env import BatchEnv, quadcopter_spaces
+from sb3_quad.envs.batch_env import BatchEnv, FlightKeywords, quadcopter_spaces
 from sb3_quad.simulation.tasks import TaskSpec
 
 _OF_ROWS = ("target", "noise", "observation_mean", "observation_std", "wrench", "wind")
@@ -22,40 +23,47 @@ _METHODS = ("set_target", "set_wrench", "set_wind", "set_noise")
 
 
 class RowSeeds(VecEnv):
-    """A vectorised environment whose rows have nothing in common, whatever the seeds.
+    """A vectorised environment whose rows share no random numbers, whatever the seeds.
 
-    SB3 gives row i ``seed + i``: of 480 rows, those of seeds 0 and 1 share 479 streams of random
-    numbers.
+    SB3 seeds row i with ``seed + i``, so that 480 rows of seed 0 and 480 of seed 1 share 479
+    streams of random numbers.
     """
 
     def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seed all rows from their next reset on; returns :func:`~sb3_quad.base.seeds.row_seeds`.
-        None: by a random number.
+        """Seed all rows from their next reset on.
+
+        :param seed: None: a random number.
+        :return: the seed of each row, :func:`~sb3_quad.base.seeds.row_seeds`.
         """
-        first = secrets.randbits(32) if seed is None else seed
-        self._seeds = [*row_seeds(first, self.num_envs)]
-        return [*self._seeds]
+        if seed is None:
+            seed = secrets.randbits(32)
+        self._seeds = list(row_seeds(seed, self.num_envs))
+        return list(self._seeds)
 
 
 class QuadcopterVecEnv(BatchEnv, RowSeeds):
     """n quadcopters stepped together by compiled code; the flight is PyBullet's to 1e-9.
 
     The learning problem, the arguments and the setters are those of
-    :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`; row i flies exactly as that environment
-    does after ``reset(seed=row_seeds(seed, n)[i])`` (:func:`~sb3_quad.base.seeds.row_seeds`;
-    ``seed()`` returns them). A row that ends begins its next episode within the same step, and its
-    info then holds ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``, ``l``,
-    ``t`` as of SB3's Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and
-    ``out_of_range``. The infos of other rows are empty. The list of infos is the environment's own
-    and changes with the next step; the arrays are fresh.
+    :class:`~sb3_quad.envs.quadcopter_env.QuadcopterEnv`. Row i flies exactly as that environment
+    does after ``reset(seed=row_seeds(seed, n)[i])``; ``seed()`` returns these seeds
+    (:func:`~sb3_quad.base.seeds.row_seeds`).
+
+    A row that ends begins its next episode within the same step. Its info then holds
+    ``terminal_observation``, ``TimeLimit.truncated``, ``episode`` (``r``, ``l``, ``t`` as of SB3's
+    Monitor), ``is_success``, ``survival``, ``distance``, ``collision`` and ``out_of_range``. The
+    infos of other rows are empty. The list of infos is the environment's own and changes with the
+    next step; the arrays are new ones.
 
     Further keywords are the fields of :class:`~sb3_quad.simulation.settings.FlightSettings`.
 
-    :param n_envs: number of rows; ``seed`` and ``n_threads`` as of
-        :class:`~sb3_quad.simulation.batch.QuadcopterBatch`.
+    :param n_envs: number of rows.
     :param staggered: whether the episodes that :meth:`reset` begins end at times spread evenly over
-        ``max_episode_steps``, so that the mean return and success of a training are of all its
-        episodes, not at first of crashes alone.
+        ``max_episode_steps``. The first mean return and success of a training then come from all
+        kinds of episodes, not from early crashes alone.
+    :param seed: gives each row a stream of its own; None: random.
+    :param n_threads: threads that share the work, at most; None: the CPUs this process may use.
+        Results do not depend on it.
     :raises ConfigError: an argument that does not fit.
     """
 
@@ -67,12 +75,13 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         staggered: bool = False,
         seed: int | None = None,
         n_threads: int | None = None,
-        **keywords: Any,
+        **keywords: Unpack[FlightKeywords],
     ) -> None:
-        self._make_batch(
-            n_envs, seed, n_threads, autoreset=True, task=task, task_kwargs=task_kwargs, **keywords
-        )
-        self.render_mode, self._staggered = None, staggered  # QuadcopterEnv draws
+        self._make_batch(n_envs, seed, n_threads, task, task_kwargs, autoreset=True, **keywords)
+        # Only QuadcopterEnv draws.
+        self.render_mode = None
+        self._staggered = staggered
+        # The list is reused in every step; only rows that end or have just ended change.
         self._infos: list[dict[str, Any]] = [{} for _ in range(self.batch.n)]
         self._ended: list[int] = []
         self._actions: npt.NDArray[Any] = np.zeros((self.batch.n, 4), dtype=np.float32)
@@ -81,10 +90,12 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
 
     def reset(self) -> VecEnvObs:
         """Begin a new episode in every row; observations float32 (n, 18)."""
+        # SB3 passes options through a method of their own, before the reset.
         if any(self._options):
             self._reset_options()
             raise ConfigError(
-                "reset options: the batched environment takes none; call set_target and its like after reset()"
+                "reset options: the batched environment takes none; "
+                "call set_target and the like after reset()"
             )
         if any(seed is not None for seed in self._seeds):
             self.batch.seed(self._seeds)
@@ -99,45 +110,54 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """Fly one control step: observations (n, 18), rewards (n,), done (n,), infos."""
+        """Fly one control step.
+
+        :return: observations (n, 18), rewards (n,), done (n,), infos.
+        """
+        # An info holds until the next step.
         for row in self._ended:
             self._infos[row] = {}
         observations, rewards, dones = self.batch.step(self._actions)
         rows = dones.nonzero()[0]
-        self._ended = ended = rows.tolist()
-        if ended:
-            elapsed = round(time.time() - self._start, 6)
-            outcomes, last = (
-                self.batch.outcome[rows].tolist(),
-                self.batch.last_observations[rows],
-            )  # copies
-            for row, outcome, observation in zip(ended, outcomes, last, strict=True):
-                total, _, length, distance, collision, out_of_range, truncated, success = outcome
-                self._infos[row] = {  # not from INFOS, which takes twice as long
-                    "terminal_observation": observation,
-                    "TimeLimit.truncated": truncated,
-                    "episode": {"r": round(total, 6), "l": length, "t": elapsed},
-                    "is_success": success,
-                    "survival": truncated,
-                    "distance": distance,
-                    "collision": collision,
-                    "out_of_range": out_of_range,
-                }
+        self._ended = rows.tolist()
+        if self._ended:
+            self._write_infos(rows)
         return observations, rewards, dones, self._infos
 
+    def _write_infos(self, rows: npt.NDArray[np.intp]) -> None:
+        """Write the infos of rows that have ended."""
+        elapsed = round(time.time() - self._start, 6)
+        # Indexing copies, so that the next step does not change them.
+        outcomes = self.batch.outcome[rows].tolist()
+        observations = self.batch.last_observations[rows]
+        for row, outcome, observation in zip(self._ended, outcomes, observations, strict=True):
+            total, _, length, distance, collision, out_of_range, truncated, success = outcome
+            # Not by a loop over ``INFOS``, which takes twice as long.
+            self._infos[row] = {
+                "terminal_observation": observation,
+                "TimeLimit.truncated": truncated,
+                "episode": {"r": round(total, 6), "l": length, "t": elapsed},
+                "is_success": success,
+                "survival": truncated,
+                "distance": distance,
+                "collision": collision,
+                "out_of_range": out_of_range,
+            }
+
     def close(self) -> None:
-        """There is nothing to give back."""
+        """Do nothing: there is nothing to close."""
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """One value per requested row."""
+        """Return an attribute of the given rows, one value per row."""
         rows = self.batch.rows(indices)
+        # Attributes of rows differ by row; all others belong to the environment.
         if attr_name == "vehicle":
             return [self.batch.vehicle_list[row] for row in rows]
         value = getattr(self, attr_name)
         return [value[row] if attr_name in _OF_ROWS else value for row in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Set ``target`` or ``noise``."""
+        """Set ``target`` or ``noise`` of the given rows."""
         if attr_name not in ("target", "noise"):
             raise AttributeError(f"{attr_name!r} cannot be set; these can: target, noise")
         self.env_method(f"set_{attr_name}", value, indices=indices)
@@ -149,7 +169,7 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Call a method for the given rows; one result per row."""
+        """Call a method for the given rows and return one result per row."""
         rows = self.batch.rows(indices)
         if method_name == "true_state":
             state = self.true_state()
@@ -164,5 +184,5 @@ class QuadcopterVecEnv(BatchEnv, RowSeeds):
     def env_is_wrapped(
         self, wrapper_class: type[Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """True of SB3's ``Monitor``, whose ``info["episode"]`` the rows give; of no other wrapper."""
+        """Return True for SB3's ``Monitor`` only, since the rows give its ``info["episode"]``."""
         return [wrapper_class is Monitor] * self.batch.rows(indices).size

@@ -19,7 +19,7 @@ from sb3_quad.vehicles.vehicle import load_vehicle
 
 
 class Stateful(gym.Env):
-    """An environment whose true state is its number in every entry; observations say nothing of it."""
+    """An environment whose true state is its number in every entry, which observations hide."""
 
     observation_space = spaces.Box(-1, 1, (18,), np.float32)
     action_space = spaces.Box(-1, 1, (4,), np.float32)
@@ -35,7 +35,7 @@ class Stateful(gym.Env):
 
 
 class FromState:
-    """Acts on the true state, and says so by a value that observations cannot give."""
+    """Acts on the true state, by a value that observations do not have."""
 
     def actions(self, state):
         return np.repeat(state.position[:, :1], 4, axis=1).astype(np.float32)
@@ -61,9 +61,7 @@ def test_the_true_state_is_collected_from_single_environments():
         (SACBC, {"bc_coef": 1.0}),
     ],
 )
-def test_an_expert_can_be_a_name_and_is_made_for_the_vehicle_of_the_environments(
-    algorithm, settings
-):
+def test_an_expert_by_name_is_made_for_the_vehicle_of_the_environments(algorithm, settings):
     env = VecMonitor(QuadcopterVecEnv(2, vehicle="crazyflie", seed=0))
     model = algorithm("MlpPolicy", env, expert="pid", device="cpu", **settings).learn(16)
     labeller = Controller.for_env(model.expert, env, model._labeller)
@@ -137,7 +135,7 @@ def test_labels_are_clipped_to_the_action_space():
         ),
     ],
 )
-def test_unfit_labels_are_named(expert, message):
+def test_unfit_labels_raise_and_name_the_row(expert, message):
     env = make_vec_env("Pendulum-v1", 2, seed=0)
     with pytest.raises(ExpertError, match=message):
         Controller.for_env(expert, env).labels(env.reset())
@@ -157,12 +155,12 @@ class OnlyState:
         (OnlyState(), "true_state"),
     ],
 )
-def test_unfit_experts_are_refused_at_once(expert, message):
+def test_unfit_experts_raise_at_once(expert, message):
     with pytest.raises(ExpertError, match=message):
         Controller.for_env(expert, make_vec_env("Pendulum-v1", 1))
 
 
-def test_a_model_of_another_environment_is_refused():
+def test_a_model_of_another_environment_raises():
     with pytest.raises(
         ExpertError, match=r"observation space has shape \(3,\), the environment's \(18,\)"
     ):
@@ -170,9 +168,7 @@ def test_a_model_of_another_environment_is_refused():
 
 
 class Counter:
-    """Its state is how often it was asked; it notes what it was given, as SB3's recurrent policies
-    are.
-    """
+    """Counts its calls in its state, and records the arguments that recurrent policies get."""
 
     def __init__(self):
         self.given, self.starts = [], []
@@ -183,14 +179,14 @@ class Counter:
         return np.zeros((len(observation), 4)), (1 if state is None else state + 1)
 
 
-def test_the_state_of_a_controller_is_of_one_flight():
+def test_the_state_of_a_controller_lasts_one_flight():
     counter = Counter()
     for n in (3, 2):
         fly(counter, "target_tracking", n, max_steps=4)
     assert counter.given == [None, 1, 2, 3] * 2
 
 
-def test_the_state_of_an_expert_goes_on_in_its_environment():
+def test_the_state_of_an_expert_lasts_in_its_environment():
     counter, env = Counter(), QuadcopterVecEnv(2, seed=0)
     labeller, observation, starts = (
         Controller.for_env(counter, env),

@@ -16,7 +16,8 @@ from sb3_quad.base.imports import import_packages
 from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains
+from sb3_quad.experts.geometric import GeometricExpert
+from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.experts.pid import PIDExpert
 from sb3_quad.simulation.observation import DEFAULT_MEAN, DEFAULT_STD
 from sb3_quad.simulation.state import BODY_RATES, QUATERNION, VELOCITY, QuadcopterState
@@ -115,12 +116,11 @@ def test_geometric_gains_come_from_the_vehicle_or_its_authority():
     assert GeometricExpert().gains == itm.geometric_gains
     assert GeometricExpert(gains=derived_gains(itm)).gains.measured is None
     slow = itm.model_copy(
-        update={"motor_gain": 10.0, "inertia": tuple(3 * each for each in itm.inertia)}
+        update={"motor_gain": 10.0, "inertia": tuple(3 * moment for moment in itm.inertia)}
     )
     gains = GeometricExpert(slow).gains
-    assert (
-        gains.attitude < itm.geometric_gains.attitude
-    )  # a vehicle that turns more slowly is asked for less
+    # A vehicle that turns more slowly gets smaller gains.
+    assert gains.attitude < itm.geometric_gains.attitude
     assert gains.angular_deceleration == pytest.approx(derived_gains(itm).angular_deceleration / 3)
 
 
@@ -151,14 +151,11 @@ def test_actions_are_always_valid(expert, data):
     assert np.isfinite(actions).all() and np.abs(actions).max() <= 1.0
 
 
-def test_a_module_of_the_present_folder_is_found_where_only_installed_ones_are_searched(
-    tmp_path, monkeypatch
-):
-    """As in an installed command; it comes last on the path, so that nothing there replaces an
-    installed module.
-    """
+def test_a_module_of_the_current_folder_is_found_in_an_installed_command(tmp_path, monkeypatch):
+    """An installed command finds it, but last on the path: it replaces no installed module."""
     (tmp_path / "my_own.py").write_text(
-        "from stable_baselines3.common.callbacks import BaseCallback as Callback\nfrom sb3_quad import PIDExpert as Pilot\n"
+        "from stable_baselines3.common.callbacks import BaseCallback as Callback\n"
+        "from sb3_quad import PIDExpert as Pilot\n"
     )
     (tmp_path / "torch.py").write_text("raise AssertionError('imported from the present folder')\n")
     before = [path for path in sys.path if path not in ("", str(tmp_path))]
@@ -200,7 +197,7 @@ def test_experts_by_name(tmp_path, monkeypatch):
             resolve_expert(spec)
 
 
-def test_wrong_observations_and_gains_are_named():
+def test_wrong_observations_and_gains_raise():
     with pytest.raises(ExpertError, match=r"\(18,\)"):
         PIDExpert().predict(np.zeros(17))
     with pytest.raises(ConfigError, match="kp"):

@@ -1,6 +1,4 @@
-"""The geometric expert: its symmetries, its equilibrium, and that it keeps to what the 18 features
-hold.
-"""
+"""The geometric expert: symmetries, equilibrium, and that it uses the 18 features alone."""
 
 import numpy as np
 import pytest
@@ -9,7 +7,8 @@ from hypothesis import strategies as st
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.evaluation.flights import fly
-from sb3_quad.experts.geometric import GeometricExpert, derived_gains, privileged_derived
+from sb3_quad.experts.geometric import GeometricExpert, privileged_derived
+from sb3_quad.experts.geometric_gains import derived_gains
 from sb3_quad.simulation.state import (
     BODY_RATES,
     POSITION,
@@ -44,7 +43,7 @@ def actions(array: np.ndarray) -> np.ndarray:
 
 
 def mostly_close(one: np.ndarray, other: np.ndarray) -> bool:
-    """Alike but for rounding, in all states but those on the edge between the two ways round."""
+    """Whether actions agree to rounding, apart from states between the two ways round."""
     return int((np.abs(one - other).max(axis=1) > 1e-4).sum()) <= 1
 
 
@@ -64,7 +63,7 @@ def test_turning_the_world_about_the_vertical_changes_nothing(seed: int, angle: 
 
 @given(seeds)
 def test_the_mirrored_vehicle_gives_mirrored_actions(seed: int) -> None:
-    """Left and right exchanged: y, roll, yaw and their rates change sign, rotors 0 and 1, 2 and 3
+    """Exchange left and right: y, roll, yaw and their rates change sign; rotors 0 and 1, 2 and 3
     change places.
     """
     array = random_states(seed)
@@ -98,8 +97,8 @@ def test_hover_at_the_target_is_an_equilibrium_in_any_heading(seed: int) -> None
 
 
 @given(seeds)
-def test_upside_down_it_turns_with_all_it_has(seed: int) -> None:
-    """The greatest moment leaves no other thrust than the middle one; some rotor is at its limit."""
+def test_upside_down_it_turns_with_its_greatest_moment(seed: int) -> None:
+    """The greatest moment leaves the middle thrust only, and some rotor is at its limit."""
     array = random_states(seed)
     array[VELOCITY] = array[BODY_RATES] = 0.0
     array[TARGET] = array[POSITION]
@@ -127,7 +126,7 @@ def changed(**changes: object) -> GeometricExpert:
     "expert",
     [
         changed(motor_gain=10.0),
-        changed(inertia=tuple(3 * each for each in ITM.inertia)),
+        changed(inertia=tuple(3 * moment for moment in ITM.inertia)),
         changed(thrust_limits=(0.7, 1.25)),
         changed(delay=4),
         changed(
@@ -139,7 +138,7 @@ def changed(**changes: object) -> GeometricExpert:
     ],
     ids=["slow motors", "heavy arms", "weak", "late", "palm-sized plus"],
 )
-def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(
+def test_derived_gains_fly_vehicles_unlike_those_of_the_search(
     expert: GeometricExpert,
 ) -> None:
     vehicle = expert.vehicle
@@ -152,8 +151,8 @@ def test_derived_gains_fly_vehicles_unlike_the_one_they_were_found_for(
 
 @pytest.mark.parametrize(("name", "late"), [("hummingbird", False), ("cf2x_L250", True)])
 def test_privileged_derived_is_gentler_where_commands_act_late(name: str, late: bool) -> None:
-    """A quick vehicle flies by its derived gains; a slow one comes to rest within 0.1 m, too, but
-    by other ones.
+    """A quick vehicle flies with its derived gains. A slow one flies with others, and also comes to
+    rest within 0.1 m.
     """
     vehicle = load_vehicle(name)
     bold = GeometricExpert(vehicle, derived_gains(vehicle), privileged=True)
@@ -166,8 +165,6 @@ def test_privileged_derived_is_gentler_where_commands_act_late(name: str, late: 
 
 
 @pytest.mark.parametrize(("privileged", "name"), [(False, "attitude"), (True, "atitude")])
-def test_gains_where_commands_act_late_are_known_ones_of_a_privileged_expert(
-    privileged: bool, name: str
-) -> None:
+def test_late_needs_known_gains_and_a_privileged_expert(privileged: bool, name: str) -> None:
     with pytest.raises(ConfigError, match=f"late {name}"):
         GeometricExpert(privileged=privileged, late={name: 0.5})

@@ -65,7 +65,7 @@ def same(ours, theirs):
         if isinstance(value, dict):
             same(ours[key], value)
         elif value.dtype == object:  # the last observations, None where no episode has ended
-            assert [each is None for each in ours[key]] == [each is None for each in value]
+            assert [row is None for row in ours[key]] == [row is None for row in value]
             for got, expected in zip(ours[key], value, strict=True):
                 assert expected is None or np.abs(got - expected).max() < 2e-6
         else:
@@ -73,7 +73,7 @@ def same(ours, theirs):
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
-def test_an_autoreset_mode_is_that_of_gymnasiums_own_vector_environment(mode):
+def test_autoreset_modes_equal_those_of_gymnasiums_vector_environment(mode):
     kwargs = {
         "task_kwargs": {"max_distance": 10.02},
         "max_episode_steps": 25,
@@ -126,6 +126,6 @@ def test_gymnasiums_wrappers_count_each_episode_once(mode):
         (lambda: make(2, render_mode="human"), "render_mode"),
     ],
 )
-def test_bad_input_is_refused(call, says):
+def test_bad_input_raises(call, says):
     with pytest.raises(ConfigError, match=says):
         call()

@@ -38,7 +38,7 @@ PICKLED = {
 
 @pytest.fixture(scope="module")
 def observations(tmp_path_factory):
-    """The path of some observations, and they."""
+    """The path of some observations, and the observations."""
     env = QuadcopterVecEnv(32, task="state_recovery", seed=5)
     path = tmp_path_factory.mktemp("observations") / "observations.npy"
     seen = env.reset()
@@ -97,7 +97,7 @@ def survival_on_the_card(name):
 
 
 @pytest.mark.slow
-def test_the_robust_one_ends_at_its_target_whatever_pushes():
+def test_the_robust_one_ends_at_its_target_under_disturbances():
     own = sb3_quad.env_kwargs("itm-robust")
     force = {"magnitude": 27**0.5, "direction": [-1, -1, -1]}  # the thesis's
     worlds = {"mass": [0.8, 1.2], "motor_gain": [0.7, 1.5], "force": {"magnitude": [0, 3]}}
@@ -111,7 +111,7 @@ def test_the_robust_one_ends_at_its_target_whatever_pushes():
 
 
 @pytest.mark.parametrize("vehicle", ["itm", "crazyflie", "hummingbird"])
-def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(vehicle):
+def test_any_quadcopter_flies_vehicles_with_another_order_of_rotors(vehicle):
     own = {**sb3_quad.env_kwargs("any-quadcopter"), "vehicles": None, "vehicle": vehicle}
     flights = fly(
         sb3_quad.load_pretrained("any-quadcopter"),
@@ -126,7 +126,7 @@ def test_any_quadcopter_flies_vehicles_that_number_their_rotors_in_another_way(v
     )  # of ITM, whose rotors do the least; without the layout it would be nearly none
 
 
-def test_any_quadcopter_is_exported_for_a_vehicle_that_is_named(tmp_path, capsys):
+def test_any_quadcopter_is_exported_for_a_given_vehicle(tmp_path, capsys):
     command = ["export", "any-quadcopter", "--format", "torchscript", "-o", str(tmp_path)]
     assert main(command) == 2
     assert "flies any vehicle; say with --vehicle" in capsys.readouterr().err
@@ -135,33 +135,30 @@ def test_any_quadcopter_is_exported_for_a_vehicle_that_is_named(tmp_path, capsys
 
 
 class Names(pickle.Unpickler):
-    """Unpickles, and keeps the names of all classes and functions that this takes."""
+    """Unpickles, and records the names of all classes and functions that it needs."""
 
     def __init__(self, content):
         super().__init__(io.BytesIO(content))
-        self.found = set()
+        self.names = set()
 
     def find_class(self, module, name):
-        self.found.add(f"{module}.{name}")
+        self.names.add(f"{module}.{name}")
         return super().find_class(module, name)
 
 
 @pytest.mark.parametrize("name", pretrained_names())
-def test_what_they_pickle_is_there_in_other_versions_too(name):
-    """SB3 2.4 and later load them (tried with 2.4.1 and 2.7.1): nothing is pickled but what all of
-    these have.
-    """
+def test_their_pickles_name_only_classes_of_all_versions(name):
+    """SB3 2.4 and later load them (tried with 2.4.1 and 2.7.1)."""
     with zipfile.ZipFile(sb3_quad.pretrained(name)) as file:
         data = json.loads(file.read("data"))
-    found = set()
+    names = set()
     for value in data.values():
         if isinstance(value, dict) and ":serialized:" in value:
             unpickler = Names(base64.b64decode(value[":serialized:"]))
             unpickler.load()
-            found |= unpickler.found
-    assert {
-        each for each in found if each.startswith(("stable_baselines3.", "sb3_quad"))
-    } == PICKLED
+            names |= unpickler.names
+    ours = {name for name in names if name.startswith(("stable_baselines3.", "sb3_quad"))}
+    assert ours == PICKLED
     assert {"learning_rate", "clip_range"} <= {
         key for key, value in data.items() if isinstance(value, float)
     }  # no schedules
@@ -182,15 +179,14 @@ def test_names_stand_where_zips_do(capsys):
     assert not any_quadcopter.notice(
         "crazyflie"
     ) and "was trained on the vehicle itm" in recovery.notice("crazyflie")
-    labels = {
-        each.label: each.spec for each in parse_controllers(["itm-recovery", "mine=itm-recovery"])
-    }
+    controllers = parse_controllers(["itm-recovery", "mine=itm-recovery"])
+    labels = {controller.label: controller.spec for controller in controllers}
     assert labels == dict.fromkeys(
         ("itm-recovery", "mine"), str(sb3_quad.pretrained("itm-recovery"))
     )
 
 
-def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(
+def test_publish_copies_the_policy_and_writes_where_it_comes_from(
     dagger_run, tmp_path, capsys, observations
 ):
     source = dagger_run / "QuadStateRecovery-v0.zip"
@@ -205,7 +201,7 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(
         "`dagger`, ",
         "16 fresh recoveries and 4 fresh targets",
         "| state recovery |",
-        "| 1.94 |",  # the physical limit, beside the time to stay
+        "| 1.94 |",  # the physical limit, next to the settling time
     ):
         assert part in card
     slim, whole = (PPO.load(path, device="cpu") for path in (tmp_path / "mine.zip", source))
@@ -221,8 +217,8 @@ def test_publish_hands_on_the_same_policy_and_says_where_it_comes_from(
     assert (tmp_path / "mine.zip").read_bytes() == before
 
 
-def test_publish_lays_out_what_the_hub_takes_and_uploads_it(tmp_path, monkeypatch):
-    """As huggingface_sb3 does, up to the calls that need a network."""
+def test_publish_uploads_what_the_hub_takes(tmp_path, monkeypatch):
+    """It does what huggingface_sb3 does; calls that need a network are recorded."""
     called = []
 
     class HfApi:
@@ -331,7 +327,7 @@ def test_outputs_go_where_the_command_is_called(tmp_path, monkeypatch, capsys):
     assert sorted(FOLDER.iterdir()) == before
 
 
-def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
+def test_publish_calls_missing_facts_unrecorded(tmp_path, capsys):
     env = QuadcopterVecEnv(2, seed=0)
     PPO("MlpPolicy", env, n_steps=8, batch_size=8, device="cpu", seed=0).save(
         tmp_path / "alone.zip"
@@ -355,7 +351,7 @@ def test_publish_calls_unrecorded_what_is_recorded_nowhere(tmp_path, capsys):
     assert agent_settings(tmp_path / "x.zip") == (FlightSettings(), None)
 
 
-def test_publish_refuses_what_it_cannot_describe(dagger_run, tmp_path, capsys):
+def test_publish_refuses_agents_that_it_cannot_describe(dagger_run, tmp_path, capsys):
     source = dagger_run / "QuadStateRecovery-v0.zip"
     for arguments, message in (
         ([str(tmp_path / "none.zip"), "--name", "x"], "no such file"),

@@ -16,6 +16,7 @@ from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
 
 from sb3_quad.base.errors import ConfigError
+from sb3_quad.envs.batch_env import FlightKeywords
 from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 from sb3_quad.envs.vec_env import QuadcopterVecEnv
 from sb3_quad.simulation.settings import FlightSettings
@@ -99,8 +100,8 @@ class Reference:
     ids=["free", "world_force", "body_force"],
 )
 def test_flight_is_the_specified_integrator(wrench: dict[str, str], delay: int) -> None:
-    """400 control steps of violent tumbling agree to 1e-9 with the specification's lines, pushed in
-    any frame.
+    """400 control steps of violent tumbling agree to 1e-9 with the specification's equations, with
+    external wrenches in any frame.
     """
     rng = np.random.default_rng(1)
     env = QuadcopterEnv(
@@ -149,7 +150,7 @@ def test_both_checkers_pass(
     monkeypatch.delenv("DISPLAY", raising=False)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # The observation is unbounded by design (thesis 3.3.1), of which Gymnasium's checker warns.
+        # Gymnasium's checker warns that the observation is unbounded, by design (thesis 3.3.1).
         warnings.filterwarnings(
             "ignore", message=".*A Box observation space m[a-z]+imum value is -?infinity.*"
         )
@@ -216,7 +217,7 @@ def test_ends_on_touching_the_ground(env: QuadcopterEnv) -> None:
         if terminated:
             break
     assert terminated and reward < -15 and not info["out_of_range"]
-    assert height > 0.1  # stopped on the step of the contact, not pushed back by it
+    assert height > 0.1  # stopped on the step of the contact, before it bounces
 
 
 def test_setters_act_while_flying(env: QuadcopterEnv) -> None:
@@ -231,7 +232,7 @@ def test_setters_act_while_flying(env: QuadcopterEnv) -> None:
     assert env.noise == 0.5 and not np.allclose(noisy, plain, atol=1e-3)
 
 
-def test_wrench_pushes_until_set_anew(env: QuadcopterEnv) -> None:
+def test_a_wrench_acts_until_another_is_set(env: QuadcopterEnv) -> None:
     env.reset(seed=0)
     env.set_wrench(force=(1.727, 0, 0))
     for _ in range(10):
@@ -270,7 +271,7 @@ def test_fixed_start(env: QuadcopterEnv) -> None:
         (np.zeros((1, 4)), r"\(1, 4\).*\(4,\)"),
     ],
 )
-def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) -> None:
+def test_bad_actions_raise(env: QuadcopterEnv, action: Any, message: str) -> None:
     env.reset(seed=0)
     before = env.true_state().copy().array
     with pytest.raises(ValueError, match=message):
@@ -319,14 +320,14 @@ def test_bad_actions_are_refused(env: QuadcopterEnv, action: Any, message: str) 
         (lambda env: QuadcopterEnv(render_mode="rgb_aray"), "did you mean 'rgb_array'"),
     ],
 )
-def test_bad_input_names_the_thing(env: QuadcopterEnv, call: Any, message: str) -> None:
+def test_bad_input_raises_and_names_the_thing(env: QuadcopterEnv, call: Any, message: str) -> None:
     env.reset(seed=0)
     with pytest.raises(ConfigError, match=message) as caught:
         call(env)
     assert "\n" not in str(caught.value)
 
 
-def test_close_twice_and_neighbours_live_on() -> None:
+def test_closing_twice_leaves_other_environments_open() -> None:
     first, second = QuadcopterEnv(), QuadcopterEnv()
     with pytest.raises(gymnasium.error.ResetNeeded):
         first.step(np.zeros(4, dtype=np.float32))
@@ -341,15 +342,14 @@ def test_close_twice_and_neighbours_live_on() -> None:
     for env in (second, third):
         assert np.isfinite(env.step(np.zeros(4, dtype=np.float32))[0]).all()
         env.close()
-    first.reset(seed=0)  # opens anew
+    first.reset(seed=0)  # opens a new simulation
     first.step(np.zeros(4, dtype=np.float32))
     first.close()
 
 
 @pytest.mark.slow
 def test_import_is_light() -> None:
-    """`import sb3_quad` brings in no simulator, compiler or torch; registration is enough for
-    gymnasium.make.
+    """`import sb3_quad` imports no simulator, compiler or torch, and gymnasium.make needs no more.
 
     PyBullet is imported without its line about its build, and standard error works afterwards.
     """
@@ -357,13 +357,13 @@ def test_import_is_light() -> None:
         "import sys, sb3_quad, sb3_quad.envs, gymnasium;"
         "print([m for m in ('pybullet', 'numba', 'torch') if m in sys.modules]);"
         "gymnasium.make('QuadTargetTracking-v0').reset(seed=0); print('torch' in sys.modules);"
-        "print('told', file=sys.stderr)"
+        "print('stderr works', file=sys.stderr)"
     )
     result = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
     assert result.stdout.splitlines() == ["[]", "False"]
-    assert result.stderr.splitlines() == ["told"]
+    assert result.stderr.splitlines() == ["stderr works"]
 
 
 def test_the_manual_lists_every_argument() -> None:
@@ -371,6 +371,10 @@ def test_the_manual_lists_every_argument() -> None:
     cells = [line.split("|")[1] for line in table.splitlines() if line.strip().startswith("| `")]
     listed = {name for cell in cells for name in re.findall(r"`(\w+)`", cell)}
     drawn = {"render_mode", "render_width", "render_height"}
-    assert listed == {*FlightSettings.model_fields, *drawn} - {
-        "max_episode_steps"
-    }  # an argument of gymnasium.make
+    # max_episode_steps is an argument of gymnasium.make.
+    assert listed == {*FlightSettings.model_fields, *drawn} - {"max_episode_steps"}
+
+
+def test_the_typed_keywords_are_the_flight_settings() -> None:
+    typed = {"task", "task_kwargs", *FlightKeywords.__annotations__}
+    assert typed == FlightSettings.model_fields.keys()

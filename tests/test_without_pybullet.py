@@ -1,6 +1,4 @@
-"""Where PyBullet cannot be imported, the batch flies and trains, and what needs PyBullet says how
-to get it.
-"""
+"""Without PyBullet the batch flies and trains, and whatever needs PyBullet says how to get it."""
 
 import subprocess
 import sys
@@ -14,6 +12,7 @@ from sb3_quad.cli import main
 
 ROOT = Path(__file__).resolve().parent.parent
 ON_PYBULLET = ("base.bullet", "envs.bullet", "envs.quadcopter_env", "envs.rendering", "show")
+NEEDS_PYBULLET = tuple(f"sb3_quad.{name}" for name in ON_PYBULLET)
 LINE = (
     "QuadcopterEnv (gymnasium.make, --vec-env dummy or subproc, --backend pybullet, enjoy) "
     "needs pybullet "
@@ -33,12 +32,8 @@ def modules():
             yield name.removesuffix(".__init__")
 
 
-def test_all_else_is_imported_and_a_batch_flies():
-    names = [
-        name
-        for name in modules()
-        if not name.startswith(tuple(f"sb3_quad.{each}" for each in ON_PYBULLET))
-    ]
+def test_everything_else_can_be_imported_and_a_batch_flies():
+    names = [name for name in modules() if not name.startswith(NEEDS_PYBULLET)]
     code = f"""
 import importlib, sys
 sys.modules["pybullet"] = sys.modules["pybullet_data"] = None
@@ -55,17 +50,13 @@ print(fly(sys.modules["sb3_quad.experts.pid"].PIDExpert(), "target_tracking", 8)
 @pytest.fixture
 def without_pybullet(monkeypatch):
     """No module of PyBullet can be imported, nor be found as imported before."""
-    for name in [
-        name
-        for name in sys.modules
-        if name.startswith(tuple(f"sb3_quad.{each}" for each in ON_PYBULLET))
-    ]:
+    for name in [name for name in sys.modules if name.startswith(NEEDS_PYBULLET)]:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setitem(sys.modules, "pybullet", None)
     monkeypatch.setattr(
         sys,
         "meta_path",
-        [each for each in sys.meta_path if type(each).__name__ != "WithoutPyBullet"],
+        [finder for finder in sys.meta_path if type(finder).__name__ != "WithoutPyBullet"],
     )
 
 
@@ -90,7 +81,7 @@ def test_a_command_that_needs_it_says_so_in_one_line(
 
 
 @pytest.mark.parametrize("name", ["QuadTargetTracking-v0", "QuadcopterEnv"])
-def test_a_program_that_needs_it_is_told(without_pybullet, name):
+def test_a_program_that_needs_it_raises_the_same_line(without_pybullet, name):
     import sb3_quad.envs
 
     with pytest.raises(MissingExtra) as caught:
@@ -100,8 +91,8 @@ def test_a_program_that_needs_it_is_told(without_pybullet, name):
 
 def test_a_training_evaluates_on_the_batch(without_pybullet, tmp_path, capsys):
     command = (
-        "train --algo dagger -n 400 --n-envs 8 --eval-freq 200 --eval-episodes 4 --n-eval-envs 2 "
-        "--no-progress"
+        "train --algo dagger -n 400 --n-envs 8 --eval-freq 200 --eval-episodes 4 "
+        "--n-eval-envs 2 --no-progress"
     )
     hyperparams = ["--hyperparams", "n_steps:25", "gradient_steps:2", "batch_size:64"]
     assert main([*command.split(), "-f", str(tmp_path), *hyperparams]) == 0

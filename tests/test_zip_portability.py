@@ -31,17 +31,18 @@ assert not any(name.startswith("sb3_quad.") for name in sys.modules)
 assert all(model.flight_settings["vehicle"]["mass"] > 0 for model in models)
 models[0].save("again.zip")
 seen = np.load(observations)
-own = [np.resize(seen, (len(seen), *model.observation_space.shape)) for model in models]  # some see more
-actions = [model.predict(each, deterministic=True)[0].tolist() for model, each in zip(models, own)]
+# Some agents observe more than 18 features.
+own = [np.resize(seen, (len(seen), *model.observation_space.shape)) for model in models]
+actions = [model.predict(x, deterministic=True)[0].tolist() for model, x in zip(models, own)]
 json.dump([actions, [model.num_timesteps for model in models]], sys.stdout)
 """
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "load_in_plain_sb3.py"
-RUN = "import runpy, sys; sys.modules['sb3_quad'] = None; runpy.run_path(sys.argv.pop(1), run_name='__main__')"
-BESIDE = {
-    "thesis-ppo": 1.5,
-    "thesis-printed-recovery": 1.0,
-    "thesis-printed-ppo": 9.0,
-}  # m: who ends beside its target
+RUN = (
+    "import runpy, sys; sys.modules['sb3_quad'] = None; "
+    "runpy.run_path(sys.argv.pop(1), run_name='__main__')"
+)
+# Agents that do not end at their target, and the greatest distance that is allowed, m.
+NEXT_TO_TARGET = {"thesis-ppo": 1.5, "thesis-printed-recovery": 1.0, "thesis-printed-ppo": 9.0}
 SMALL = {
     "n_steps": 32,
     "batch_size": 128,
@@ -107,8 +108,8 @@ def test_ppo_loads_them_where_sb3_quad_cannot_be_imported(tmp_path):
 
 
 def save_extended(folder):
-    """A zip as `train` leaves it, of an agent that sees frames, its last action and the integral,
-    by a scaling of its own.
+    """Save a zip as `train` does, of an agent that observes frames, its last action and the
+    integral, with a scaling of its own.
     """
     scaling = {
         "observation_mean": np.linspace(-0.3, 0.4, 18),
@@ -131,7 +132,7 @@ def save_extended(folder):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", [*pretrained_names(), "extended"])
 def test_the_example_builds_the_observation_that_the_package_builds(name, tmp_path):
-    """In closed loop: what flies is the action for the example's observation."""
+    """Both are compared in closed loop: the action for the example's observation flies."""
     path = save_extended(tmp_path) if name == "extended" else sb3_quad.pretrained(name)
     model = PPO.load(path, device="cpu")
     settings = {**sb3_quad.env_kwargs(path), "noise": 0.0, "vehicles": None}
@@ -171,7 +172,7 @@ def test_the_example_flies_every_zip_where_sb3_quad_cannot_be_imported(tmp_path)
     ]
     assert len(distances) == len(zips) + 1
     for name, distance in zip(pretrained_names(), distances, strict=False):
-        assert distance < BESIDE.get(name, 0.1), name
+        assert distance < NEXT_TO_TARGET.get(name, 0.1), name
     model = DAgger("MlpPolicy", QuadcopterVecEnv(4), PIDExpert(), **SMALL)
     model.save(tmp_path / "silent.zip")
     result = subprocess.run(

@@ -1,1 +1,1 @@
-"""Anything that flies: how it is asked, and how it is read from a zip or found by name."""
+"""Controllers: asking them for actions, reading them from zips, finding them by name."""

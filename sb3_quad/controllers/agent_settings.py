@@ -1,4 +1,4 @@
-"""How the agent in a zip flies, as training has written it there or beside it."""
+"""The flight settings of the agent in a zip, as training wrote them into or next to it."""
 
 from pathlib import Path
 from typing import Any
@@ -17,75 +17,93 @@ from sb3_quad.vehicles.vehicle import VEHICLES, Vehicle
 
 
 def agent_settings(zip_file: str | Path) -> tuple[FlightSettings, Path | None]:
-    """How the agent in a zip flies, and the file that says so: the zip, else the run's settings
-    beside it; None: neither.
+    """Return how the agent in a zip flies, and the file that says so.
 
-    Beside it, ``env_kwargs`` in the run's ``args.yml``, also in one of rl_zoo3, is what the agent
-    was judged with; without it, that is in its ``config.yml``. Where nothing says how it flies,
-    that is as ``FlightSettings()``.
+    The file is the zip itself, else a ``config.yml`` in a folder next to it, where runs of this
+    package and of rl_zoo3 keep their settings. If neither says how the agent flies, the settings
+    are ``FlightSettings()`` and the file is None.
 
-    :raises ConfigError: a zip or settings that cannot be read or do not fit; several runs' settings
-        lie there, or statistics of VecNormalize, which are no part of a zip.
+    :raises ConfigError: a zip or settings that cannot be read or do not fit; settings of several
+        runs next to the zip; or statistics of VecNormalize, which a zip does not hold.
     """
+    # Zips of this package say it themselves.
     record = saved_data(zip_file).get(KEY)
     if isinstance(record, dict):
-        where, task, vehicle = f"{zip_file}: {KEY}", record.get("task"), record.get("vehicle")
-        if isinstance(task, dict) and "name" in task:  # else a mixture
-            record["task"] = validate(Task, task, where)
-        _refuse_paths(record, where)
-        return validate(
-            FlightSettings, {**record, "vehicle": validate(Vehicle, vehicle, where)}, where
-        ), Path(zip_file)
+        return _settings_of_zip(record, f"{zip_file}: {KEY}"), Path(zip_file)
+
+    # Other zips, such as those of rl_zoo3, lie in a run folder.
     folder = Path(zip_file).parent
-    statistics = sorted(folder.glob("*/vecnormalize.pkl"))
-    if statistics:
+    for statistics in sorted(folder.glob("*/vecnormalize.pkl")):
         raise ConfigError(
-            f"{zip_file}: was trained with VecNormalize ({statistics[0]}), which the zip does not hold"
+            f"{zip_file}: was trained with VecNormalize ({statistics}), which the zip does not hold"
         )
-    files = sorted(folder.glob("*/config.yml"))
-    if not files:
+    configs = sorted(folder.glob("*/config.yml"))
+    if not configs:
         return FlightSettings(), None
-    if len(files) > 1:
+    if len(configs) > 1:
         raise ConfigError(
-            f"{zip_file}: several config.yml files lie beside it ({', '.join(map(str, files))})"
+            f"{zip_file}: several config.yml files lie next to it ({', '.join(map(str, configs))})"
         )
-    settings, where = read_yaml(files[0]), f"{files[0]}: env_kwargs"
-    file = files[0].with_name("args.yml")
-    judged = read_yaml(file).get("env_kwargs") if file.is_file() else None
-    parts = (
-        [judged]
-        if judged is not None
-        else [settings.get(key) for key in ("env_kwargs", "eval_env_kwargs")]
-    )
-    name = files[0].parent.name
-    given: dict[str, Any] = {"task": ENVIRONMENTS[name]} if name in ENVIRONMENTS else {}
+    return _settings_of_run(configs[0]), configs[0]
+
+
+def _settings_of_zip(record: dict[str, Any], where: str) -> FlightSettings:
+    _refuse_paths(record, where)
+    # A task is saved by its fields; a mixture holds weights by name instead.
+    task = record.get("task")
+    if isinstance(task, dict) and "name" in task:
+        record["task"] = validate(Task, task, where)
+    record["vehicle"] = validate(Vehicle, record.get("vehicle"), where)
+    return validate(FlightSettings, record, where)
+
+
+def _settings_of_run(config: Path) -> FlightSettings:
+    """Return the settings that the agent of a run was evaluated with.
+
+    They are ``env_kwargs`` in ``args.yml``, if it has some, else those in ``config.yml``.
+    """
+    settings = read_yaml(config)
+    parts = [settings.get("env_kwargs"), settings.get("eval_env_kwargs")]
+    arguments = config.with_name("args.yml")
+    if arguments.is_file():
+        evaluated = read_yaml(arguments).get("env_kwargs")
+        if evaluated is not None:
+            parts = [evaluated]
+
+    # The folder has the name of the environment, which says the task.
+    where = f"{config}: env_kwargs"
+    given: dict[str, Any] = {}
+    if config.parent.name in ENVIRONMENTS:
+        given["task"] = ENVIRONMENTS[config.parent.name]
     for part in parts:
         given |= parse_mapping(part, where)
-    return validate(FlightSettings, given, where), files[0]
+    return validate(FlightSettings, given, where)
 
 
 def _refuse_paths(record: dict[str, Any], where: str) -> None:
-    """See that a zip, which may come from anybody, opens no file of this machine: a device may
-    never end.
+    """Reject file paths in untrusted zips: reading a device file could block forever.
 
-    :raises ConfigError: it gives a path where there may be a name.
+    :raises ConfigError: the record holds a path where a name may stand.
     """
-    vehicles = record.get("vehicles")
-    distribution = vehicles.get("distribution") if isinstance(vehicles, dict) else vehicles
-    sources = {
-        "rotor_layout": (VEHICLES, record.get("rotor_layout")),
-        "vehicles": (DISTRIBUTIONS, distribution),
-    }
-    for key, (folder, source) in sources.items():
+    # Both a vehicle and a distribution may be given by a name, which could be a path.
+    distribution = record.get("vehicles")
+    if isinstance(distribution, dict):
+        distribution = distribution.get("distribution")
+    for key, folder, source in (
+        ("rotor_layout", VEHICLES, record.get("rotor_layout")),
+        ("vehicles", DISTRIBUTIONS, distribution),
+    ):
         if isinstance(source, str) and folder.is_path(source):
             raise ConfigError(
-                f"{where}: {key}: {source!r} is a path; a zip holds such files or names those of the package"
+                f"{where}: {key}: {source!r} is a path; "
+                "a zip holds such files or names those of the package"
             )
 
 
 def env_kwargs(agent: str | Path) -> dict[str, Any]:
-    """What the environments must be given so that they fly as an agent was trained to: its vehicle,
-    noise and observation.
+    """Return the keywords of environments that fly as an agent was trained to.
+
+    They are its vehicle, noise and observation.
 
     >>> import gymnasium, sb3_quad
     >>> env = gymnasium.make("QuadTargetTracking-v0", **sb3_quad.env_kwargs("itm-robust"))
@@ -93,4 +111,5 @@ def env_kwargs(agent: str | Path) -> dict[str, Any]:
     :param agent: a zip, a run folder, or the name of a policy that comes with the package.
     :raises ConfigError: a zip or settings that cannot be read.
     """
-    return agent_settings(agent_path(str(agent)))[0].in_any_task()
+    settings, _ = agent_settings(agent_path(str(agent)))
+    return settings.in_any_task()

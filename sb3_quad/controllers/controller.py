@@ -1,11 +1,13 @@
-"""One way to ask a controller, whatever it is: an expert, an SB3 model, a function."""
+"""One way to ask a controller for actions, whatever it is: an expert, an SB3 model, a function."""
 
 from collections.abc import Callable
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, Protocol, TypeAlias, cast
 
 import numpy as np
 import numpy.typing as npt
 from gymnasium import spaces
+from stable_baselines3.common.type_aliases import PolicyPredictor
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_quad.base.arrays import BoolArray, Float32Array
@@ -14,30 +16,49 @@ from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.simulation.state import QuadcopterState
 
 
+class StateController(Protocol):
+    """A controller that acts on the true state, such as ``PIDExpert``."""
+
+    def actions(self, state: QuadcopterState) -> npt.NDArray[Any]:
+        """Return actions of shape (n, action_dim) for the true state of n vehicles."""
+
+
+ExpertLike: TypeAlias = (
+    StateController | PolicyPredictor | Callable[[Any], npt.NDArray[Any]] | str | Path
+)
+"""Everything that ``expert=`` takes.
+
+An object with ``actions(state)``; an SB3 model or policy (anything with ``predict(observation)``);
+a function from observations to actions; or a name or path for
+:func:`~sb3_quad.controllers.resolve.resolve_expert`.
+"""
+
+
 class Controller:
-    """Asks anything that flies for its actions, and checks its answers.
+    """Asks a controller of any kind for its actions and checks the answers.
 
     The first of these that fits is used:
 
-    1. ``source.actions(state)`` (such as ``GeometricExpert``), where the true state is to be had:
-      it is free of noise.
+    1. ``source.actions(state)`` (such as ``GeometricExpert``), if the true state is available. The
+       true state is free of noise.
     2. ``source.predict(observation)``: an SB3 model, or an ``Expert`` of this package without a
-      true state.
+       true state.
     3. ``source(observation)``: a function from observations (n, ...) to actions (n, ...).
 
-    2 and 3 get the observations that a policy sees. The state that ``predict`` returns beside the
-    actions, as SB3's recurrent policies do, is given to it again as ``state`` when it is asked
-    next, with ``episode_start`` (n,): the rows that have just begun an episode. All rows of a new
-    Controller begin one.
+    2 and 3 get the observations that a policy sees. ``predict`` may return a state together with
+    the actions, as SB3's recurrent policies do. The next call passes it back as ``state``, with
+    ``episode_start`` (n,): the rows that have just begun an episode. All rows of a new Controller
+    begin one.
 
     :param source: the controller, as above.
-    :param action_space: a Box.
-    :param observation_space: None: not checked.
-    :param true_state: gives the present true state; None: there is none.
-    :param kind: what messages call it.
-    :param deterministic: whether ``predict`` is asked for the mean of its actions, or a sample.
-    :raises ConfigError: a source that is none of the three, or whose spaces do not fit;
-        ``ExpertError`` of an expert.
+    :param action_space: the environment's action space, a Box.
+    :param observation_space: the environment's observation space; None: not checked.
+    :param true_state: returns the current true state; None: not available.
+    :param kind: what messages call the controller. With ``"expert"``, errors are ``ExpertError``.
+    :param deterministic: whether ``predict`` returns the mean of its actions rather than a sample.
+    :param made_for: the ``expert=`` argument and the environment that :meth:`for_env` compares.
+    :raises ConfigError: the source is of no kind above, or its spaces do not fit (of an expert:
+        ``ExpertError``).
     """
 
     def __init__(
@@ -48,69 +69,83 @@ class Controller:
         true_state: Callable[[], QuadcopterState] | None = None,
         kind: str = "controller",
         deterministic: bool = True,
+        made_for: tuple[object, VecEnv] | None = None,
     ) -> None:
-        error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
-        self.source, self.kind, self._deterministic = source, kind, deterministic
+        self.source = source
+        self.kind = kind
         self.name = getattr(source, "__name__", type(source).__name__)
+        self.made_for = made_for
+        self._deterministic = deterministic
+        self._true_state = true_state
+        self._predict_state: Any = None
+        error: type[SB3QuadError] = ExpertError if kind == "expert" else ConfigError
         who = f"{kind} {self.name}"
+
+        # Refuse a controller that cannot work at once, not in the first step of a training.
         if isinstance(source, type):
             raise error(f"{who}: is a class; give an instance, such as {self.name}()")
         if not isinstance(action_space, spaces.Box):
             raise error(f"action space {action_space}: a {kind} gives Box actions only")
-        if not any(hasattr(source, name) for name in ("actions", "predict", "__call__")):
+        has_predict = hasattr(source, "predict")
+        if not (hasattr(source, "actions") or has_predict or callable(source)):
             raise error(
-                f"{kind} {source!r}: needs actions(state) or predict(observation), or must be a function of observations"
+                f"{kind} {source!r}: needs actions(state) or predict(observation), "
+                "or must be a function of observations"
             )
-        self._space, self._action_dim = action_space, int(np.prod(action_space.shape))
-        self._low, self._high = (
-            np.float32(bound.reshape(-1)) for bound in (action_space.low, action_space.high)
-        )
-        for what, ours in (
+        # SB3's models and policies have spaces. Other controllers need none.
+        for name, ours in (
             ("observation_space", observation_space),
             ("action_space", action_space),
         ):
-            theirs = getattr(source, what, None)
+            theirs = getattr(source, name, None)
             if isinstance(theirs, spaces.Space) and ours is not None and theirs.shape != ours.shape:
                 raise error(
-                    f"{who}: its {what.replace('_', ' ')} has shape {theirs.shape}, the environment's {ours.shape}"
+                    f"{who}: its {name.replace('_', ' ')} has shape {theirs.shape}, "
+                    f"the environment's {ours.shape}"
                 )
         self.needs_state = hasattr(source, "actions") and true_state is not None
-        if not (self.needs_state or hasattr(source, "predict") or callable(source)):
+        if not (self.needs_state or has_predict or callable(source)):
             raise error(f"{who}: needs the true state, and this environment has no true_state()")
-        self._true_state, self._env, self._state = (
-            true_state,
-            cast(VecEnv | None, None),
-            cast(Any, None),
-        )
-        self._given = source  # of which the source is made, where that is a name
+
+        # Actions are checked and clipped as flat rows.
+        self._action_shape = action_space.shape
+        self._low: Float32Array = action_space.low.reshape(-1).astype(np.float32)
+        self._high: Float32Array = action_space.high.reshape(-1).astype(np.float32)
 
     @staticmethod
-    def for_env(expert: Any, env: VecEnv, present: "Controller | None" = None) -> "Controller":
-        """An expert that labels the states of a vector environment; with ``VecNormalize`` it sees
-        normalised observations.
+    def for_env(
+        expert: ExpertLike | None, env: VecEnv, present: "Controller | None" = None
+    ) -> "Controller":
+        """Return the controller that labels the states of a vector environment.
 
-        :param expert: as above, or what :func:`~sb3_quad.controllers.resolve.resolve_expert` takes,
-            for the vehicle of row 0.
-        :param present: given back, with its state, if it is of the same expert and environment.
-        :raises ConfigError: an unknown name. :class:`ExpertError`: an expert that is none of the
-            three, or whose spaces do not fit the environment.
+        With ``VecNormalize`` the expert sees normalised observations.
+
+        :param expert: the expert. A name is resolved for the vehicle of row 0.
+        :param present: the controller so far. It is returned, with its state, if it was made for
+            the same expert and environment.
+        :raises ConfigError: an unknown name.
+        :raises ExpertError: no expert, one of the wrong kind, or one whose spaces do not fit the
+            environment.
         """
         if expert is None:
             raise ExpertError(
-                "no expert: give expert=... when building or loading the model, or call set_expert(expert)"
+                "no expert: give expert=... when building or loading the model, "
+                "or call set_expert(expert)"
             )
-        if present is not None and present._given is expert and present._env is env:
-            return present
+        # A recurrent expert keeps its state as long as it labels the same environment.
+        if present is not None and present.made_for is not None:
+            present_expert, present_env = present.made_for
+            if present_expert is expert and present_env is env:
+                return present
         vehicle = env.get_attr("vehicle", [0])[0] if env.has_attr("vehicle") else "itm"
-        controller = Controller(
+        return Controller(
             resolve_expert(expert, vehicle),
             env.action_space,
             env.observation_space,
             true_state_of(env),
-            "expert",
+            kind="expert",
+            made_for=(expert, env),
         )
-        controller._env, controller._given = env, expert
-        return controller
 
     def actions(
         self,
@@ -118,72 +153,81 @@ class Controller:
         rows: BoolArray | None = None,
         episode_start: BoolArray | None = None,
     ) -> Float32Array:
-        """The actions for the present state, float32 of shape (n, action_dim); ask before
-        ``env.step``.
+        """Return the actions for the current state, float32 of shape (n, action_dim).
 
-        :param observation: (n, ...): the observations of that state.
-        :param rows: bool (n,): the rows that matter; the others get zeros. None: all.
-        :param episode_start: bool (n,): the rows that have just begun an episode. None: none.
-        :raises ExpertError: of an expert, what it raises itself, actions that are not finite, or
-            not of this shape; ``ControllerError`` of others.
+        Call it before ``env.step``.
+
+        :param observation: the observations of that state, (n, ...).
+        :param rows: bool (n,), the rows that matter; the others get zeros. None: all.
+        :param episode_start: bool (n,), the rows that have just begun an episode. None: none.
+        :raises ControllerError: the controller fails, or its actions are not finite or not of this
+            shape (of an expert: ``ExpertError``).
         """
         error = ExpertError if self.kind == "expert" else ControllerError
+        who = f"{self.kind} {self.name}"
         try:
-            raw = np.asarray(self._answer(observation, episode_start))
+            raw = np.asarray(self._ask(observation, episode_start))
         except SB3QuadError:
             raise
-        except (Exception, SystemExit) as failed:  # a controller of the user's may raise anything
-            raise error(
-                f"{self.kind} {self.name}: fails with {type(failed).__name__}: {failed}"
-            ) from failed
+        except (Exception, SystemExit) as failure:  # a user's controller may raise anything
+            raise error(f"{who}: fails with {type(failure).__name__}: {failure}") from failure
+
+        # Floats, integers and booleans.
         if raw.dtype.kind not in "fiub":
-            raise error(
-                f"{self.kind} {self.name}: gives actions of type {raw.dtype}, must be real numbers"
-            )
-        n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
-        if raw.shape not in ((n, *self._space.shape), (n, self._action_dim)):
-            raise error(
-                f"{self.kind} {self.name}: gives actions of shape {raw.shape}, must be {(n, *self._space.shape)}"
-            )
-        actions = raw.reshape(n, self._action_dim).astype(np.float32)
+            raise error(f"{who}: gives actions of type {raw.dtype}, must be real numbers")
+        # Dictionary observations have a batch axis in each entry.
+        batch: Any = observation
+        if isinstance(observation, dict):
+            batch = next(iter(observation.values()))
+        shape = (len(batch), *self._action_shape)
+        flat_shape = (len(batch), len(self._low))
+        if raw.shape not in (shape, flat_shape):
+            raise error(f"{who}: gives actions of shape {raw.shape}, must be {shape}")
+        actions = raw.reshape(flat_shape).astype(np.float32)
+
+        # Rows that do not matter may hold anything, such as labels of a finished flight.
         if rows is not None:
             actions[~rows] = 0.0
-        if not np.isfinite(actions).all():
-            row = int(np.flatnonzero(~np.isfinite(actions).all(axis=1))[0])
+        finite = np.isfinite(actions).all(axis=1)
+        if not finite.all():
+            row = int(finite.argmin())
             raise error(
-                f"{self.kind} {self.name}: gives {actions[row].tolist()} in row {row}; every number must be finite"
+                f"{who}: gives {actions[row].tolist()} in row {row}; every number must be finite"
             )
         return actions
 
     def labels(
         self, observation: npt.NDArray[Any], episode_start: BoolArray | None = None
     ) -> Float32Array:
-        """As :meth:`actions`, clipped to the action space: what an agent is to learn."""
+        """Return :meth:`actions` clipped to the action space: the labels that an agent imitates."""
         actions = self.actions(observation, episode_start=episode_start)
         np.clip(actions, self._low, self._high, out=actions)
         return actions
 
-    def _answer(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
+    def _ask(self, observation: npt.NDArray[Any], episode_start: BoolArray | None) -> Any:
+        """Return the controller's own answer, unchecked."""
         if self.needs_state and self._true_state is not None:
             return self.source.actions(self._true_state())
         if not hasattr(self.source, "predict"):
             return self.source(observation)
-        before: dict[str, Any] = {}
-        if self._state is not None:
-            before = {"state": self._state} | (
-                {} if episode_start is None else {"episode_start": episode_start}
-            )
-        actions, self._state, *_ = self.source.predict(
-            observation, deterministic=self._deterministic, **before
+        # Without a state yet, the policy begins by itself. Many policies take no such keywords.
+        keywords: dict[str, Any] = {}
+        if self._predict_state is not None:
+            keywords["state"] = self._predict_state
+            if episode_start is not None:
+                keywords["episode_start"] = episode_start
+        actions, self._predict_state, *_ = self.source.predict(
+            observation, deterministic=self._deterministic, **keywords
         )
         return actions
 
 
 def true_state_of(env: VecEnv) -> Callable[[], QuadcopterState] | None:
-    """What gives the true state of all rows of a vector environment; None if there is none."""
+    """Return a function that returns the true state of all rows; None if ``env`` has no state."""
+    # The batched environment has the state of all rows; others have one for each environment.
     base: Any = env.unwrapped
     if hasattr(base, "true_state"):
-        return base.true_state  # type: ignore[no-any-return]
+        return cast(Callable[[], QuadcopterState], base.true_state)
     if env.has_attr("true_state"):
         return lambda: QuadcopterState.concatenate(env.env_method("true_state"))
     return None

@@ -10,6 +10,7 @@ from sb3_quad.controllers.pretrained import agent_path, pretrained_names
 from sb3_quad.controllers.zips import load_model
 from sb3_quad.vehicles.vehicle import Vehicle, first_vehicle
 
+# Experts by name, and their factories, which are imported when they are asked for.
 EXPERTS = {
     "pid": "sb3_quad.experts.pid:PIDExpert",
     "geometric": "sb3_quad.experts.geometric:GeometricExpert",
@@ -18,7 +19,7 @@ EXPERTS = {
     "privileged_cautious": "sb3_quad.experts.geometric:privileged_cautious",
 }
 DEFAULT_EXPERT = "pid"
-"""Whose actions are learnt where nothing else is asked for: the thesis's."""
+"""The expert that is imitated by default, the thesis's."""
 
 
 def resolve_expert(
@@ -27,13 +28,13 @@ def resolve_expert(
     kind: str = "expert",
     layout: str | Path | Vehicle | None = None,
 ) -> Any:
-    """The expert that ``spec`` names.
+    """Return the expert that ``spec`` names.
 
     :param spec: a name of ``EXPERTS``, as ``"pid"``; the path of an SB3 ``.zip`` model, or the name
         of a policy that comes with the package (:func:`sb3_quad.pretrained`);
         ``"package.module:factory"``, where ``factory(vehicle)`` returns an expert; or an expert
         itself, returned as it is.
-    :param vehicle: what a named expert is designed for; of several, the first.
+    :param vehicle: the vehicle that a named expert is designed for; of several, the first.
     :param kind: what messages call it.
     :param layout: ``rotor_layout`` of the environments that it flies in.
     :raises ConfigError: an unknown name, a missing or unreadable file, a factory that cannot be
@@ -43,6 +44,7 @@ def resolve_expert(
     if not isinstance(spec, (str, Path)):
         return spec
     text = str(spec)
+    # A policy of the package and a run folder stand for a zip.
     path = agent_path(text)
     if path.endswith(".zip"):
         return load_model(path)
@@ -58,10 +60,10 @@ def resolve_expert(
 
 
 def import_factory(text: str, kind: str = "expert") -> Any:
-    """What makes the expert of a name, or is at ``package.module:factory``.
+    """Return the factory of a named expert, or the one at ``package.module:factory``.
 
-    :raises ConfigError: an unknown name, or a factory that cannot be imported;
-        :class:`MissingExtra` where it needs one.
+    :raises ConfigError: an unknown name, or a factory that cannot be imported.
+    :raises MissingExtra: the factory needs a package that is not installed.
     """
     location = EXPERTS.get(text, text)
     if ":" not in location:

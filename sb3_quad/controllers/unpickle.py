@@ -1,9 +1,9 @@
-"""Reading the pickles in SB3's zips. Python's own reader calls any function that a pickle names
-(docs/security.md).
+"""A strict reader of the pickles in SB3's zips.
 
-Here the opcodes are interpreted one by one. Names are looked up in the tables of this file alone;
-what is called is a function of this file, which checks its arguments; what is changed was made by
-the same pickle. So nothing outside the result changes.
+Python's own reader calls any function that a pickle names (docs/security.md). This one interprets
+the opcodes one by one. It looks names up in the tables of this file alone. It calls only functions
+of this file, which check their arguments, and changes only objects that the same pickle has made.
+So nothing outside the result changes.
 """
 
 import base64
@@ -12,7 +12,7 @@ import pickletools
 import re
 import sys
 from collections import OrderedDict, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
@@ -33,16 +33,17 @@ from sb3_quad.base.imports import require
 from sb3_quad.base.process import TRUST_VARIABLE
 
 WAY_OUT = f"if you trust whoever made it, add --trust (in Python: {TRUST_VARIABLE}=1)"
-Names = dict[tuple[str, str], Any]  # what stands for module and name
+Names = dict[tuple[str, str], Any]
+"""Objects by module and name."""
 
 
 def unpickle(text: str, where: str) -> Any:
-    """What an entry of an SB3 zip holds.
+    """Return the object that an entry of an SB3 zip holds.
 
     :param text: base64 of a pickle, as SB3 writes it.
     :param where: what messages call the entry.
-    :raises ConfigError: it names or does what SB3's own pickles do not; nothing of that has been
-        imported or called.
+    :raises ConfigError: the pickle names or does something that SB3's own pickles do not. Nothing
+        of that has been imported or called.
     """
     try:
         return _interpret(base64.b64decode(text))
@@ -51,7 +52,7 @@ def unpickle(text: str, where: str) -> Any:
     except MissingExtra:
         raise
     except Exception as error:  # what wrong types raise depends on the types
-        # Not the message of any error: to show an object is to ask it.
+        # Other errors' messages may show an object of the pickle, and to show it is to call it.
         reason = str(error) if isinstance(error, _Refusal) else type(error).__name__
         raise ConfigError(
             f"{where} is not what Stable-Baselines3 pickles ({reason}); {WAY_OUT}"
@@ -59,11 +60,11 @@ def unpickle(text: str, where: str) -> Any:
 
 
 class _UnknownName(Exception):
-    """A pickle names what is in no table."""
+    """A pickle names something that is in no table."""
 
 
 class _Refusal(Exception):
-    """A pickle does what no pickle of SB3 does."""
+    """A pickle does something that no pickle of SB3 does."""
 
 
 def _check(fits: bool, what: str) -> None:
@@ -71,38 +72,45 @@ def _check(fits: bool, what: str) -> None:
         raise _Refusal(what)
 
 
+def _is_one_of(value: Any, candidates: Iterable[Any]) -> bool:
+    """Compare by identity: equality could be an object's own method."""
+    return any(value is candidate for candidate in candidates)
+
+
+# Functions that stand for those that SB3's pickles call, and for the methods that set a state.
+
+
 def _array(buffer: Any, dtype: Any, shape: Any, order: Any, axes: Any = None) -> Any:
-    """As ``numpy._core.numeric._frombuffer``."""
+    """Do what ``numpy._core.numeric._frombuffer`` does."""
     _check(type(buffer) in (bytes, bytearray) and isinstance(dtype, np.dtype), "an array")
     array = np.frombuffer(buffer, dtype)
-    return (
-        array.reshape(shape, order=order) if axes is None else array.reshape(shape).transpose(axes)
-    )
+    if axes is None:
+        return array.reshape(shape, order=order)
+    return array.reshape(shape).transpose(axes)
 
 
 def _fill_array(array: Any, state: Any) -> None:
-    """As ``ndarray.__setstate__``."""
+    """Do what ``ndarray.__setstate__`` does."""
     _, shape, dtype, by_columns, content = state
-    _check(
-        isinstance(dtype, np.dtype) and type(content) is bytes and type(by_columns) is bool,
-        "an array",
-    )
-    _check(
-        type(shape) is tuple and all(type(n) is int and n >= 0 for n in shape),
-        "the shape of an array",
-    )
+    _check(isinstance(dtype, np.dtype), "an array")
+    _check(type(content) is bytes and type(by_columns) is bool, "an array")
+    _check(type(shape) is tuple, "the shape of an array")
+    _check(all(type(n) is int and n >= 0 for n in shape), "the shape of an array")
     _check(len(content) == math.prod(shape) * dtype.itemsize, "the size of an array")
     array.__setstate__((1, shape, dtype, by_columns, content))
 
 
 def _dtype(code: Any, *_: Any) -> Any:
-    """Numbers only. An array of objects made of bytes would read memory as it likes."""
+    """Make a dtype of numbers; an array of objects made of bytes would read memory as it likes."""
     _check(type(code) is str and re.fullmatch(r"[biufc]\d{1,2}", code) is not None, "a dtype")
     return np.dtype(code)
 
 
 def _check_dtype(dtype: Any, state: Any) -> None:
-    native = "|" if dtype.itemsize == 1 else {"little": "<", "big": ">"}[sys.byteorder]
+    """Accept the state of a plain dtype in this machine's byte order, which it has already."""
+    native = {"little": "<", "big": ">"}[sys.byteorder]
+    if dtype.itemsize == 1:
+        native = "|"
     _check(state[1] in ("|", native) and state[2:5] == (None, None, None), "a dtype")
 
 
@@ -115,7 +123,10 @@ def _set_bit_generator(bit_generator: Any, state: Any) -> None:
 
 
 def _generator(bit_generator: Any, *_: Any) -> Generator:
-    """As ``numpy.random._pickle.__generator_ctor``; NumPy 1 gives the bit generator's name."""
+    """Do what ``numpy.random._pickle.__generator_ctor`` does.
+
+    NumPy 1 passes the name of the bit generator, whose state follows.
+    """
     return Generator(bit_generator if type(bit_generator) is PCG64 else PCG64(0))
 
 
@@ -124,127 +135,107 @@ def _set_generator(generator: Any, state: Any) -> None:
 
 
 def _set_seed_sequence(seeds: Any, state: Any) -> None:
-    entropy, spawned, _, pool_size, spawn_key = state  # of which the pool follows
+    # The third entry, the pool, follows from the others.
+    entropy, spawned, _, pool_size, spawn_key = state
     seeds.__init__(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=spawned)
 
 
 def _member(kind: Any, value: Any) -> Any:
-    return {each.value: each for each in kind}[value]
+    """Return the member of an enumeration."""
+    members = {member.value: member for member in kind}
+    return members[value]
+
+
+# Tables: what a pickle may name.
 
 
 def _by_name(*classes: type) -> Names:
-    return {(each.__module__, each.__qualname__): each for each in classes}
+    return {(kind.__module__, kind.__qualname__): kind for kind in classes}
 
 
-_WITH_ATTRIBUTES = _by_name(  # instances of these are made, and given attributes
-    *(spaces.Box, spaces.Dict, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete),
-    *(noise.NormalActionNoise, noise.OrnsteinUhlenbeckActionNoise, noise.VectorizedActionNoise),
-    *(utils.ConstantSchedule, utils.FloatSchedule, utils.LinearSchedule),
+def _members(module: Any, names: str) -> Names:
+    return _by_name(*[getattr(module, name) for name in names.split()])
+
+
+# Instances of these classes are made, and get attributes.
+_WITH_ATTRIBUTES = (
+    _members(spaces, "Box Dict Discrete MultiBinary MultiDiscrete")
+    | _members(noise, "NormalActionNoise OrnsteinUhlenbeckActionNoise VectorizedActionNoise")
+    | _members(utils, "ConstantSchedule FloatSchedule LinearSchedule")
 )
-_CLASSES = _WITH_ATTRIBUTES | _by_name(  # these are only named; TrainFreq is a tuple
-    *(
-        policies.ActorCriticPolicy,
-        policies.ActorCriticCnnPolicy,
-        policies.MultiInputActorCriticPolicy,
-    ),
-    *(
-        sac.SACPolicy,
-        sac.CnnPolicy,
-        sac.MultiInputPolicy,
-        td3.TD3Policy,
-        td3.CnnPolicy,
-        td3.MultiInputPolicy,
-    ),
-    *(dqn.DQNPolicy, dqn.CnnPolicy, dqn.MultiInputPolicy),
-    *(torch_layers.FlattenExtractor, torch_layers.NatureCNN, torch_layers.CombinedExtractor),
-    *(
-        buffers.RolloutBuffer,
-        buffers.DictRolloutBuffer,
-        buffers.ReplayBuffer,
-        buffers.DictReplayBuffer,
-    ),
-    *(buffers.NStepReplayBuffer, HerReplayBuffer, TrainFreq, np.float32, np.float64),
-    *(
-        nn.CELU,
-        nn.ELU,
-        nn.GELU,
-        nn.Hardswish,
-        nn.Hardtanh,
-        nn.LeakyReLU,
-        nn.Mish,
-        nn.ReLU,
-        nn.ReLU6,
-        nn.SELU,
-        nn.Sigmoid,
-    ),
-    *(nn.SiLU, nn.Softplus, nn.Softsign, nn.Tanh),
-    *(
-        optim.Adagrad,
-        optim.Adam,
-        optim.Adamax,
-        optim.AdamW,
-        optim.NAdam,
-        optim.RAdam,
-        optim.RMSprop,
-        optim.SGD,
-        RMSpropTFLike,
-    ),
+# The others of these are only named, but for TrainFreq, a named tuple.
+_CLASSES = (
+    _WITH_ATTRIBUTES
+    | _members(policies, "ActorCriticPolicy ActorCriticCnnPolicy MultiInputActorCriticPolicy")
+    | _members(sac, "SACPolicy CnnPolicy MultiInputPolicy")
+    | _members(td3, "TD3Policy CnnPolicy MultiInputPolicy")
+    | _members(dqn, "DQNPolicy CnnPolicy MultiInputPolicy")
+    | _members(torch_layers, "FlattenExtractor NatureCNN CombinedExtractor")
+    | _members(buffers, "RolloutBuffer DictRolloutBuffer ReplayBuffer DictReplayBuffer")
+    | _members(buffers, "NStepReplayBuffer")
+    | _members(nn, "CELU ELU GELU Hardswish Hardtanh LeakyReLU Mish ReLU ReLU6 SELU Sigmoid SiLU")
+    | _members(nn, "Softplus Softsign Tanh")
+    | _members(optim, "Adagrad Adam Adamax AdamW NAdam RAdam RMSprop SGD")
+    | _by_name(RMSpropTFLike, HerReplayBuffer, TrainFreq, np.float32, np.float64)
 )
-_NUMPY: Names = {  # in numpy.core, which is numpy._core in NumPy 2
-    ("numeric", "_frombuffer"): _array,
-    ("multiarray", "_reconstruct"): lambda *_: np.empty(0, np.int8),
-    ("multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[()],
-}
-_FUNCTIONS: Names = {  # what is called for a name; items and state follow
-    **{
-        (f"numpy.{core}.{module}", name): each
-        for core in ("core", "_core")
-        for (module, name), each in _NUMPY.items()
-    },
+# The function that is called for a name. Items and state of its result follow in the pickle.
+_FUNCTIONS: Names = {
     ("numpy", "dtype"): _dtype,
-    ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(
-        0
-    ),  # Gymnasium's spaces have no other kind
+    # Gymnasium's spaces have no other bit generator.
+    ("numpy.random._pickle", "__bit_generator_ctor"): lambda *_: PCG64(0),
     ("numpy.random._pickle", "__generator_ctor"): _generator,
     ("numpy.random.bit_generator", "__pyx_unpickle_SeedSequence"): lambda *_: SeedSequence(0),
     ("collections", "OrderedDict"): lambda: OrderedDict(),
     ("collections", "deque"): lambda _, length=None: deque(maxlen=length),
-    **{
-        key: partial(_member, kind)
-        for key, kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items()
-    },
 }
-_ARGUMENTS: Names = {
-    key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)
-}  # of those functions, which know them
-_CHANGES: dict[type, Callable[[Any, Any], None]] = {  # how what has been made is given its state
+for _core in ("numpy.core", "numpy._core"):  # in NumPy 1 and 2
+    _FUNCTIONS |= {
+        (f"{_core}.numeric", "_frombuffer"): _array,
+        (f"{_core}.multiarray", "_reconstruct"): lambda *_: np.empty(0, np.int8),
+        (f"{_core}.multiarray", "scalar"): lambda dtype, content: _array(content, dtype, (), "C")[
+            ()
+        ],
+    }
+for _key, _kind in _by_name(TrainFrequencyUnit, GoalSelectionStrategy).items():
+    _FUNCTIONS[_key] = partial(_member, _kind)
+# Arguments of these functions, which know by themselves what they make.
+_ARGUMENTS: Names = {key: key[1] for key in _by_name(np.ndarray, PCG64, SeedSequence)}
+# How an object that has been made gets its state.
+_CHANGES: dict[type, Callable[[Any, Any], None]] = {
     np.ndarray: _fill_array,
     PCG64: _set_bit_generator,
     Generator: _set_generator,
     SeedSequence: _set_seed_sequence,
-    **{type(np.dtype(each)): _check_dtype for each in "?bhilqBHILQefdgFDG"},
 }
+for _code in "?bhilqBHILQefdgFDG":
+    _CHANGES[type(np.dtype(_code))] = _check_dtype
+
+
+def _recurrent_names() -> Names:
+    recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
+    return _members(
+        recurrent.policies,
+        "RecurrentActorCriticPolicy RecurrentActorCriticCnnPolicy "
+        "RecurrentMultiInputActorCriticPolicy",
+    ) | _members(recurrent.buffers, "RecurrentRolloutBuffer RecurrentDictRolloutBuffer")
+
+
+# What the opcodes do. Each function takes the items of the stack and returns what replaces them.
 
 
 def _find(module: Any, name: Any) -> Any:
     _check(type(module) is str and type(name) is str, "a name")
     names = _CLASSES | _FUNCTIONS | _ARGUMENTS
     if module.startswith("sb3_contrib.common.recurrent."):
-        recurrent = require("sb3_contrib", "", "a recurrent agent").common.recurrent
-        kinds = ("ActorCriticPolicy", "ActorCriticCnnPolicy", "MultiInputActorCriticPolicy")
-        names |= _by_name(*(getattr(recurrent.policies, f"Recurrent{kind}") for kind in kinds))
-        names |= _by_name(
-            recurrent.buffers.RecurrentRolloutBuffer, recurrent.buffers.RecurrentDictRolloutBuffer
-        )
+        names |= _recurrent_names()
     if (module, name) not in names:
         raise _UnknownName(f"{module}.{name}".encode("unicode_escape").decode()[:200])
     return names[module, name]
 
 
 def _call(function: Any, arguments: Any) -> Any:
-    _check(
-        any(function is each for each in _FUNCTIONS.values()) and type(arguments) is tuple, "a call"
-    )
+    _check(_is_one_of(function, _FUNCTIONS.values()), "a call")
+    _check(type(arguments) is tuple, "a call")
     return function(*arguments)
 
 
@@ -252,7 +243,7 @@ def _new(kind: Any, arguments: Any) -> Any:
     _check(type(arguments) is tuple, "an instance")
     if kind is TrainFreq:
         return TrainFreq(*arguments)
-    _check(any(kind is each for each in _WITH_ATTRIBUTES.values()) and not arguments, "an instance")
+    _check(_is_one_of(kind, _WITH_ATTRIBUTES.values()) and not arguments, "an instance")
     return kind.__new__(kind)
 
 
@@ -261,87 +252,106 @@ def _change(instance: Any, state: Any) -> Any:
     if kind in _CHANGES:
         _CHANGES[kind](instance, state)
         return instance
-    _check(kind in _WITH_ATTRIBUTES.values() and type(state) is dict, "a state")
+    _check(_is_one_of(kind, _WITH_ATTRIBUTES.values()) and type(state) is dict, "a state")
     _check(all(type(name) is str and not name.startswith("__") for name in state), "attributes")
-    getattr(kind, "__setstate__", lambda made, attributes: made.__dict__.update(attributes))(
-        instance, state
-    )
+    if hasattr(kind, "__setstate__"):
+        kind.__setstate__(instance, state)
+    else:
+        instance.__dict__.update(state)
     return instance
 
 
-def _of_kind(value: Any, *kinds: type) -> Any:
-    _check(type(value) in kinds, "a container")
-    return value
+def _extend(items: Any, *new: Any) -> Any:
+    _check(type(items) in (list, deque), "a container")
+    items.extend(new)
+    return items
 
 
-_CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False}
-_EMPTY = {"EMPTY_TUPLE": tuple, "EMPTY_LIST": list, "EMPTY_DICT": dict, "EMPTY_SET": set}
-_LITERALS = {
-    *(
-        "BININT",
-        "BININT1",
-        "BININT2",
-        "LONG1",
-        "BINFLOAT",
-        "SHORT_BINUNICODE",
-        "BINUNICODE",
-        "BINUNICODE8",
-    ),
+def _update(items: Any, *new: Any) -> Any:
+    _check(type(items) in (dict, OrderedDict), "a container")
+    items.update(zip(new[::2], new[1::2], strict=True))
+    return items
+
+
+def _add(items: Any, *new: Any) -> Any:
+    _check(type(items) is set, "a container")
+    items.update(new)
+    return items
+
+
+def _tuple(*items: Any) -> Any:
+    return items
+
+
+# Opcodes that push their argument.
+_LITERALS = (
+    *("BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT"),
+    *("SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8"),
     *("SHORT_BINBYTES", "BINBYTES", "BINBYTES8", "BYTEARRAY8"),
+)
+# Opcodes that replace so many items of the stack by the result of a function.
+_OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "NONE": (0, lambda: None),
+    "NEWTRUE": (0, lambda: True),
+    "NEWFALSE": (0, lambda: False),
+    "EMPTY_TUPLE": (0, tuple),
+    "EMPTY_LIST": (0, list),
+    "EMPTY_DICT": (0, dict),
+    "EMPTY_SET": (0, set),
+    "TUPLE1": (1, _tuple),
+    "TUPLE2": (2, _tuple),
+    "TUPLE3": (3, _tuple),
+    "APPEND": (2, _extend),
+    "SETITEM": (3, _update),
+    "STACK_GLOBAL": (2, _find),
+    "REDUCE": (2, _call),
+    "NEWOBJ": (2, _new),
+    "BUILD": (2, _change),
 }
-_OF_TWO: dict[str, Callable[[Any, Any], Any]] = {
-    "STACK_GLOBAL": _find,
-    "REDUCE": _call,
-    "NEWOBJ": _new,
-    "BUILD": _change,
+# The same for all items above the last mark, and so many below it.
+_MARK_OPERATIONS: dict[str, tuple[int, Callable[..., Any]]] = {
+    "TUPLE": (0, _tuple),
+    "FROZENSET": (0, lambda *items: frozenset(items)),
+    "APPENDS": (1, _extend),
+    "SETITEMS": (1, _update),
+    "ADDITEMS": (1, _add),
 }
-_SIZES = {
-    "TUPLE1": 1,
-    "TUPLE2": 2,
-    "TUPLE3": 3,
-    "APPEND": 1,
-    "SETITEM": 2,
-    "POP": 1,
-    **dict.fromkeys(_OF_TWO, 2),
-}
-_FROM_MARK = {"TUPLE", "APPENDS", "SETITEMS", "ADDITEMS", "FROZENSET", "POP_MARK"}
 
 
 def _interpret(content: bytes) -> Any:
-    """What a pickle holds; of the opcodes, those that protocols 4 and 5 use for what SB3 saves."""
+    """Return what a pickle holds.
+
+    Known are the opcodes of protocols 4 and 5 that are used for what SB3 saves.
+    """
     memo: dict[int, Any] = {}
     stack: list[Any] = []
     below: list[list[Any]] = []  # the stacks below each mark
     argument: Any
     for opcode, argument, _ in pickletools.genops(content):
-        name, items = opcode.name, []
-        if name in _SIZES:
-            items = [stack.pop() for _ in range(_SIZES[name])][::-1]
-        elif name in _FROM_MARK:
-            items, stack = stack, below.pop()
-        if name in _CONSTANTS:
-            stack.append(_CONSTANTS[name])
-        elif name in _EMPTY:
-            stack.append(_EMPTY[name]())
-        elif name in _LITERALS:
+        name = opcode.name
+        if name in _LITERALS:
             stack.append(argument)
-        elif name in _OF_TWO:
-            stack.append(_OF_TWO[name](*items))
-        elif name.startswith("TUPLE"):
-            stack.append(tuple(items))
-        elif name == "FROZENSET":
-            stack.append(frozenset(items))
-        elif name.startswith("APPEND"):
-            _of_kind(stack[-1], list, deque).extend(items)
-        elif name.startswith("SETITEM"):
-            _of_kind(stack[-1], dict, OrderedDict).update(zip(items[::2], items[1::2], strict=True))
-        elif name == "ADDITEMS":
-            _of_kind(stack[-1], set).update(items)
+        elif name in _OPERATIONS or name in _MARK_OPERATIONS:
+            # Take the items off the stack, and push the result.
+            above: list[Any] = []
+            if name in _OPERATIONS:
+                count, operation = _OPERATIONS[name]
+            else:
+                count, operation = _MARK_OPERATIONS[name]
+                above, stack = stack, below.pop()
+            items = [stack.pop() for _ in range(count)]
+            stack.append(operation(*reversed(items), *above))
         elif name == "GLOBAL":
             stack.append(_find(*argument.split(" ")))
+        # A mark begins a new stack on top of the present one.
         elif name == "MARK":
             below.append(stack)
             stack = []
+        elif name == "POP_MARK":
+            stack = below.pop()
+        elif name == "POP":
+            stack.pop()
+        # The memo is how a pickle names an object twice.
         elif name == "MEMOIZE":
             memo[len(memo)] = stack[-1]
         elif name in ("BINPUT", "LONG_BINPUT"):
@@ -351,5 +361,5 @@ def _interpret(content: bytes) -> Any:
         elif name == "STOP":
             return stack.pop()
         else:
-            _check(name in ("PROTO", "FRAME", "POP", "POP_MARK"), f"opcode {name}")
+            _check(name in ("PROTO", "FRAME"), f"opcode {name}")
     raise _Refusal("no end")

@@ -1,4 +1,4 @@
-"""Loading a saved SB3 model without being told which algorithm made it."""
+"""Loading a saved SB3 model whose algorithm is not known beforehand."""
 
 import io
 import json
@@ -28,64 +28,53 @@ _FAMILIES = {
     "stable_baselines3.td3.policies": "TD3",
     "stable_baselines3.dqn.policies": "DQN",
 }
-# By family, settings that only these save; their zips are the stock algorithm's otherwise
-_OURS = {
-    "PPO": {"bc_coef": "PPOBC", "beta": "DAgger"},
-    "SAC": {"bc_coef": "SACBC"},
-}
-_STOCK = {
-    name: family for family, names in _OURS.items() for name in names.values()
-}  # what reads the zips of ours
-_TO_FLY = (
-    "action_space",
-    "observation_space",
-    "policy_class",
-    "policy_kwargs",
-)  # what is read of the pickles of an agent
-_STAND_INS = {
-    "clip_range": 0.0,
-    "learning_rate": 0.0,
-    "train_freq": 1,
-}  # for those others that cannot be None
-_NEVER_READ = (
-    "env",
-    "expert",
-    "_labeller",
-)  # whose names would be imported; SB3 and this package save none
-_VARIABLES = {
-    "ent_coef_tensor",
-    "log_ent_coef",
-}  # what SB3 saves beside policies and optimisers; it may write elsewhere
+# Of this package's algorithms: the family, a setting that only they save, and their name. Apart
+# from that their zips are those of the stock algorithm.
+_OURS = (
+    ("PPO", "bc_coef", "PPOBC"),
+    ("PPO", "beta", "DAgger"),
+    ("SAC", "bc_coef", "SACBC"),
+)
+# Of the pickles of an agent, ``predict`` needs only these.
+_TO_FLY = ("action_space", "observation_space", "policy_class", "policy_kwargs")
+# The others become None, or these values where SB3 cannot load None.
+_STAND_INS = {"clip_range": 0.0, "learning_rate": 0.0, "train_freq": 1}
+# SB3 and this package never save these, and loading them would import what they name.
+_NEVER_READ = ("env", "expert", "_labeller")
+# What SB3 saves apart from policies and optimisers. Loading another one would set any attribute.
+_VARIABLES = {"ent_coef_tensor", "log_ent_coef"}
 
 
 def saved_data(path: str | Path | io.BytesIO, where: str = "") -> dict[str, Any]:
-    """The attributes of the model in an SB3 ``.zip`` as its JSON has them; those that are pickled
-    there stay so.
+    """Return the attributes of the model in an SB3 ``.zip``, as its JSON has them.
 
-    :param where: what messages call the file; its path unless given.
+    Attributes that are pickled there stay pickled.
+
+    :param where: what messages call the file; empty: its path.
     :raises ConfigError: a missing file, or one that is not a complete SB3 zip.
     """
-    file, where = path if isinstance(path, io.BytesIO) else Path(path), where or f"model {path}"
-    if isinstance(file, Path) and not file.is_file():
-        raise ConfigError(
-            f"{where}: "
-            + ("no run with an agent in this folder" if file.is_dir() else "no such file")
-        )
+    where = where or f"model {path}"
+    if not isinstance(path, io.BytesIO):
+        if Path(path).is_dir():
+            raise ConfigError(f"{where}: no run with an agent in this folder")
+        if not Path(path).is_file():
+            raise ConfigError(f"{where}: no such file")
     try:
-        with zipfile.ZipFile(file) as archive:
+        with zipfile.ZipFile(path) as archive:
             return dict(json.loads(archive.read("data")))
     except Exception as error:  # what a damaged archive raises depends on where the damage is
-        raise ConfigError(
-            f"{where}: not a complete SB3 zip ({type(error).__name__}: {error})"
-        ) from None
+        raise _incomplete(where, error) from None
+
+
+def _incomplete(where: str, error: Exception) -> ConfigError:
+    return ConfigError(f"{where}: not a complete SB3 zip ({type(error).__name__}: {error})")
 
 
 def saved_algorithm(path: str | Path) -> str:
-    """What made an SB3 ``.zip``: PPO, A2C, SAC, TD3, DDPG, DQN, RecurrentPPO; PPOBC, SACBC, DAgger
-    of ours.
+    """Return the name of the algorithm that made an SB3 ``.zip``.
 
-    A zip does not name its algorithm; the policy class and the settings that were saved with it
-    tell.
+    It is PPO, A2C, SAC, TD3, DDPG, DQN or RecurrentPPO; or PPOBC, SACBC or DAgger of this package.
+    A zip does not name its algorithm. The policy class and the settings in it tell.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, or a policy of an
         unknown family.
@@ -94,20 +83,21 @@ def saved_algorithm(path: str | Path) -> str:
     try:
         module = str(data["policy_class"]["__module__"])
     except (KeyError, TypeError) as error:
-        raise ConfigError(
-            f"model {path}: not a complete SB3 zip ({type(error).__name__}: {error})"
-        ) from None
+        raise _incomplete(f"model {path}", error) from None
     if module not in _FAMILIES:
         raise ConfigError(
             f"model {path}: its policy is of {module}, known are {', '.join(sorted(_FAMILIES))}"
         )
     family = _FAMILIES[module]
-    for key, name in _OURS.get(family, {}).items():
-        if key in data:
+    for stock, setting, name in _OURS:
+        if family == stock and setting in data:
             return name
+    # A2C and DDPG have the policy classes of PPO and TD3.
     if family == "PPO" and "n_epochs" not in data:
         return "A2C"
-    return "DDPG" if family == "TD3" and data.get("policy_delay") == 1 else family
+    if family == "TD3" and data.get("policy_delay") == 1:
+        return "DDPG"
+    return family
 
 
 def load_zip(
@@ -117,39 +107,39 @@ def load_zip(
     where: str = "",
     **kwargs: Any,
 ) -> Algorithm:
-    """``algorithm.load(path, **kwargs)``, in which no code of the file's own runs, unless
-    :func:`trusted`.
+    """Return ``algorithm.load(path, **kwargs)``, without running any code of the file's own.
 
-    PyTorch reads the weights with ``weights_only``; what is pickled beside them is read by
-    :func:`unpickle`.
+    PyTorch reads the weights with ``weights_only``; :func:`unpickle` reads the pickles that are
+    saved with them. If the user has declared files :func:`trusted`, SB3 reads all of it.
 
-    :param to_fly: only for ``predict``: schedules, noise and the like, which may be functions, are
-        not read at all.
-    :param where: what messages call the file; its path unless given.
+    :param to_fly: load for ``predict`` only. Schedules, noise and the like, which may be functions,
+        are then not read at all.
+    :param where: what messages call the file; empty: its path.
     :raises ConfigError: a missing or damaged file, or one that may run code of its own.
     """
     where = where or f"model {path}"
+    # What stands in ``custom_objects`` is not unpickled by SB3.
     objects: dict[str, Any] = {}
     data = {} if trusted() else saved_data(path, where)
     for key, entry in data.items():
         if key in _NEVER_READ:
             objects[key] = None
         elif isinstance(entry, dict) and ":serialized:" in entry:
-            unread = to_fly and key not in _TO_FLY
-            objects[key] = (
-                _STAND_INS.get(key)
-                if unread
-                else unpickle(entry[":serialized:"], f"{where}: its {key}")
-            )
+            if to_fly and key not in _TO_FLY:
+                objects[key] = _STAND_INS.get(key)
+            else:
+                objects[key] = unpickle(entry[":serialized:"], f"{where}: its {key}")
+    # SB3 sets variables by their names, on any part of the model.
     try:
-        variables = load_from_zip_file(path, load_data=False, device="cpu")[2] if data else None
-        if not _VARIABLES.issuperset(variables or ()):
-            raise ConfigError(
-                f"{where}: holds variables that no algorithm has; known are {', '.join(sorted(_VARIABLES))}"
-            )
-        with (
-            warnings.catch_warnings()
-        ):  # SB3 takes the buffer of n-step returns, its own choice, for the user's
+        if data:
+            variables = load_from_zip_file(path, load_data=False, device="cpu")[2] or {}
+            if variables.keys() - _VARIABLES:
+                raise ConfigError(
+                    f"{where}: holds variables that no algorithm has; "
+                    f"known are {', '.join(sorted(_VARIABLES))}"
+                )
+        with warnings.catch_warnings():
+            # SB3 takes the buffer of n-step returns, its own choice, for the user's.
             warnings.filterwarnings("ignore", "`n_steps=")
             return algorithm.load(path, custom_objects=objects, **kwargs)
     except SB3QuadError:
@@ -161,23 +151,27 @@ def load_zip(
 
 
 def load_model(path: str | Path, device: str = "cpu") -> BaseAlgorithm:
-    """The model in an SB3 ``.zip``, of any algorithm of Stable-Baselines3 (and of this package),
-    ready for ``predict``.
+    """Return the model in an SB3 ``.zip``, ready for ``predict``.
+
+    It may be of any algorithm of Stable-Baselines3 or of this package.
 
     :raises ConfigError: a missing file, one that is not a complete SB3 zip, a policy of an unknown
-        family, or with parameters that are not finite; a file that may run code of its own.
-        :class:`MissingExtra`: a recurrent one, and no sb3-contrib.
+        family, parameters that are not finite, or a file that may run code of its own.
+    :raises MissingExtra: a recurrent model, and sb3-contrib is not installed.
     """
-    algorithm = saved_algorithm(path)
-    name = _STOCK.get(algorithm, algorithm)
-    library = (
-        require("sb3_contrib", "", f"model {path}") if name == "RecurrentPPO" else stable_baselines3
-    )
-    stock: type[BaseAlgorithm] = getattr(library, name)
-    model: BaseAlgorithm = load_zip(stock, path, to_fly=True, device=device)
-    broken = [
-        name for name, tensor in model.policy.state_dict().items() if not th.isfinite(tensor).all()
-    ]
-    if broken:
-        raise ConfigError(f"model {path}: {broken[0]} is not finite; no policy flies by that")
+    name = saved_algorithm(path)
+    for stock, _, ours in _OURS:
+        if name == ours:
+            name = stock
+    # ``predict`` of this package's algorithms is that of the stock ones.
+    library = stable_baselines3
+    if name == "RecurrentPPO":
+        library = require("sb3_contrib", "", f"model {path}")
+    algorithm: type[BaseAlgorithm] = getattr(library, name)
+    model = load_zip(algorithm, path, to_fly=True, device=device)
+    for parameter, tensor in model.policy.state_dict().items():
+        if not th.isfinite(tensor).all():
+            raise ConfigError(
+                f"model {path}: {parameter} contains NaN or infinity; the model is unusable"
+            )
     return model

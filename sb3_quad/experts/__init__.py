@@ -1,1 +1,1 @@
-"""Controllers that know the model: the teachers of DAgger and of PPO with behavioural cloning."""
+"""Controllers that know the model: teachers for DAgger and for cloning in PPO and SAC."""

@@ -1,6 +1,4 @@
-"""The nested PID controller of the thesis (2.1.2, 3.2.1, Table A.1), for a batch of vehicles at
-once.
-"""
+"""The nested PID controller of the thesis (2.1.2, 3.2.1, Table A.1), for a batch of vehicles."""
 
 import math
 
@@ -9,31 +7,23 @@ import numpy.typing as npt
 
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.experts.protocol import Actions, Expert
+from sb3_quad.experts.vectors import difference, rotated, rotations_at, vector_at
 from sb3_quad.simulation.compiled import compiled
-from sb3_quad.simulation.physics import rotation_rows
-from sb3_quad.simulation.state import (
-    BODY_RATES,
-    POSITION,
-    QUATERNION,
-    TARGET,
-    VELOCITY,
-    QuadcopterState,
-)
+from sb3_quad.simulation.state import QuadcopterState, X
 from sb3_quad.vehicles.vehicle import Vehicle
 
-ANGLE_FACTOR = (
-    0.25  # φ_des and θ_des are taken at a quarter, "to ensure smoother rotations" (3.2.1)
-)
+# The thesis takes φ_des and θ_des at a quarter, "to ensure smoother rotations" (3.2.1).
+ANGLE_FACTOR = 0.25
 
 
 class PIDExpert(Expert):
     """Position PID around an attitude PD controller, on the true state (thesis 2.1.2 and 3.2.1).
 
-    For small angles; from a random attitude it recovers less than a third of the time. The attitude
-    gains are I ωn² and 2 ξ ωn I (Eq. 3.15), so they fit any vehicle; with ITM's inertia they are
-    those of Table A.1.
+    It is made for small angles: from a random attitude it recovers less than a third of the time.
+    The attitude gains are I ωn² and 2 ξ ωn I (Eq. 3.15), so they fit any vehicle. With ITM's
+    inertia they are those of Table A.1.
 
-    :param vehicle: name, YAML path or Vehicle it is designed for.
+    :param vehicle: name, YAML path or Vehicle that it is designed for.
     :param kp: position gain, 1/s² (Table A.1).
     :param ki: height gain, 1/s³. The printed integral acts over one control step, as ki e_z Δt: a
         true integrator with ki = 50 is unstable.
@@ -55,74 +45,80 @@ class PIDExpert(Expert):
         observation_std: npt.ArrayLike | None = None,
     ) -> None:
         super().__init__(vehicle, observation_mean, observation_std)
-        gains = {
-            "kp": kp,
-            "ki": ki,
-            "kd": kd,
-            "natural_frequency": natural_frequency,
-            "damping": damping,
-        }
+        gains = {"kp": kp, "ki": ki, "kd": kd, "damping": damping}
+        gains["natural_frequency"] = natural_frequency
         for name, value in gains.items():
             if not (math.isfinite(value) and value >= 0):
                 raise ConfigError(
                     f"PIDExpert: {name} is {value}, must be a finite number of at least 0"
                 )
+        # Table A.1, for any inertia (Eq. 3.15).
         v = self.vehicle
         inertia = np.asarray(v.inertia)
-        position = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
-        attitude = np.stack(
-            [inertia * natural_frequency**2, inertia * 2 * damping * natural_frequency]
+        position_gains = np.array([kp, kd, ki * v.control_step, v.mass, v.gravity])
+        proportional = inertia * natural_frequency**2
+        derivative = inertia * 2 * damping * natural_frequency
+        self._constants = (
+            position_gains,
+            np.stack([proportional, derivative]),
+            v.mixer_inverse,
+            np.array(v.thrust_range),
         )
-        self._constants = position, attitude, v.mixer_inverse, np.array(v.thrust_range)
 
     def actions(self, state: QuadcopterState) -> Actions:
-        """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
+        """Return actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
         actions = np.empty((state.n, 4), dtype=np.float32)
-        moving = [
-            state.array[rows] for rows in (POSITION, QUATERNION, VELOCITY, BODY_RATES, TARGET)
-        ]
-        _pid(*moving, *self._constants, actions)
+        _pid(state.array, *self._constants, actions)
         return actions
 
 
 @compiled
-def _pid(
-    position, quaternion, velocity, rates, target, gains, attitude, mixer_inverse, limits, actions
-):  # type: ignore[no-untyped-def]
+def _rotor_thrust(mixer_row, u1, u2, u3, u4):  # type: ignore[no-untyped-def]
+    """Return the thrust of a rotor, N, for a thrust u1 and moments u2, u3, u4 (Eq. 2.7)."""
+    return mixer_row[0] * u1 + mixer_row[1] * u2 + mixer_row[2] * u3 + mixer_row[3] * u4
+
+
+@compiled
+def _pid(state, gains, attitude, mixer_inverse, limits, actions):  # type: ignore[no-untyped-def]
+    """Write the actions of n vehicles, (n, 4), from their state, (STATE_SIZE, n)."""
     kp, kd, ki_dt, mass, g = gains
+    proportional, derivative = attitude
     low, high = limits
-    middle, half = (high + low) / 2, (high - low) / 2
+    middle = (high + low) / 2
+    half = (high - low) / 2
     for i in range(actions.shape[0]):
-        ex = target[0, i] - position[0, i]
-        ey = target[1, i] - position[1, i]
-        ez = target[2, i] - position[2, i]
-        vx, vy, vz = velocity[0, i], velocity[1, i], velocity[2, i]
-        (r11, r12, r13), (r21, r22, r23), (r31, r32, r33) = rotation_rows(
-            quaternion[0, i], quaternion[1, i], quaternion[2, i], quaternion[3, i]
-        )
-        roll, pitch, yaw = (
-            math.atan2(r32, r33),
-            math.asin(min(1.0, max(-1.0, -r31))),
-            math.atan2(r21, r11),
-        )
-        ax = kp * ex - kd * (r11 * vx + r21 * vy + r31 * vz)  # body-frame velocity
-        ay = kp * ey - kd * (r12 * vx + r22 * vy + r32 * vz)
-        az = kp * ez - kd * (r13 * vx + r23 * vy + r33 * vz)
-        sin_yaw, cos_yaw = math.sin(yaw), math.cos(yaw)
-        roll_des = ANGLE_FACTOR * (ax * sin_yaw - ay * cos_yaw) / g
-        pitch_des = ANGLE_FACTOR * (ax * cos_yaw + ay * sin_yaw) / g
-        u1 = mass * (g + az + ki_dt * ez)
-        u2 = attitude[0, 0] * (roll_des - roll) - attitude[1, 0] * rates[0, i]
-        u3 = attitude[0, 1] * (pitch_des - pitch) - attitude[1, 1] * rates[1, i]
-        u4 = -attitude[0, 2] * yaw - attitude[1, 2] * rates[2, i]  # ψ_des = 0
+        position_error = difference(vector_at(state, X.target, i), vector_at(state, X.position, i))
+        # The velocity in the body frame, and the Euler angles Z-Y-X.
+        rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
+        velocity = rotated(rotation_inverse, vector_at(state, X.velocity, i))
+        p, q, r = vector_at(state, X.body_rates, i)
+        (r11, _, _), (r21, _, _), (r31, r32, r33) = rotation
+        roll = math.atan2(r32, r33)
+        pitch = math.asin(min(1.0, max(-1.0, -r31)))
+        yaw = math.atan2(r21, r11)
+
+        # Position: desired accelerations, and the angles that make the horizontal ones.
+        ax = kp * position_error[0] - kd * velocity[0]
+        ay = kp * position_error[1] - kd * velocity[1]
+        az = kp * position_error[2] - kd * velocity[2]
+        sine = math.sin(yaw)
+        cosine = math.cos(yaw)
+        roll_des = ANGLE_FACTOR * (ax * sine - ay * cosine) / g
+        pitch_des = ANGLE_FACTOR * (ax * cosine + ay * sine) / g
+
+        # Attitude: the thrust and the moments (Eqs. 2.7 to 2.10). The desired yaw is 0.
+        u1 = mass * (g + az + ki_dt * position_error[2])
+        u2 = proportional[0] * (roll_des - roll) - derivative[0] * p
+        u3 = proportional[1] * (pitch_des - pitch) - derivative[1] * q
+        u4 = -proportional[2] * yaw - derivative[2] * r
+
+        # Scale all four thrusts by one factor, so that the largest is allowed.
         largest = -math.inf
         for k in range(4):
-            m = mixer_inverse[k]
-            largest = max(largest, m[0] * u1 + m[1] * u2 + m[2] * u3 + m[3] * u4)
-        scale = (
-            high / largest if largest > high else 1.0
-        )  # all four by one factor, so that the largest is allowed
+            largest = max(largest, _rotor_thrust(mixer_inverse[k], u1, u2, u3, u4))
+        scale = 1.0
+        if largest > high:
+            scale = high / largest
         for k in range(4):
-            m = mixer_inverse[k]
-            thrust = max(low, scale * (m[0] * u1 + m[1] * u2 + m[2] * u3 + m[3] * u4))
+            thrust = max(low, scale * _rotor_thrust(mixer_inverse[k], u1, u2, u3, u4))
             actions[i, k] = min(1.0, max(-1.0, (thrust - middle) / half))

@@ -1,4 +1,4 @@
-"""What an expert is, and how it answers both with the true state and behind SB3's ``predict``."""
+"""The base class of experts: they act on the true state, or on observations as SB3's models do."""
 
 from abc import ABC, abstractmethod
 
@@ -22,19 +22,18 @@ Actions = Float32Array
 
 
 class Expert(ABC):
-    """A controller of a known vehicle: :meth:`actions` from the true state is all that a subclass
-    has to write.
+    """A controller of a known vehicle. A subclass has to write :meth:`actions` only.
 
     >>> class Hover(Expert):
     ...     def actions(self, state):
     ...         return np.zeros((state.n, 4), dtype=np.float32)
 
-    Anything with such an ``actions(state)`` method can teach; this class adds ``predict``, so that
+    Anything with such an ``actions(state)`` method can teach. This class adds ``predict``, so that
     ``evaluate_policy(PIDExpert(), env)`` works as for an SB3 model.
 
     :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that the expert
         is designed for.
-    :param observation_mean: μ of Eq. 3.16, shape (18,), that :meth:`predict` undoes; None for the
+    :param observation_mean: μ of Eq. 3.16, shape (18,), which :meth:`predict` undoes; None: the
         environment's default.
     :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
     """
@@ -46,16 +45,16 @@ class Expert(ABC):
         observation_std: npt.ArrayLike | None = None,
     ) -> None:
         self.vehicle = load_vehicle(vehicle)
-        self.observation_mean = np.array(
-            DEFAULT_MEAN if observation_mean is None else observation_mean, dtype=np.float64
-        )
-        self.observation_std = np.array(
-            DEFAULT_STD if observation_std is None else observation_std, dtype=np.float64
-        )
+        if observation_mean is None:
+            observation_mean = DEFAULT_MEAN
+        if observation_std is None:
+            observation_std = DEFAULT_STD
+        self.observation_mean = np.array(observation_mean, dtype=np.float64)
+        self.observation_std = np.array(observation_std, dtype=np.float64)
 
     @abstractmethod
     def actions(self, state: QuadcopterState) -> Actions:
-        """Actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
+        """Return actions in [-1, 1], float32 of shape (n, 4), for the true state of n vehicles."""
 
     def predict(
         self,
@@ -64,51 +63,59 @@ class Expert(ABC):
         episode_start: npt.NDArray[np.bool_] | None = None,
         deterministic: bool = True,
     ) -> tuple[Actions, tuple[npt.NDArray[np.floating], ...] | None]:
-        """SB3's ``predict``: the actions for observations of shape (18,) or (n, 18), noise and all.
+        """Return the actions for observations of shape (18,) or (n, 18), as SB3's ``predict`` does.
+
+        Noise of the observations stays in.
 
         :raises ExpertError: observations of another shape.
         """
         array = np.asarray(observation, dtype=np.float64)
         if array.ndim not in (1, 2) or array.shape[-1] != OBSERVATION_SIZE:
-            sizes = f"({OBSERVATION_SIZE},) or (n, {OBSERVATION_SIZE})"
             raise ExpertError(
-                f"{type(self).__name__}: observation of shape {array.shape}, expected {sizes}"
+                f"{type(self).__name__}: observation of shape {array.shape}, "
+                f"expected ({OBSERVATION_SIZE},) or (n, {OBSERVATION_SIZE})"
             )
-        actions = self.actions(
-            observed_state(np.atleast_2d(array), self.observation_mean, self.observation_std)
-        )
-        return (actions[0] if array.ndim == 1 else actions), state
+        # One observation is a batch of one.
+        rows = np.atleast_2d(array)
+        actions = self.actions(observed_state(rows, self.observation_mean, self.observation_std))
+        return actions.reshape(*array.shape[:-1], -1), state
 
 
 def observed_state(observation: FloatArray, mean: FloatArray, std: FloatArray) -> QuadcopterState:
-    """The state that observations of shape (n, 18) describe, with the target as origin (Eq. 3.16
-    undone).
+    """Return the state that observations of shape (n, 18) describe (Eq. 3.16 undone).
 
-    Noise leaves ᴮRᴵ no rotation; the nearest one is taken. Rotor speeds cannot be observed and are
-    zero.
+    The target is the origin. Noise makes ᴮRᴵ no rotation matrix, so the nearest rotation is taken.
+    Rotor speeds cannot be observed and are zero.
     """
     features = observation * std + mean
     part = {name: features[:, columns] for name, columns in GROUPS.items()}
+    # The feature holds ᴮRᴵ, world to body; the state's rotation is its transpose.
+    body_to_world = part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1)
     array = np.zeros((STATE_SIZE, len(features)))
     array[POSITION] = part["position"].T
-    array[QUATERNION] = _nearest_quaternion(part["rotation"].reshape(-1, 3, 3).transpose(0, 2, 1)).T
+    array[QUATERNION] = _nearest_quaternion(body_to_world).T
     array[BODY_RATES] = part["body_rates"].T
+    # The feature is in the body frame, the state in the world frame.
     state = QuadcopterState(array)
     array[VELOCITY] = np.einsum("nij,nj->in", state.rotation, part["velocity"])
     return state
 
 
 def _nearest_quaternion(matrices: FloatArray) -> FloatArray:
-    """Unit quaternions (w, x, y, z; body to world), (n, 4), of the rotations nearest to matrices
-    (n, 3, 3); w is not negative.
+    """Return the unit quaternions (n, 4) of the rotations nearest to matrices (n, 3, 3).
 
-    By Davenport's q-method: of all q, the eigenvector to the greatest eigenvalue has the greatest
-    trace of R(q)ᵀ M.
+    They are (w, x, y, z), body to world, with w at least 0. This is Davenport's q-method: the
+    trace of R(q)ᵀ M is qᵀ K q, with a symmetric matrix K made of M. Of all unit quaternions the
+    eigenvector to the greatest eigenvalue makes it greatest.
     """
-    m, transposed = matrices, matrices.transpose(0, 2, 1)
-    profile = np.zeros((len(m), 4, 4))
-    profile[:, 0, 0] = trace = np.einsum("nii->n", m)
-    profile[:, 1:, 1:] = m + transposed - trace[:, None, None] * np.eye(3)
-    profile[:, 1:, 0] = profile[:, 0, 1:] = (m - transposed)[:, [2, 0, 1], [1, 2, 0]]
-    quaternion = np.linalg.eigh(profile).eigenvectors[:, :, -1]
-    return np.asarray(quaternion * np.where(quaternion[:, :1] < 0, -1.0, 1.0))
+    trace = np.trace(matrices, axis1=1, axis2=2)
+    transposed = matrices.transpose(0, 2, 1)
+    axis = (matrices - transposed)[:, [2, 0, 1], [1, 2, 0]]
+    k = np.empty((len(matrices), 4, 4))
+    k[:, 0, 0] = trace
+    k[:, 0, 1:] = axis
+    k[:, 1:, 0] = axis
+    k[:, 1:, 1:] = matrices + transposed - trace[:, None, None] * np.eye(3)
+    # eigh sorts the eigenvalues in ascending order.
+    quaternions = np.linalg.eigh(k).eigenvectors[:, :, -1]
+    return np.where(quaternions[:, :1] < 0, -quaternions, quaternions)

@@ -1,5 +1,4 @@
-"""Generated pickles, of all opcodes and all names: whatever they hold, nothing outside of the
-result changes.
+"""Generated pickles with all opcodes and all names: nothing outside of the result changes.
 
 SB3_QUAD_PICKLES asks for more of them.
 """
@@ -86,10 +85,10 @@ def text(value: str) -> bytes:
 def real_pickles() -> list[bytes]:
     with zipfile.ZipFile(pretrained("itm-imitation")) as archive:
         entries = json.loads(archive.read("data")).values()
-    found = [
-        base64.b64decode(each[":serialized:"])
-        for each in entries
-        if isinstance(each, dict) and ":serialized:" in each
+    saved = [
+        base64.b64decode(entry[":serialized:"])
+        for entry in entries
+        if isinstance(entry, dict) and ":serialized:" in entry
     ]
     noise = VectorizedActionNoise(NormalActionNoise(np.zeros(2), np.ones(2)), 2)
     arrays = (
@@ -107,7 +106,7 @@ def real_pickles() -> list[bytes]:
         deque([1], 3),
         arrays,
     )
-    return found + [pickle.dumps(each, protocol) for each in others for protocol in (4, 5)]
+    return saved + [pickle.dumps(value, protocol) for value in others for protocol in (4, 5)]
 
 
 REAL = real_pickles()
@@ -121,14 +120,14 @@ def shown(value: object) -> str:
 
 
 @pytest.mark.parametrize("content", REAL)
-def test_what_sb3_pickles_is_read_as_pickle_reads_it(content):
+def test_sb3s_pickles_are_read_as_pickle_reads_them(content):
     ours, theirs = own.unpickle(base64.b64encode(content).decode(), "here"), pickle.loads(content)
     assert shown(ours) == shown(theirs)
     assert type(ours) is type(theirs)
 
 
 class Writer:
-    """Writes pickles, most of which fit together."""
+    """Writes pickles. Most of them fit together."""
 
     def __init__(self, seed: int) -> None:
         self.rng = random.Random(seed)
@@ -155,7 +154,7 @@ class Writer:
         return content
 
     def value(self, depth: int) -> bytes:
-        """What leaves one object on the stack, as a rule."""
+        """Return opcodes that leave one object on the stack, as a rule."""
         simple, nested = (
             (self.constant, self.word, self.a_name, self.raw),
             (self.items, self.made, self.made, self.changed),
@@ -189,7 +188,7 @@ class Writer:
         return text(module) + text(name) + b"\x93"
 
     def raw(self, depth: int = 0) -> bytes:
-        """Any opcode, with an argument that it takes."""
+        """Return any opcode, with an argument that it takes."""
         opcode = self.rng.choice(pickletools.opcodes)
         size, one = (
             opcode.arg.n if opcode.arg else 0,
@@ -240,8 +239,9 @@ class Writer:
         return self.name(names) + arguments + how
 
     def changed(self, depth: int) -> bytes:
-        """An object, or what is none, that is given a state: of its attributes or, as Python has
-        it, of slots.
+        """Return opcodes that set the state of an object, or of something else.
+
+        The state holds attributes or, as Python allows, slots.
         """
         state = self.rng.choice(
             (self.state(depth), b"N" + self.state(depth) + b"\x86", self.tuple(depth))
@@ -265,12 +265,13 @@ def contents(value: object) -> list[object]:
 
 
 class World:
-    """The attributes of all classes that pickles may name, of those above them and of their
-    modules; what containers hold.
+    """Attributes of all classes that pickles may name, of their bases and modules, and the contents
+    of containers.
     """
 
     def __init__(self) -> None:
-        kinds = {kind for each in (*own._CLASSES.values(), *own._CHANGES) for kind in each.__mro__}
+        known = (*own._CLASSES.values(), *own._CHANGES)
+        kinds = {base for kind in known for base in kind.__mro__}
         names = {kind.__module__ for kind in kinds} | {module for module, _ in KNOWN}
         owners = [own, *kinds, *(sys.modules[name] for name in names if name in sys.modules)]
         self.before = [
@@ -280,7 +281,7 @@ class World:
         self.modules, self.environment = [*sys.modules], dict(os.environ)
 
     def is_as_before(self) -> bool:
-        for now, before in self.before:  # views of what the owners have now, and what they had
+        for now, before in self.before:  # the owners' attributes now and before
             if now.keys() - {"__warningregistry__"} != before.keys() - {"__warningregistry__"}:
                 return False
             for name, (value, held) in before.items():
@@ -291,7 +292,7 @@ class World:
         return [*sys.modules] == self.modules and dict(os.environ) == self.environment
 
 
-EVENTS: list[str] | None = None  # what Python's auditing tells of, while it is asked
+EVENTS: list[str] | None = None  # events of Python's auditing, while they are recorded
 
 
 def audit(event: str, _: object) -> None:

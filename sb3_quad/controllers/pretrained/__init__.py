@@ -1,8 +1,8 @@
-"""Trained policies that come with the package: for each ``NAME.zip``, for stock PPO, a card
-``NAME.md``.
+"""Trained policies that come with the package.
 
-The card says what it flies, how it was trained (command, seed, commit) and what was measured.
-``examples/publish.py`` writes both.
+Each ``NAME.zip``, which stock PPO loads, has a card ``NAME.md``. The card says what the policy
+flies, how it was trained (command, seed, commit) and what was measured. ``examples/publish.py``
+writes both.
 """
 
 from pathlib import Path
@@ -14,16 +14,18 @@ if TYPE_CHECKING:
     from stable_baselines3 import PPO
 
 FOLDER = Path(__file__).parent
-CORRECTED, BEST = "corrected_model.zip", "best_model.zip"  # in a run folder
+# Agents in a run folder.
+CORRECTED = "corrected_model.zip"
+BEST = "best_model.zip"
 
 
 def pretrained_names() -> list[str]:
-    """Names of the policies that come with the package."""
+    """Return the names of the policies that come with the package."""
     return sorted(path.stem for path in FOLDER.glob("*.zip"))
 
 
 def pretrained(name: str) -> Path:
-    """The zip of a policy that comes with the package, for ``PPO.load`` of Stable-Baselines3.
+    """Return the zip of a policy that comes with the package, for Stable-Baselines3's ``PPO.load``.
 
     >>> import sb3_quad
     >>> sb3_quad.pretrained("itm-recovery").name
@@ -38,35 +40,40 @@ def pretrained(name: str) -> Path:
 
 
 def load_pretrained(name: str, **kwargs: Any) -> "PPO":
-    """A policy that comes with the package, as a stock PPO model.
+    """Return a policy that comes with the package, as a stock PPO model.
 
-    It reads what an environment with :func:`env_kwargs` of that name observes, and gives 4 actions
-    in [-1, 1].
+    It takes the observations of an environment made with :func:`env_kwargs` of that name, and gives
+    4 actions in [-1, 1].
 
-    :param kwargs: of ``PPO.load``, such as ``env`` and ``device`` (here "cpu" unless told
-        otherwise).
+    :param kwargs: passed on to ``PPO.load``, such as ``env`` and ``device`` (default: "cpu").
     :raises ConfigError: an unknown name.
     """
     from stable_baselines3 import PPO
 
-    return PPO.load(pretrained(name), **{"device": "cpu", **kwargs})
+    kwargs.setdefault("device", "cpu")
+    return PPO.load(pretrained(name), **kwargs)
 
 
 def agent_path(text: str) -> str:
-    """The path of an agent's zip, from what stands for one: the name of a policy that comes with
-    the package, or a run folder.
+    """Return the path of an agent's zip.
 
-    Anything else is returned as it is.
+    :param text: the name of a policy that comes with the package, or a run folder. Anything else is
+        returned as it is.
     """
     if text in pretrained_names():
         return str(pretrained(text))
     configs = sorted(Path(text).glob("*/config.yml"))
-    return str(run_agent(Path(text), configs[0].parent.name)) if len(configs) == 1 else text
+    if len(configs) == 1:
+        return str(run_agent(Path(text), configs[0].parent.name))
+    return text
 
 
 def run_agent(folder: Path, name: str) -> Path:
-    """What a run has to offer: its trimmed agent, else its best one, else its last one,
-    ``<name>.zip``.
+    """Return the agent that a run offers.
+
+    It is the one with corrected offset, else the best one, else the last one, ``<name>.zip``.
     """
-    zips = [folder / file for file in (CORRECTED, BEST, f"{name}.zip")]
-    return next((path for path in zips if path.is_file()), zips[-1])
+    for path in (folder / CORRECTED, folder / BEST):
+        if path.is_file():
+            return path
+    return folder / f"{name}.zip"

@@ -1,0 +1,163 @@
+"""The constants of the geometric expert's law: gains, and what follows from a vehicle."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sb3_quad.base.arrays import FloatArray
+from sb3_quad.simulation.state import P, first_rows
+from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
+from sb3_quad.vehicles.vehicle import Vehicle
+
+G = first_rows(dict.fromkeys(GAIN_NAMES, 1))
+
+# The yaw gain is this many times larger where the external torque is known. An error in the moment
+# that compensates it then makes a smaller yaw rate.
+_PRIVILEGED_YAW = 4.0
+# Command lags, s, from which on the factors of ``late`` begin to act and act fully.
+_LATE_FROM = 0.085
+_LATE_TO = 0.125
+
+
+class LawConstants(NamedTuple):
+    """Constants of n vehicles, one column for each."""
+
+    gains: FloatArray
+    """Shape (len(GAIN_NAMES), n), in the order of ``GAIN_NAMES``."""
+    mass: FloatArray
+    """Shape (n,), kg."""
+    gravity: FloatArray
+    """Shape (n,), m/s²."""
+    inertia: FloatArray
+    """Shape (3, n), kg m²."""
+    lag: FloatArray
+    """Shape (n,), τ, from a command to its thrust, s."""
+    mixer_inverse: FloatArray
+    """Shape (4, 4, n), rotor thrusts from thrust and moments."""
+    least_thrust: FloatArray
+    """Shape (n,), of one rotor, N."""
+    most_thrust: FloatArray
+    """Shape (n,), of one rotor, N."""
+
+
+def derived_gains(vehicle: Vehicle) -> GeometricGains:
+    """Return gains for a vehicle whose YAML has none, in proportion to its control authority.
+
+    The factors were found by search, for ITM, Crazyflie, Hummingbird, a vehicle with slow motors
+    and vehicles of the distribution ``raptor`` together, with a privileged expert. The scales are
+    the lag τ from a command to its thrust (``Vehicle.command_lag``); the greatest angular
+    acceleration a_φ about the weaker of roll and pitch; the time to turn, τ + 1/√a_φ; and the
+    greatest accelerations: upwards, g (c - 1), sideways at constant height, g √(c² - 1), and
+    downwards, g (1 - l), with thrust limits l and c in hover thrusts.
+    """
+    rows = gains_by_authority(vehicle.parameters()[:, None], vehicle.control_step)
+    return GeometricGains.model_validate(dict(zip(GAIN_NAMES, rows[:, 0].tolist(), strict=True)))
+
+
+def gains_by_authority(v: FloatArray, control_step: float) -> FloatArray:
+    """Return the gains of :func:`derived_gains`, (len(GAIN_NAMES), n).
+
+    :param v: parameters of n vehicles, (len(PARAMETER_NAMES), n).
+    """
+    # How quickly the vehicle can turn: the weaker of roll and pitch counts.
+    gravity = v[P.gravity]
+    lag = _command_lag(v, control_step)
+    roll_pitch_arms = v[P.roll_arm_0 : P.yaw_arm_0].reshape(2, 4, -1)
+    moments = np.abs(roll_pitch_arms).sum(axis=1) * v[P.thrust_half_range]
+    turn = (moments / v[[P.ixx, P.iyy]]).min(axis=0)
+    rate = np.minimum(1.0 / (lag + 1.0 / np.sqrt(turn)), 0.438 / lag)
+
+    # In hover thrusts. Worn motors and a low battery may not even lift the vehicle.
+    least = (v[P.thrust_middle] - v[P.thrust_half_range]) / v[P.hover_thrust]
+    most = (v[P.thrust_middle] + v[P.thrust_half_range]) / v[P.hover_thrust]
+    most = np.maximum(most, 1.01)
+    sideways = np.sqrt(most**2 - 1.0)
+    upwards = gravity * (most - 1.0)
+    downwards = 1.0 - least
+
+    gains = {
+        "position": 0.285 * rate,
+        "velocity": 0.607 * rate,
+        "height_position": 0.407 * rate,
+        "height_velocity": 0.937 * rate,
+        "deceleration": 1.07 * gravity * sideways,
+        "height_deceleration": 1.63 * gravity * downwards,
+        "descent": gravity * np.minimum(0.9, 1.56 * downwards),
+        "tilt": 1.90 * sideways,
+        "attitude": 1.53 * rate,
+        "angular_deceleration": 1.17 * turn,
+        "body_rates": 0.587 / lag,
+        "yaw_rate": 0.132 / lag,
+        "descent_deceleration": 0.612 * upwards,
+    }
+    return np.stack([gains[name] for name in GAIN_NAMES])
+
+
+def _command_lag(v: FloatArray, control_step: float) -> FloatArray:
+    """Return ``Vehicle.command_lag`` of n vehicles, (n,), s."""
+    held = (v[P.delay] + 0.5) * control_step
+    return np.asarray(held + 0.5 / v[P.motor_gain_up] + 0.5 / v[P.motor_gain_down])
+
+
+def constants_of(v: FloatArray, control_step: float, gains: FloatArray) -> LawConstants:
+    """Return the constants for n vehicles, from their parameters and gains.
+
+    The arrays are copies, in the layout that the law is compiled for.
+
+    :param v: parameters, (len(PARAMETER_NAMES), n).
+    :param gains: (len(GAIN_NAMES), n).
+    """
+    # [ΣF; Mx; My; Mz] = mixer · F: ones, then the arms of the rotors about each axis.
+    arms = v[P.roll_arm_0 : P.roll_arm_0 + 12].reshape(3, 4, -1)
+    mixers = np.concatenate([np.ones_like(arms[:1]), arms])
+    constants = LawConstants(
+        gains,
+        mass=v[P.mass],
+        gravity=v[P.gravity],
+        inertia=v[P.ixx : P.izz + 1],
+        lag=_command_lag(v, control_step),
+        mixer_inverse=np.linalg.inv(mixers.transpose(2, 0, 1)).transpose(1, 2, 0),
+        least_thrust=v[P.thrust_middle] - v[P.thrust_half_range],
+        most_thrust=v[P.thrust_middle] + v[P.thrust_half_range],
+    )
+    return LawConstants(*[np.array(values, order="C") for values in constants])
+
+
+class TrueConstants:
+    """The law's constants for vehicles whose true parameters are known.
+
+    They are kept, and computed again only for vehicles that have changed: in each control step of a
+    training few rows begin a new episode with another vehicle.
+
+    :param vehicle: the vehicle that ``gains`` are for. Those of the others scale with their control
+        authority, as :func:`derived_gains` do.
+    :param late: factors of gains by name, the more effective the later commands act.
+    """
+
+    def __init__(self, vehicle: Vehicle, gains: GeometricGains, late: dict[str, float]) -> None:
+        self._control_step = vehicle.control_step
+        derived = gains_by_authority(vehicle.parameters()[:, None], vehicle.control_step)
+        self._scale = gains.values()[:, None] / derived
+        self._scale[G.yaw_rate] *= _PRIVILEGED_YAW
+        self._late = np.array([[late.get(name, 1.0)] for name in GAIN_NAMES])
+        self._seen = np.empty((0, 0))
+
+    def of(self, vehicles: FloatArray) -> LawConstants:
+        """Return the constants for parameters (len(PARAMETER_NAMES), n)."""
+        # Another number of vehicles is another environment.
+        if self._seen.shape != vehicles.shape:
+            self._seen = vehicles.copy()
+            self._constants = self._compute(vehicles)
+        changed = np.flatnonzero((self._seen != vehicles).any(axis=0))
+        if changed.size:
+            self._seen[:, changed] = vehicles[:, changed]
+            for kept, new in zip(self._constants, self._compute(vehicles[:, changed]), strict=True):
+                kept[..., changed] = new
+        return self._constants
+
+    def _compute(self, v: FloatArray) -> LawConstants:
+        lag = _command_lag(v, self._control_step)
+        lateness = np.clip((lag - _LATE_FROM) / (_LATE_TO - _LATE_FROM), 0.0, 1.0)
+        gains = self._scale * gains_by_authority(v, self._control_step)
+        gains *= 1.0 + (self._late - 1.0) * lateness
+        return constants_of(v, self._control_step, gains)

@@ -1,0 +1,246 @@
+"""The law of the geometric expert for a batch of vehicles, compiled.
+
+docs/research/experts.md has it in formulas. Vectors are tuples; ``gains`` is a column of
+``LawConstants.gains``, whose rows have names in ``G``.
+"""
+
+import math
+
+import numpy as np
+
+from sb3_quad.experts.geometric_gains import G
+from sb3_quad.experts.vectors import (
+    added,
+    cross,
+    difference,
+    divided,
+    dot,
+    rotated,
+    rotations_at,
+    vector_at,
+)
+from sb3_quad.simulation.compiled import compiled
+from sb3_quad.simulation.state import W, X
+
+
+@compiled
+def fly_geometric(state, constants, wrench, reserve, actions):
+    """Write the actions of n vehicles, (n, 4).
+
+    :param state: (STATE_SIZE, n).
+    :param constants: ``LawConstants`` with n columns, or one for all vehicles.
+    :param wrench: the external wrench to compensate, (WRENCH_SIZE, n) or (WRENCH_SIZE, 1).
+    :param reserve: thrust kept back for braking a descent, in weights.
+    """
+    # Each vehicle's gains are copied, so that they lie side by side. One column stands for all.
+    gains = np.empty(constants.gains.shape[0])
+    for i in range(actions.shape[0]):
+        k = min(i, constants.gains.shape[1] - 1)
+        j = min(i, wrench.shape[1] - 1)
+        gains[:] = constants.gains[:, k]
+        mass = constants.mass[k]
+        g = constants.gravity[k]
+        inertia = vector_at(constants.inertia, 0, k)
+        rotation, rotation_inverse = rotations_at(state, X.quaternion, i)
+        omega = vector_at(state, X.body_rates, i)
+
+        # What the external wrench does: an acceleration in the world frame, a torque in the body's.
+        body_force = vector_at(wrench, W.force_body, j)
+        force = added(vector_at(wrench, W.force_world, j), rotated(rotation, body_force))
+        world_torque = vector_at(wrench, W.torque_world, j)
+        torque = added(vector_at(wrench, W.torque_body, j), rotated(rotation_inverse, world_torque))
+
+        # The force that the rotors should give per mass, and its direction b as the body will see
+        # it when the command acts.
+        f = desired_force(
+            difference(vector_at(state, X.target, i), vector_at(state, X.position, i)),
+            vector_at(state, X.velocity, i),
+            divided(force, mass),
+            gains,
+            g,
+            reserve * g,
+        )
+        size = math.sqrt(dot(f, f))
+        b = divided(rotated(rotation_inverse, f), size)
+        b = seen_later(b, omega, constants.lag[k])
+
+        # Moments for the turn, against the yaw rate, and against the external torque.
+        mx, my = turn_moments(b, omega, gains, inertia)
+        mz = -gains[G.yaw_rate] * inertia[2] * omega[2]
+        moments = difference((mx, my, mz), torque)
+        allocate(
+            mass * size * b[2],
+            moments,
+            constants.mixer_inverse[:, :, k],
+            constants.least_thrust[k],
+            constants.most_thrust[k],
+            actions[i],
+        )
+
+
+@compiled
+def desired_force(e, v, a, gains, g, reserve):
+    """Return the desired force of the rotors per mass, world frame, m/s².
+
+    :param e: vector to the target, m.
+    :param v: velocity, m/s.
+    :param a: acceleration by the external force, m/s².
+    :param reserve: deceleration kept back for braking a descent, m/s².
+    """
+    ex, ey, ez = e
+    vx, vy, vz = v
+    ax, ay, az = a
+
+    # Plan to brake with less where the external force accelerates the vehicle towards the target.
+    distance = math.sqrt(ex * ex + ey * ey)
+    along = 0.0
+    if distance > 0.0:
+        along = (ax * ex + ay * ey) / distance
+    brake = left_to_brake(gains[G.deceleration], along)
+    if ez > 0.0:
+        height_brake = left_to_brake(gains[G.height_deceleration], az)
+    else:
+        height_brake = left_to_brake(gains[G.descent_deceleration], reserve - az)
+
+    # Both components brake at once, so the path is a straight line.
+    way = math.sqrt((distance / brake) ** 2 + (ez / height_brake) ** 2)
+    speed = braking_profile(gains[G.position], way)
+    climb_speed = braking_profile(gains[G.height_position], way)
+    fx = gains[G.velocity] * (speed * ex - vx)
+    fy = gains[G.velocity] * (speed * ey - vy)
+    fz = max(-gains[G.descent], gains[G.height_velocity] * (climb_speed * ez - vz))
+
+    # The force may be as great as the one that holds the height at the greatest tilt. The largest
+    # λ that keeps |λ (fx, fy, fz) + (0, 0, g) - a| within that solves a quadratic equation:
+    # λ² square + 2 λ across = room.
+    weight = g - az
+    square = fx * fx + fy * fy + fz * fz
+    across = fz * weight - fx * ax - fy * ay
+    limit = g * g * (1.0 + gains[G.tilt] * gains[G.tilt])
+    room = limit - (weight * weight + ax * ax + ay * ay)
+    scale = 1.0
+    if square + 2.0 * across > room:
+        root = math.sqrt(max(0.0, across * across + square * max(0.0, room)))
+        scale = max(0.0, root - across) / square
+
+    # The force points upwards, so that it has a tilt.
+    return scale * fx - ax, scale * fy - ay, max(0.1 * g, weight + scale * fz)
+
+
+@compiled
+def braking_profile(gain, distance_by_deceleration):
+    """Return the speed per distance from which the vehicle can still brake.
+
+    Near the target it is the gain, far away that of √(2 deceleration distance).
+    """
+    return 2.0 * gain / (1.0 + math.sqrt(1.0 + 2.0 * gain * gain * distance_by_deceleration))
+
+
+@compiled
+def left_to_brake(deceleration, forward):
+    """Return the deceleration to plan with where something else accelerates by ``forward``."""
+    return max(0.1 * deceleration, deceleration - max(0.0, forward))
+
+
+@compiled
+def seen_later(b, omega, time):
+    """Return a direction fixed in the world as the body sees it after turning for some time.
+
+    This is Rodrigues' formula for exp(-ω× t) b, with the present body rates ω.
+    """
+    rate = math.sqrt(dot(omega, omega))
+    if rate < 1e-9:
+        return b
+    n = divided(omega, rate)
+    n_cross_b = cross(n, b)
+    cosine = math.cos(rate * time)
+    sine = -math.sin(rate * time)
+    along = dot(n, b) * (1.0 - cosine)
+    return (
+        cosine * b[0] + sine * n_cross_b[0] + along * n[0],
+        cosine * b[1] + sine * n_cross_b[1] + along * n[1],
+        cosine * b[2] + sine * n_cross_b[2] + along * n[2],
+    )
+
+
+@compiled
+def turn_moments(b, omega, gains, inertia):
+    """Return the roll and pitch moments that turn the thrust to direction b, body frame, N m."""
+    p, q, r = omega
+    ixx, iyy, izz = inertia
+    deceleration = gains[G.angular_deceleration]
+
+    # Turn by the angle α about the axis n, which is level in the body.
+    sine = math.sqrt(b[0] * b[0] + b[1] * b[1])
+    alpha = math.atan2(sine, b[2])
+    nx = 1.0
+    ny = 0.0
+    if sine > 1e-9:
+        nx = -b[1] / sine
+        ny = b[0] / sine
+
+    # Go the long way round where the present spin makes that quicker. Both are the times, times
+    # the deceleration, in which a double integrator comes to rest at the direction.
+    along = p * nx + q * ny
+    half_square = 0.5 * along * along
+    short = -along + 2.0 * math.sqrt(half_square + deceleration * alpha)
+    long = along + 2.0 * math.sqrt(half_square + deceleration * (2.0 * math.pi - alpha))
+    if long < short:
+        nx = -nx
+        ny = -ny
+        alpha = 2.0 * math.pi - alpha
+    rate = alpha * braking_profile(gains[G.attitude], alpha / deceleration)
+
+    # The desired rates stay fixed in the world while the body yaws; then Euler's gyroscopic terms.
+    p_dot = gains[G.body_rates] * (rate * nx - p) + r * rate * ny
+    q_dot = gains[G.body_rates] * (rate * ny - q) - r * rate * nx
+    return ixx * p_dot + (izz - iyy) * q * r, iyy * q_dot + (ixx - izz) * r * p
+
+
+@compiled
+def tilting_thrust(mixer_inverse, moments, rotor):
+    """Return a rotor's share of the roll and pitch moments, N."""
+    return mixer_inverse[rotor, 1] * moments[0] + mixer_inverse[rotor, 2] * moments[1]
+
+
+@compiled
+def allocate(thrust, moments, mixer_inverse, low, high, actions):
+    """Write the actions of one vehicle that make a thrust, N, and moments, N m.
+
+    Roll and pitch come before the thrust, and the thrust before yaw, all within the limits of every
+    rotor (``low`` and ``high``, N).
+    """
+    middle = (high + low) / 2
+    half = (high - low) / 2
+
+    # Scale the differences for roll and pitch until they fit; then shift the common thrust.
+    least = 0.0
+    most = 0.0
+    largest = 0.0
+    for rotor in range(4):
+        tilting = tilting_thrust(mixer_inverse, moments, rotor)
+        least = min(least, tilting)
+        most = max(most, tilting)
+        largest = max(largest, abs(tilting))
+    scale = 1.0
+    if largest > half:
+        scale = half / largest
+    common = min(high, max(low, thrust / 4))
+    common = min(high - scale * most, max(low - scale * least, common))
+
+    # The share of the yaw moment that every rotor has room for.
+    share = 1.0
+    for rotor in range(4):
+        without_yaw = common + scale * tilting_thrust(mixer_inverse, moments, rotor)
+        yaw = mixer_inverse[rotor, 3] * moments[2]
+        room = without_yaw - low
+        if yaw > 0.0:
+            room = high - without_yaw
+        if abs(yaw) * share > room:
+            share = max(0.0, room / abs(yaw))
+
+    # Eq. 3.18: actions are thrusts between the limits, as numbers from -1 to 1.
+    for rotor in range(4):
+        without_yaw = common + scale * tilting_thrust(mixer_inverse, moments, rotor)
+        rotor_thrust = without_yaw + share * mixer_inverse[rotor, 3] * moments[2]
+        actions[rotor] = min(1.0, max(-1.0, (rotor_thrust - middle) / half))
