@@ -95,8 +95,8 @@ class Progress:
         while not self._ended.wait(60):
             stats = self._reporter.stats
             failed = len(stats.get("failed", ())) + len(stats.get("error", ()))
-            self._reporter.ensure_newline()
-            self._reporter.write_line(f"{self._done} of {self._total} tests, {failed} failed")
+            # The line before it is one of dots, which has not ended.
+            self._reporter.write_line(f"\n{self._done} of {self._total} tests, {failed} failed")
 
 
 def pytest_addoption(parser):
