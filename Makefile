@@ -114,9 +114,15 @@ format: $(INSTALLED)
 	$(PY) -m ruff check --fix --exit-zero --quiet .
 	$(PY) -m ruff format .
 
+# Tests hand over wrong types on purpose, replace methods, and know which member of a union they get.
+# What is left holds names, attributes, imports and the arguments of calls.
+LOOSE := $(addprefix --disable-error-code=,arg-type assignment call-overload dict-item func-returns-value has-type \
+	index list-item method-assign misc operator override type-var union-attr unreachable unused-ignore var-annotated)
+
 type: $(INSTALLED) links
 	$(PY) -m mypy
-	cd build/type && $(abspath $(PY)) -m mypy --config-file ../../mypy.ini examples tests
+	$(PY) -m mypy --config-file tests/mypy.ini examples
+	$(PY) -m mypy --config-file tests/mypy.ini $(LOOSE) tests
 
 # The page's scripts are JavaScript with types in comments.
 type-demo:
@@ -124,9 +130,8 @@ type-demo:
 
 # mypy and import-linter do not follow __path__, by which a checkout's envs/ and its like are part of sb3_quad: links do.
 links:
-	@rm -rf build/type && mkdir -p $(LINKS)
+	@rm -rf $(LINKS) && mkdir -p $(LINKS)
 	@for path in sb3_quad/* envs callbacks zoo_configs; do ln -s "$(CURDIR)/$$path" $(LINKS); done
-	@for path in examples tests; do ln -s "$(CURDIR)/$$path" build/type; done
 
 commit-checks: format type lint
 

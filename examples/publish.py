@@ -160,8 +160,8 @@ def run(options: argparse.Namespace) -> int:
         card_stream.write(f"{metadata}{text}".encode())
         # Hold signals back, so that all files are replaced or none.
         signals = last.enter_context(StopSignals())
-        for path, data in files.items():
-            last.enter_context(replacing(folder / path)).write(data)
+        for member, data in files.items():
+            last.enter_context(replacing(folder / member)).write(data)
     print(text)
     print(f"saved {zip_file} ({len(content)} bytes) and {card_file}")
     if api is not None and not signals.exit_code:

@@ -46,7 +46,7 @@ class Raptor:
     order of the rotors and the range of their speeds.
 
     :param vehicle: name, YAML path or :class:`~sb3_quad.vehicles.vehicle.Vehicle` that it flies; or
-        a sequence of n of them, of which row i flies number i modulo n.
+        a sequence of n of them, and row i flies number i modulo n.
     :param observation_mean: μ of Eq. 3.16, shape (18,), which is undone; None: the environment's
         default.
     :param observation_std: σ of Eq. 3.16, shape (18,), likewise.
