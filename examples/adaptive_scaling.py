@@ -1,13 +1,12 @@
-"""The scaling of the observation that the thesis adapts while flying (4.3.1, Eq. 4.10): agents with
-and without it (Fig. 4.7).
+r"""The thesis's adaptive scaling of the observation: agents with and without it (Fig. 4.7).
 
-    python examples/adaptive_scaling.py PID=pid IL-agent=thesis-imitation RL-agent=thesis-recovery
-    -o adaptive_times.png
+    python examples/adaptive_scaling.py PID=pid IL-agent=thesis-imitation \
+        RL-agent=thesis-recovery -o adaptive_times.png
 
-An agent hovers beside its target, by the same vector wherever the target is. Moving the position
-components of μ by that vector cancels it; multiplying those of σ by α, below 1 near the target,
-lets the last metre seem longer than it is. μ is measured on flights to targets that are used for
-nothing else. Experts fly as they are.
+An agent stops at an offset from its target, which is the same wherever the target is. Adding that
+offset to the position components of μ cancels it. Multiplying those of σ by α (4.3.1, Eq. 4.10),
+which is below 1 near the target, makes the last metre seem longer than it is. μ is measured on
+flights to targets that nothing else uses. Experts fly unchanged.
 """
 
 import argparse
@@ -43,29 +42,31 @@ def adaptive_factor(distance: npt.ArrayLike) -> FloatArray:
 
 
 class AdaptiveScaling:
-    """A policy behind the thesis's scaling, asked by ``predict`` as an SB3 model is.
+    """A policy behind the thesis's scaling; it has ``predict`` as an SB3 model has.
 
-    In the position components it shows the policy (s - μ) / (α σ), where s / σ is what the
-    environment gives. The distance in α is the observed one, noise and all, so that a policy needs
-    nothing but its observation.
+    The environment gives s / σ. The policy sees (s - μ) / (α σ) in the position components. The
+    distance in α is the observed one, with its noise, so the policy needs its observation only.
 
     :param policy: an SB3 model, or a function of observations.
     :param mean: position components of μ, (3,), m; zero: only α.
-    :param std: σ that the environment scales by, (18,); None: Table A.2.
+    :param std: σ by which the environment scales, (18,); None: Table A.2.
     """
 
     def __init__(
         self, policy: Any, mean: npt.ArrayLike = (0.0, 0.0, 0.0), std: npt.ArrayLike | None = None
     ) -> None:
-        self.policy, self.observation_space = policy, getattr(policy, "observation_space", None)
+        self.policy = policy
+        self.observation_space = getattr(policy, "observation_space", None)
         self.mean = np.asarray(mean, dtype=np.float64)
-        self.std = np.asarray(DEFAULT_STD if std is None else std, dtype=np.float64)[POSITION]
+        if std is None:
+            std = DEFAULT_STD
+        self.std = np.asarray(std, dtype=np.float64)[POSITION]
 
     def predict(self, observation: Float32Array, **how: Any) -> tuple[Any, Any]:
-        """The policy's answer to scaled observations, (n, 18), in physical terms those that the
-        environment gives.
+        """Ask the policy for actions, with its observations scaled.
 
-        :param how: for the policy's own ``predict``.
+        :param observation: (n, 18), as the environment gives them.
+        :param how: keywords of the policy's own ``predict``.
         """
         position = observation[:, POSITION] * self.std
         factor = adaptive_factor(np.linalg.norm(position, axis=1, keepdims=True))
@@ -80,26 +81,23 @@ class AdaptiveScaling:
 def measure_mean(
     policy: Any, n_flights: int = N_OFFSETS, settings: FlightSettings | None = None
 ) -> FloatArray:
-    """The position components of μ, (3,), m, with which a policy behind :class:`AdaptiveScaling`
-    stops at its target.
+    """Find the position components of μ, (3,), m, with which a policy stops at its target.
 
-    Eq. 4.10 shrinks the offset, too, so it is measured with α at work, and again after each
+    Eq. 4.10 shrinks the offset, too. So it is measured with α in use, and again after each
     correction.
 
-    :raises ConfigError: a policy that crashes on the way to targets.
+    :raises ConfigError: for a policy that crashes on the way to targets.
     """
     mean = np.zeros(3)
+    std = None if settings is None else settings.observation_std
     for number in range(ROUNDS):
-        seed, std = (
-            seed_for("offset", number),
-            None if settings is None else settings.observation_std,
-        )
+        seed = seed_for("offset", number)
         mean = mean - hover_offset(AdaptiveScaling(policy, mean, std), n_flights, seed, settings)
     return mean
 
 
 def main() -> None:
-    """Measure, fly, print the table, draw the times."""
+    """Measure the offsets, fly, print the table, draw the times."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -107,7 +105,10 @@ def main() -> None:
         "controllers", nargs="+", metavar="CONTROLLER", help="as for sb3-quad evaluate"
     )
     parser.add_argument(
-        "--scenario", default="tracking", metavar="NAME", help="of the suite thesis (tracking)"
+        "--scenario",
+        default="tracking",
+        metavar="NAME",
+        help="scenario of the suite thesis (tracking)",
     )
     parser.add_argument(
         "--episodes", type=int, metavar="N", help="instead of the scenario's own number"
@@ -118,31 +119,30 @@ def main() -> None:
     options = parser.parse_args()
 
     (scenario,) = load_suite("thesis").with_changes([options.scenario], options.episodes).scenarios
-    plain, adapted = {}, {}
+    plain = {}
+    adapted = {}
     for spec in parse_controllers(options.controllers):
         controller = resolve_expert(spec.spec, scenario.nominal_vehicle(), "controller")
         plain[spec.label] = summarise(fly_scenario(controller, scenario, own=spec.observed)[0])
-        if hasattr(controller, "actions"):  # an expert, which sees the true state
+        # An expert sees the true state, and no observation that could be scaled.
+        if hasattr(controller, "actions"):
             continue
         if spec.own is not None and spec.own.is_extended:
             raise ConfigError(
-                f"{spec.label}: sees more than the 18 features, which alone are scaled"
+                f"{spec.label}: sees more than the 18 features; only these can be scaled"
             )
         settings = FlightSettings(vehicle=scenario.nominal_vehicle(), **spec.observed)
         mean = measure_mean(controller, settings=settings)
-        print(f"{spec.label}: offset μ = ({', '.join(f'{x:.4f}' for x in mean)}) m")
+        print(f"{spec.label}: offset μ = ({mean[0]:.4f}, {mean[1]:.4f}, {mean[2]:.4f}) m")
         scaled = AdaptiveScaling(controller, mean, spec.observed["observation_std"])
         adapted[f"{spec.label} (adaptive)"] = summarise(
             fly_scenario(scaled, scenario, own=spec.observed)[0]
         )
     metrics = plain | adapted
-    columns = [
-        *map(Column, metrics),
-        *(Column(name, source="thesis") for name in scenario.reference),
-    ]
-    rows = metric_rows(
-        scenario, [metric_cells(each) for each in metrics.values()], scenario.reference.values()
-    )
+    columns = [Column(label) for label in metrics]
+    columns += [Column(name, source="thesis") for name in scenario.reference]
+    cells = [metric_cells(measured) for measured in metrics.values()]
+    rows = metric_rows(scenario, cells, scenario.reference.values())
     console().print(Table(columns, rows, title=scenario.heading, caption=CAPTION))
     if options.output:
         write_bytes(options.output, arrivals_plot(scenario, metrics, colours_of([*metrics])).png)

@@ -1,11 +1,12 @@
-"""How far agents hover from their targets after stage two, with the cloning term and without:
-docs/research/results.md.
+"""Plot how far RL agents hover from their targets, with the cloning term and without.
+
+docs/research/results.md shows the plot.
 
     sb3-quad sweep cloning
     python examples/cloning_plot.py logs/sweep/cloning_1/results.csv cloning.png
 
-A configuration is called after what it shares with another and whether it clones, such as "our
-reward, cloning, 1 M".
+The name of a configuration says what it shares with another one, and whether it clones, such as
+"our reward, cloning, 1 M".
 """
 
 import argparse
@@ -19,39 +20,45 @@ COLOURS = {"cloning": "#1B7EC2", "none": "#D55E00"}
 
 
 def pairs(path: str | Path, scenario: str = "tracking") -> dict[str, dict[str, list[float]]]:
-    """By what two configurations share, and by whether they clone, the median final error of each
-    seed, m.
+    """Read the median final error of each seed, m.
+
+    :returns: lists by what two configurations share, and by whether they clone.
     """
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    errors: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     with Path(path).open(encoding="utf-8", newline="") as file:
         for row in csv.DictReader(file):
             if row["scenario"] == scenario and row["final_error"]:
-                parts = [part.replace("-", " ").strip() for part in row["configuration"].split(",")]
-                kind = next(part for part in parts if part.startswith(tuple(COLOURS)))
-                label = ", ".join(part for part in parts if part != kind)
-                found[label][kind].append(float(row["final_error"]))
-    return found
+                label, kind = split_name(row["configuration"])
+                errors[label][kind].append(float(row["final_error"]))
+    return errors
 
 
-def draw(found: dict[str, dict[str, list[float]]]) -> Figure:
-    """A line for each pair: a point for each seed, a bar at their mean."""
-    figure = Figure(figsize=(8.0, 0.55 * len(found) + 1.2), layout="constrained")
+def split_name(configuration: str) -> tuple[str, str]:
+    """Split "our reward, cloning, 1 M" into ("our reward, 1 M", "cloning")."""
+    kind = ""
+    shared = []
+    for part in configuration.replace("-", " ").split(","):
+        if part.strip().startswith(tuple(COLOURS)):
+            kind = part.strip()
+        else:
+            shared.append(part.strip())
+    return ", ".join(shared), kind
+
+
+def draw(errors: dict[str, dict[str, list[float]]]) -> Figure:
+    """Draw a line for each pair: a point for each seed, a bar at their mean."""
+    figure = Figure(figsize=(8.0, 0.55 * len(errors) + 1.2), layout="constrained")
     axes = figure.subplots()
-    for y, kinds in enumerate(found.values()):
-        for kind, errors in kinds.items():
-            colour = COLOURS[kind.split(" ")[0]] if kind in COLOURS else "#7A5BC0"
+    for y, kinds in enumerate(errors.values()):
+        for kind, values in kinds.items():
+            colour = COLOURS.get(kind, "#7A5BC0")
             height = y + {"cloning": -0.14, "none": 0.14}.get(kind, 0.0)
-            shown = kind if y == 0 else None  # in the legend
-            axes.plot(errors, [height] * len(errors), "o", color=colour, alpha=0.75, label=shown)
-            axes.plot(
-                sum(errors) / len(errors),
-                height,
-                "|",
-                color=colour,
-                markersize=16,
-                markeredgewidth=2.5,
-            )
-    axes.set_yticks(range(len(found)), [label or "all else as it is" for label in found])
+            # The legend needs each kind once.
+            label = kind if y == 0 else None
+            axes.plot(values, [height] * len(values), "o", color=colour, alpha=0.75, label=label)
+            mean = sum(values) / len(values)
+            axes.plot(mean, height, "|", color=colour, markersize=16, markeredgewidth=2.5)
+    axes.set_yticks(range(len(errors)), [label or "all else unchanged" for label in errors])
     axes.invert_yaxis()
     axes.set_xscale("log")
     axes.xaxis.set_major_formatter("{x:g}")

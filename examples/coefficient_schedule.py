@@ -1,10 +1,11 @@
-"""A callback by which a coefficient of the algorithm follows how well the training goes;
-docs/callbacks.md says more.
+"""A callback by which a coefficient of the algorithm follows how well the training goes.
 
     python examples/coefficient_schedule.py
 
-In a settings file, with ``PYTHONPATH=examples``: ``callback:
-{coefficient_schedule.CoefficientSchedule: {…}}``.
+docs/callbacks.md says more. In a settings file, with ``PYTHONPATH=examples``::
+
+    callback:
+      - coefficient_schedule.CoefficientSchedule: {coefficient: beta, start: 1.0, final: 0.0}
 """
 
 import argparse
@@ -27,28 +28,27 @@ PROGRESS = "progress"
 
 
 class CoefficientSchedule(BaseCallback):
-    """Moves a coefficient from ``start`` to ``final`` while what it follows goes through
-    ``between``.
+    """Move a coefficient from ``start`` to ``final`` while a quantity goes through ``between``.
 
-    Made for DAgger's ``beta`` (how often the expert flies) and PPOBC's ``bc_coef`` (weight of the
-    cloning term); with any algorithm, for any of its numbers that are given as floats or schedules:
-    ``ent_coef``, ``clip_range``, ``learning_rate``, SAC's ``tau``.
+    It was made for DAgger's ``beta`` (how often the expert flies) and PPOBC's ``bc_coef`` (weight
+    of the cloning term). You can use it with any algorithm, for any of its numbers that is a float
+    or a schedule: ``ent_coef``, ``clip_range``, ``learning_rate``, SAC's ``tau``.
 
-    It is set after a rollout, holds for the next one and is logged as ``schedule/<coefficient>``. A
-    model's zip holds the present number, nothing of this package; a training that continues from
-    the zip continues from that number.
+    The coefficient is set after a rollout, holds for the next one and is logged as
+    ``schedule/<coefficient>``. A model's zip holds the current number, and nothing of this package.
+    A training that continues from the zip continues from that number.
 
     :param coefficient: its name. If the model has a method ``set_<name>(value)``, it is called.
     :param start: its value until the followed quantity is known and has passed ``between[0]``.
-    :param final: its value from ``between[1]`` on; in between, linear.
+    :param final: its value once the quantity has passed ``between[1]``; in between, linear.
     :param follow: ``progress``, the share of the timesteps done; or the name of anything that is
-        logged, such as ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate`` (of
-        :class:`~sb3_quad.callbacks.BestModel` or SB3's EvalCallback).
-    :param between: where it begins to move and where it ends; the second may be the smaller one, as
-        for a loss.
-    :param one_way: it never goes back when the followed quantity does.
-    :raises ConfigError: numbers that are not finite, equal ends of ``between``; when training
-        begins, a coefficient that the algorithm does not have.
+        logged, such as ``rollout/success_rate``, ``rollout/ep_rew_mean``, ``eval/success_rate``
+        (from :class:`~sb3_quad.callbacks.BestModel` or SB3's EvalCallback).
+    :param between: values of the quantity at which the coefficient begins and ends to move. The
+        second may be the smaller one, as for a loss.
+    :param one_way: never move back when the quantity does.
+    :raises ConfigError: for numbers that are not finite and for equal ends of ``between``; when
+        training begins, for a coefficient that the algorithm does not have.
     """
 
     def __init__(
@@ -67,20 +67,22 @@ class CoefficientSchedule(BaseCallback):
             isinstance(value, (int, float)) and math.isfinite(value) for value in numbers
         ):
             raise ConfigError(
-                f"CoefficientSchedule: start {start}, final {final}, between {between}: must be finite numbers"
+                f"CoefficientSchedule: start {start}, final {final}, between {between}: "
+                "must be finite numbers"
             )
         if between[0] == between[1]:
             raise ConfigError(
                 f"CoefficientSchedule: between {tuple(between)}: its ends must differ"
             )
-        self.coefficient, self.follow = coefficient, follow
-        self._start, self._final, self._between = float(start), float(final), tuple(between)
+        self.coefficient = coefficient
+        self.follow = follow
+        self._start = float(start)
+        self._final = float(final)
+        self._between = tuple(between)
         self._one_way = one_way
 
     def value_at(self, measured: float) -> float:
-        """The coefficient that belongs to a value of the followed quantity, without regard to
-        ``one_way``.
-        """
+        """The coefficient at a value of the followed quantity, regardless of ``one_way``."""
         first, last = self._between
         share = min(max((measured - first) / (last - first), 0.0), 1.0)
         return self._start + share * (self._final - self._start)
@@ -89,14 +91,11 @@ class CoefficientSchedule(BaseCallback):
         _check(self.model, self.coefficient)
         self._logged = _LastLogged()
         self.logger.output_formats.append(self._logged)
-        self._value = (
-            self._start if self.num_timesteps == 0 else _read(self.model, self.coefficient)
-        )
-        for value in (
-            self._final,
-            self._start,
-            self._value,
-        ):  # one that is out of range is refused now, not at the end
+        self._value = self._start
+        if self.num_timesteps > 0:
+            self._value = _read(self.model, self.coefficient)
+        # Set each value once, so that one out of range is refused now and not at the end.
+        for value in (self._final, self._start, self._value):
             _set(self.model, self.coefficient, value)
         if self.follow == PROGRESS:
             self._on_rollout_end()
@@ -106,67 +105,72 @@ class CoefficientSchedule(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         self._logged.write(self.logger.name_to_value)
-        done = self.num_timesteps / self.model._total_timesteps
-        measured = (
-            done if self.follow == PROGRESS else self._logged.values.get(self.follow, math.nan)
-        )
+        if self.follow == PROGRESS:
+            measured = self.num_timesteps / self.model._total_timesteps
+        else:
+            measured = self._logged.values.get(self.follow, math.nan)
         if math.isfinite(measured):
-            value, falls = self.value_at(measured), self._final < self._start
-            self._value = (min if falls else max)(value, self._value) if self._one_way else value
+            value = self.value_at(measured)
+            if self._one_way and self._final < self._start:
+                value = min(value, self._value)
+            elif self._one_way:
+                value = max(value, self._value)
+            self._value = value
         _set(self.model, self.coefficient, self._value)
         self.logger.record(f"schedule/{self.coefficient}", self._value)
 
     def _on_training_end(self) -> None:
         self.logger.output_formats.remove(self._logged)
         if self.follow != PROGRESS and self.follow not in self._logged.values:
-            known = (
-                unknown("metric", self.follow, self._logged.values)
-                if self._logged.values
-                else "nothing was logged"
-            )
+            reason = "nothing was logged"
+            if self._logged.values:
+                reason = unknown("metric", self.follow, self._logged.values)
             warnings.warn(
-                f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {known}",
+                f"CoefficientSchedule: {self.coefficient} stayed {self._value:g}: {reason}",
                 stacklevel=2,
             )
 
 
 def _set(model: BaseAlgorithm, name: str, value: float) -> None:
-    """Give the algorithm another value of a coefficient: by its ``set_<name>``, else as its
-    constructor would.
-    """
+    """Set a coefficient by the algorithm's ``set_<name>``, or else as its constructor would."""
     setter = getattr(model, f"set_{name}", None)
     if setter is not None:
         setter(value)
     elif name == "learning_rate":
-        model.learning_rate, model.lr_schedule = value, FloatSchedule(value)
+        model.learning_rate = value
+        model.lr_schedule = FloatSchedule(value)
+    elif callable(getattr(model, name)):
+        setattr(model, name, FloatSchedule(value))
     else:
-        setattr(model, name, FloatSchedule(value) if callable(getattr(model, name)) else value)
+        setattr(model, name, value)
 
 
 def _read(model: BaseAlgorithm, name: str) -> float:
     value: Any = getattr(model, f"current_{name}", getattr(model, name))
-    return float(value(model._current_progress_remaining) if callable(value) else value)
+    if callable(value):
+        value = value(model._current_progress_remaining)
+    return float(value)
 
 
 def _check(model: BaseAlgorithm, name: str) -> None:
-    """:raises ConfigError: a name that is no coefficient of the algorithm, or one that is no float
-    there.
+    """Check a coefficient's name.
+
+    :raises ConfigError: if the algorithm has no such coefficient, or if it is not a float there.
     """
-    public = {
-        key: value
-        for key, value in vars(model).items()
-        if not key.startswith("_") and key != "lr_schedule"
-    }
-    valid = [
-        key
-        for key, value in public.items()
-        if isinstance(value, (float, FloatSchedule)) or key == "learning_rate"
-    ]
+    public = {}
+    valid = []
+    for key, value in vars(model).items():
+        if key.startswith("_") or key == "lr_schedule":
+            continue
+        public[key] = value
+        if isinstance(value, (float, FloatSchedule)) or key == "learning_rate":
+            valid.append(key)
     if name not in valid and not isinstance(public.get(name), int):
         raise ConfigError(unknown(f"coefficient of {type(model).__name__}", name, valid))
     if name not in valid and not hasattr(model, f"set_{name}"):
         raise ConfigError(
-            f"{name} of {type(model).__name__} is {public[name]!r}, which is no float; give it as one, as 0.0"
+            f"{name} of {type(model).__name__} is {public[name]!r}, which is not a float; "
+            "give it as one, as 0.0"
         )
 
 

@@ -1,9 +1,10 @@
-"""A callback of one's own: mean and deviation of what is observed while training, from which Table
-A.2 of the thesis comes.
+"""Your own callback: mean and standard deviation of the observations of a training.
+
+Table A.2 of the thesis comes from them.
 
     python examples/observation_statistics.py
 
-No agent comes of it: PPO has hardly begun to learn, and its first flights are what is measured.
+You get no agent: the first flights of PPO are measured, when it has hardly begun to learn.
 
 In a settings file, with ``PYTHONPATH=examples`` on the command line::
 
@@ -25,17 +26,16 @@ from sb3_quad.simulation.observation import FEATURES, GROUPS, OBSERVATION_SIZE
 
 
 class ObservationStatistics(EveryTimesteps):
-    """Running mean and standard deviation (Eq. 3.17) of the 18 features, in m, m/s and rad/s, with
-    noise.
+    """Running mean and standard deviation (Eq. 3.17) of the 18 features, with noise.
 
-    Each control step's observations, whose scaling (Eq. 3.16) is undone, are combined with all
-    before (T. F. Chan, G. H. Golub, R. J. LeVeque, *Updating formulae and a pairwise algorithm for
-    computing sample variances*, Stanford 1979).
+    They are in m, m/s and rad/s: the scaling (Eq. 3.16) is undone. The observations of each control
+    step are combined with all earlier ones (T. F. Chan, G. H. Golub, R. J. LeVeque, *Updating
+    formulae and a pairwise algorithm for computing sample variances*, Stanford 1979).
 
-    :param path: of a YAML file, whose ``observation_std`` is a list as ``env_kwargs`` takes it;
-        None for no file.
-    :param every: timesteps between two logs (``observation/std_<group>``) and writes; both are also
-        done at the end.
+    :param path: YAML file to write; its ``observation_std`` is a list as ``env_kwargs`` takes it.
+        None: no file.
+    :param every: timesteps after which it logs (``observation/std_<group>``) and writes. It does so
+        at the end, too.
     """
 
     def __init__(self, path: str | None = None, every: int = 100_000, verbose: int = 0) -> None:
@@ -50,18 +50,18 @@ class ObservationStatistics(EveryTimesteps):
         }
 
     def table(self) -> str:
-        """The deviation of each group beside that of Table A.2."""
+        """The deviation of each group next to that of Table A.2."""
         groups = self.groups()
-        lines = [
-            f"{each.name:<10} {groups[each.name]:10.3f}  {each.std:9.3f} {each.unit}"
-            for each in FEATURES
-        ]
-        return "\n".join([f"{'group':<10} {'sigma':>10}  Table A.2", *lines])
+        lines = [f"{'group':<10} {'sigma':>10}  Table A.2"]
+        for feature in FEATURES:
+            sigma = groups[feature.name]
+            lines.append(f"{feature.name:<10} {sigma:10.3f}  {feature.std:9.3f} {feature.unit}")
+        return "\n".join(lines)
 
     def _on_step(self) -> bool:
-        std, mean = (
-            np.array(self.training_env.get_attr(f"observation_{name}")) for name in ("std", "mean")
-        )
+        # The environments scale what they show; undo it.
+        std = np.array(self.training_env.get_attr("observation_std"))
+        mean = np.array(self.training_env.get_attr("observation_mean"))
         self.moments.update(self.locals["new_obs"] * std + mean)
         return super()._on_step()
 
@@ -69,13 +69,11 @@ class ObservationStatistics(EveryTimesteps):
         for name, sigma in self.groups().items():
             self.logger.record(f"observation/std_{name}", sigma)
         if self._path is not None:
-            found = {
-                "observation_mean": self.moments.mean,
-                "observation_std": np.sqrt(self.moments.var),
+            settings = {
+                "observation_mean": self.moments.mean.tolist(),
+                "observation_std": np.sqrt(self.moments.var).tolist(),
             }
-            write_text(
-                self._path, yaml.safe_dump({name: array.tolist() for name, array in found.items()})
-            )
+            write_text(self._path, yaml.safe_dump(settings))
         return True
 
     def _on_training_end(self) -> None:

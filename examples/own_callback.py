@@ -1,5 +1,6 @@
-"""A callback of one's own, and a schedule that follows what it logs: the expert flies less as
-crashes get rare.
+"""Your own callback, and a schedule that follows what it logs.
+
+The expert flies less as crashes get rare.
 
     python examples/own_callback.py
 
@@ -18,23 +19,28 @@ from sb3_quad.evaluation.flights import fly
 
 
 class CrashRate(BaseCallback):
-    """Logs the share of the episodes that ended on the ground, rollout by rollout."""
+    """Log the share of the episodes that ended on the ground, rollout by rollout."""
 
-    def _on_rollout_start(self):
-        self.episodes = self.crashes = 0
+    def _on_rollout_start(self) -> None:
+        self.episodes = 0
+        self.crashes = 0
 
-    def _on_step(self):
-        for info in self.locals["infos"]:  # empty but where an episode ends
+    def _on_step(self) -> bool:
+        # Infos are empty, except where an episode ends.
+        for info in self.locals["infos"]:
             if "collision" in info:
                 self.episodes += 1
                 self.crashes += info["collision"]
         return True  # False would end the training
 
-    def _on_rollout_end(self):
+    def _on_rollout_end(self) -> None:
         if self.episodes:
             self.logger.record("my/crash_rate", self.crashes / self.episodes)
-            print(f"{self.num_timesteps:>9,} transitions: {self.crashes} of {self.episodes} episodes crashed, "
-                  f"beta {self.model.current_beta:.2f}")  # fmt: skip
+            assert isinstance(self.model, DAgger)
+            print(
+                f"{self.num_timesteps:>9,} transitions: {self.crashes} of {self.episodes} "
+                f"episodes crashed, beta {self.model.current_beta:.2f}"
+            )
 
 
 parser = argparse.ArgumentParser(

@@ -1,5 +1,6 @@
-"""A vehicle of one's own: its parameters in a YAML file; the experts derive their gains, an agent
-learns to fly it.
+"""Your own vehicle: a YAML file with its parameters, from which experts derive their gains.
+
+An agent then learns to fly it from the geometric expert.
 
     python examples/own_vehicle.py
     python examples/own_vehicle.py --vehicle path/to/yours.yaml
@@ -33,12 +34,12 @@ parser.add_argument(
 )
 arguments = parser.parse_args()
 
-vehicle = load_vehicle(
-    arguments.vehicle
-)  # checked: a value that no vehicle can have is refused with its name
+# A value that no vehicle can have is refused here, by its name.
+vehicle = load_vehicle(arguments.vehicle)
 low, high = vehicle.thrust_range
 print(
-    f"{vehicle.name}: rotors from {low:.2f} to {high:.2f} N, hover at {vehicle.hover_rotor_speed:.0f} rad/s"
+    f"{vehicle.name}: rotors from {low:.2f} to {high:.2f} N, "
+    f"hover at {vehicle.hover_rotor_speed:.0f} rad/s"
 )
 
 expert = GeometricExpert(vehicle)
@@ -53,7 +54,8 @@ model = DAgger(
     n_epochs=1,
     gamma=0.99,
     learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
-    beta=1.0,  # the expert flies the first rollout, and less of each following one
+    # The expert flies the first rollout, and less of each following one.
+    beta=1.0,
     beta_decay=0.2,
     beta_final=0.0,
     seed=0,

@@ -1,6 +1,7 @@
-"""The picture of the README: success and final error over what each scenario of a suite varies.
+r"""The picture of the README: success and final error over what each scenario of a suite varies.
 
-    sb3-quad evaluate pid geometric itm-robust --suite robustness --scenario mass constant_force -o FOLDER
+    sb3-quad evaluate pid geometric itm-robust --suite robustness \
+        --scenario mass constant_force -o FOLDER
     python examples/robustness_plot.py FOLDER robustness.png
 
 A scenario that varies nothing, or two quantities at once, has no panel.
@@ -8,7 +9,9 @@ A scenario that varies nothing, or two quantities at once, has no panel.
 
 import argparse
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -18,38 +21,45 @@ from sb3_quad.evaluation.scenarios.scenario import Scenario
 
 COLUMNS = 3
 MARKERS = "osD^vP"
-LEAST_ERROR = 1e-3  # m; smaller ones are drawn there, on a logarithmic axis
+# m. The axis is logarithmic; smaller errors are drawn there.
+LEAST_ERROR = 1e-3
 
 
 def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> None:
-    """Draw the success, in %, with 95 % intervals, and the median final error, in m, of the cells
-    of one scenario.
+    """Draw success and final error of the cells of one scenario.
+
+    Success is in %, with 95 % intervals; the final error is the median, in m.
     """
     (key,) = cells[0].cell
     for number, controller in enumerate(results.controllers):
-        entries = [(cell.cell[key], results.entry(controller.label, cell.name)) for cell in cells]
-        flown = [(x, entry.metrics) for x, entry in entries if entry is not None]
-        style = {
+        colour = f"C{number}"
+        style: dict[str, Any] = {
             "marker": MARKERS[number % len(MARKERS)],
             "markersize": 5,
-            "color": f"C{number}",
+            "color": colour,
             "alpha": 0.9,
         }
-        shares = [
-            (x, 100.0 * m.success.value, 100.0 * m.success.low, 100.0 * m.success.high)
-            for x, m in flown
-            if m.success
-        ]
+        shares = []
+        errors = []
+        for cell in cells:
+            entry = results.entry(controller.label, cell.name)
+            if entry is None:
+                continue
+            x = cell.cell[key]
+            success = entry.metrics.success
+            if success is not None:
+                shares.append((x, success.value, success.low, success.high))
+            # A median over the few survivors would flatter: half of the flights must survive.
+            median = entry.metrics.final_error_median
+            if median is not None and entry.metrics.survival.value >= 0.5:
+                errors.append((x, max(median, LEAST_ERROR)))
         if shares:
-            x, success, low, high = zip(*shares, strict=True)
-            top.plot(x, success, label=controller.label, **style)
-            top.fill_between(x, low, high, color=style["color"], alpha=0.15, linewidth=0)
-        # A median over the few flights that are left would flatter: half of them must survive.
-        errors = [
-            (x, max(m.final_error_median, LEAST_ERROR)) for x, m in flown if m.survival.value >= 0.5
-        ]
+            x, value, low, high = np.array(shares, dtype=np.float64).T
+            top.plot(x, 100.0 * value, label=controller.label, **style)
+            top.fill_between(x, 100.0 * low, 100.0 * high, color=colour, alpha=0.15, linewidth=0)
         if errors:
-            bottom.plot(*zip(*errors, strict=True), **style)
+            x, error = np.array(errors, dtype=np.float64).T
+            bottom.plot(x, error, **style)
     top.set_title(
         cells[0].title.split(":")[0].capitalize(), loc="left", fontweight="bold", fontsize=10
     )
@@ -65,17 +75,18 @@ def panel(top: Axes, bottom: Axes, results: Results, cells: list[Scenario]) -> N
 
 
 def draw(results: Results) -> Figure:
-    """A picture with two panels for each scenario that varies one quantity.
+    """Draw two panels for each scenario that varies one quantity.
 
     :raises SystemExit: no scenario varies one quantity.
     """
     groups: dict[str, list[Scenario]] = {}
     for scenario in results.scenarios:
-        if len(scenario.cell) == 1:
+        if len(scenario.cell) == 1 and scenario.group is not None:
             groups.setdefault(scenario.group, []).append(scenario)
     if not groups:
         raise SystemExit(
-            "no scenario of these results varies one quantity; evaluate --suite robustness --scenario mass does"
+            "no scenario of these results varies one quantity; "
+            "evaluate --suite robustness --scenario mass does"
         )
     columns = min(COLUMNS, len(groups))
     rows = -(-len(groups) // columns)
@@ -97,7 +108,7 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("folder", type=Path, help="of results, as evaluate leaves it")
+    parser.add_argument("folder", type=Path, help="folder of results that evaluate wrote")
     parser.add_argument("picture", type=Path, help="PNG, SVG or PDF to write")
     options = parser.parse_args()
     draw(load_results(options.folder)).savefig(options.picture)

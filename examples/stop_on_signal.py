@@ -1,9 +1,8 @@
-"""Ctrl-C in a training script of one's own: the training ends after the step, and the model is
-saved.
+"""Ctrl-C in your own training script: the training ends after the step, and the model is saved.
 
     python examples/stop_on_signal.py
 
-``sb3-quad train`` does more (resumable runs).
+``sb3-quad train`` does more: you can resume its runs exactly.
 """
 
 import argparse
@@ -18,25 +17,25 @@ from sb3_quad.envs import QuadcopterVecEnv
 
 
 class StopOnSignal(BaseCallback):
-    """Makes Ctrl-C (SIGINT), SIGTERM and SIGHUP end ``model.learn`` after the step, and saves the
-    model, whole or not at all.
+    """End ``model.learn`` after the step on Ctrl-C (SIGINT), SIGTERM or SIGHUP, and save the model.
 
-    A second signal interrupts at once, without saving.
+    The file is written whole or not at all. A second signal interrupts at once, without saving.
     ``learn`` returns as usual and the script continues; ``signal`` tells whether one came.
 
     To continue: ``PPO.load("interrupted.zip", env).learn(n, reset_num_timesteps=False)``. While
     ``learn`` runs, signals are held back. If an exception ends it, the next signal is held back
     too.
 
-    :param path: where the model goes; an existing file is replaced.
-    :raises ConfigError: where the model is saved, a folder that cannot be written.
+    :param path: file for the model; an existing one is replaced.
+    :raises ConfigError: when the model is saved, if its folder cannot be written.
     """
 
     signal = ""
     """The name of the signal that ended the training, empty if none did."""
     exit_code = 0
-    """For ``sys.exit``, as a shell expects it: 130 after SIGINT, 143 after SIGTERM, 129 after
-    SIGHUP; 0 if none came.
+    """For ``sys.exit``, as a shell expects it.
+
+    130 after SIGINT, 143 after SIGTERM, 129 after SIGHUP; 0 if no signal came.
     """
 
     def __init__(self, path: str | Path, verbose: int = 1) -> None:
@@ -44,7 +43,8 @@ class StopOnSignal(BaseCallback):
         self._path = Path(path)
 
     def _on_training_start(self) -> None:
-        self.signal, self.exit_code = "", 0
+        self.signal = ""
+        self.exit_code = 0
         self._signals = StopSignals()
         self._signals.__enter__()
 
@@ -53,13 +53,15 @@ class StopOnSignal(BaseCallback):
 
     def _on_training_end(self) -> None:
         self._signals.hold()
-        self.signal, self.exit_code = self._signals.name, self._signals.exit_code
+        self.signal = self._signals.name
+        self.exit_code = self._signals.exit_code
         try:
             if self.signal:
                 save_model(self.model, self._path)
                 if self.verbose:
                     print(
-                        f"{self.signal} after {self.num_timesteps:,} timesteps: model saved to {self._path}"
+                        f"{self.signal} after {self.num_timesteps:,} timesteps: "
+                        f"model saved to {self._path}"
                     )
         finally:
             self._signals.__exit__(None, None, None)

@@ -1,14 +1,15 @@
-"""The thesis's PID law in each way its text can be read: order of the Euler angles, frame of the
-velocity.
+r"""The thesis's PID law in each way in which you can read its text.
+
+The readings differ in the order of the Euler angles and in the frame of the velocity.
 
     python examples/thesis_readings.py
-    PYTHONPATH=examples sb3-quad evaluate ours=pid zxy_body=thesis_readings:zxy_body
-    zyx_world=thesis_readings:zyx_world \
-        zxy_world=thesis_readings:zxy_world --suite thesis -o evaluations/readings
+    PYTHONPATH=examples sb3-quad evaluate ours=pid zxy_body=thesis_readings:zxy_body \
+        zyx_world=thesis_readings:zyx_world zxy_world=thesis_readings:zxy_world \
+        --suite thesis -o evaluations/readings
 
 Eq. 2.1 prints the order Z-X-Y and Eq. 2.9 the velocity of the world frame. ``PIDExpert`` takes
-Z-Y-X and the body frame; docs/choices.md tells why, with the figures of this command. Everything
-else is as there.
+Z-Y-X and the body frame. docs/choices.md says why, with the figures of this command. Everything
+else is the same as in ``PIDExpert``.
 """
 
 import numpy as np
@@ -19,8 +20,14 @@ from sb3_quad.evaluation.flights import fly
 from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.vehicle import Vehicle
 
-KP, KI, KD, NATURAL_FREQUENCY, DAMPING = 1.5, 50.0, 4.1, 9.0, 1.0  # Table A.1
-ANGLE_FACTOR = 0.25  # 3.2.1
+# Table A.1
+KP = 1.5
+KI = 50.0
+KD = 4.1
+NATURAL_FREQUENCY = 9.0
+DAMPING = 1.0
+# Section 3.2.1
+ANGLE_FACTOR = 0.25
 
 
 class PIDReading(PIDExpert):
@@ -33,40 +40,41 @@ class PIDReading(PIDExpert):
 
     def __init__(self, vehicle: str | Vehicle, order: str, frame: str) -> None:
         super().__init__(vehicle)
-        self._order, self._frame = order, frame
+        self._order = order
+        self._frame = frame
 
     def actions(self, state: QuadcopterState) -> npt.NDArray[np.float32]:
         """Actions in [-1, 1], float32 of shape (n, 4)."""
-        vehicle, rotation = self.vehicle, state.rotation  # (n, 3, 3), body to world
+        vehicle = self.vehicle
+        rotation = state.rotation  # (n, 3, 3), body to world
         roll, pitch, yaw = euler_angles(rotation, self._order)
-        velocity = (
-            state.velocity
-            if self._frame == "world"
-            else np.einsum("nji,nj->ni", rotation, state.velocity)
-        )
+        velocity = state.velocity
+        if self._frame == "body":
+            velocity = np.einsum("nji,nj->ni", rotation, velocity)
+
+        # The acceleration that the position loop asks for, and the tilt that gives it.
         error = state.target - state.position
         wanted = KP * error - KD * velocity
-        sin, cos = np.sin(yaw), np.cos(yaw)
-        tilts = np.stack(
-            [wanted[:, 0] * sin - wanted[:, 1] * cos, wanted[:, 0] * cos + wanted[:, 1] * sin]
-        )
-        angles = [*(ANGLE_FACTOR / vehicle.gravity * tilts - np.stack([roll, pitch])), -yaw]
-        turning = (
-            NATURAL_FREQUENCY**2 * np.stack(angles, 1)
-            - 2 * DAMPING * NATURAL_FREQUENCY * state.body_rates
-        )
+        sin = np.sin(yaw)
+        cos = np.cos(yaw)
+        wanted_roll = ANGLE_FACTOR / vehicle.gravity * (wanted[:, 0] * sin - wanted[:, 1] * cos)
+        wanted_pitch = ANGLE_FACTOR / vehicle.gravity * (wanted[:, 0] * cos + wanted[:, 1] * sin)
+
+        # The attitude loop: a damped oscillator about each axis.
+        angles = np.stack([wanted_roll - roll, wanted_pitch - pitch, -yaw], axis=1)
+        damping = 2 * DAMPING * NATURAL_FREQUENCY * state.body_rates
+        turning = NATURAL_FREQUENCY**2 * angles - damping
+
         height = wanted[:, 2] + KI * vehicle.control_step * error[:, 2]
         force = vehicle.mass * (vehicle.gravity + height)
-        thrusts = (
-            np.column_stack([force, np.asarray(vehicle.inertia) * turning])
-            @ vehicle.mixer_inverse.T
-        )
+        wrench = np.column_stack([force, np.asarray(vehicle.inertia) * turning])
+        thrusts = wrench @ vehicle.mixer_inverse.T
         low, high = vehicle.thrust_range
+        # Where a rotor would exceed its limit, all four are scaled down.
         thrusts *= (high / np.maximum(thrusts.max(1), high))[:, None]
         half = (high - low) / 2
-        return np.asarray(
-            np.clip((np.maximum(thrusts, low) - low) / half - 1, -1, 1), dtype=np.float32
-        )
+        actions = (np.maximum(thrusts, low) - low) / half - 1
+        return np.asarray(np.clip(actions, -1, 1), dtype=np.float32)
 
 
 def euler_angles(r: npt.NDArray[np.float64], order: str) -> tuple[npt.NDArray[np.float64], ...]:
@@ -95,7 +103,7 @@ def euler_angles(r: npt.NDArray[np.float64], order: str) -> tuple[npt.NDArray[np
 
 
 def zyx_body(vehicle: str | Vehicle) -> PIDReading:
-    """As ``PIDExpert``."""
+    """Z-Y-X, velocity of the body frame: the same as ``PIDExpert``."""
     return PIDReading(vehicle, "zyx", "body")
 
 
@@ -128,5 +136,6 @@ if __name__ == "__main__":
     for reading in (zyx_body, zyx_world, zxy_body, zxy_world, xyz_body, xyz_world):
         flights = fly(reading("itm"), "state_recovery", n_episodes=240, seed=0)
         print(
-            f"{reading.__name__}: {flights.survival.mean():.1%} of 240 recoveries survive (thesis: 29.48%)"
+            f"{reading.__name__}: {flights.survival.mean():.1%} of 240 recoveries survive "
+            "(thesis: 29.48%)"
         )

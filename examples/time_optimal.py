@@ -1,15 +1,14 @@
-"""The least time in which a vehicle comes to a target: within 0.1 m of it, to stay and come to rest
-there.
+"""The least time in which a vehicle gets within 0.1 m of a target, to stay and to rest there.
 
     pip install casadi
     python examples/time_optimal.py itm
     python examples/time_optimal.py my.yaml --distances 10 20 --directions 12
 
-The vehicle hovers until the first command acts, which its delay puts off. Its rotors then turn up
-and down as fast as their motor gains and limits let them (Eq. 4.1). Direct collocation
-(Hermite-Simpson) of its full model, solved by IPOPT from the flight of its geometric expert: so
-each time is the least nearby, and a bound on what a controller can do only as far as no other kind
-of flight is quicker. The directions are spread evenly over the sphere.
+The vehicle hovers until the first command acts, after its delay. Its rotors then speed up and slow
+down as fast as their motor gains and limits let them (Eq. 4.1). The full model is discretized by
+direct collocation (Hermite-Simpson), and IPOPT solves it, starting from the flight of the geometric
+expert. So each time is a local minimum: it bounds what a controller can do unless another kind of
+flight is quicker. The directions are spread evenly over the sphere.
 """
 
 import argparse
@@ -22,21 +21,19 @@ from sb3_quad.simulation.batch import QuadcopterBatch
 from sb3_quad.simulation.settings import FlightSettings
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
-NEAR, START = 0.1, 100.0  # m; the height of the start, so that no ground is below
-WAY, REST = 60, 20  # intervals until it is near, and from then to rest
+NEAR = 0.1  # m
+START = 100.0  # m; the height of the start, so that the ground does not matter
+WAY = 60  # intervals until it is near
+REST = 20  # intervals from then to rest
 REST_TIME = 1.0  # s, at most
-STATES = {
-    "position": 3,
-    "quaternion": 4,
-    "velocity": 3,
-    "rates": 3,
-    "speeds": 4,
-}  # rotor speeds in those of hover
+# Sizes of the parts of a state. Rotor speeds are relative to that of hover.
+STATES = {"position": 3, "quaternion": 4, "velocity": 3, "rates": 3, "speeds": 4}
 
 
 def rates_of_change(vehicle: Vehicle) -> ca.Function:
-    """The state's derivative, from the state and the rates of change of the four rotor speeds."""
-    state, turn = ca.SX.sym("state", sum(STATES.values())), ca.SX.sym("turn", 4)
+    """Return the derivative of the state, a function of the state and the rotors' accelerations."""
+    state = ca.SX.sym("state", sum(STATES.values()))
+    turn = ca.SX.sym("turn", 4)
     _, q, v, w, speeds = ca.vertsplit(state, np.cumsum([0, *STATES.values()]).tolist())
     qw, qx, qy, qz = ca.vertsplit(q)
     rotation = ca.blockcat(
@@ -51,38 +48,46 @@ def rates_of_change(vehicle: Vehicle) -> ca.Function:
     inertia = ca.DM(vehicle.inertia)
     spin = (total[1:] - ca.cross(w, inertia * w)) / inertia
     turning = 0.5 * ca.vertcat(-ca.dot(q[1:], w), qw * w + ca.cross(q[1:], w))
-    return ca.Function(
-        "f",
-        [state, turn],
-        [ca.vertcat(v, turning, force / vehicle.mass - ca.DM([0, 0, vehicle.gravity]), spin, turn)],
-    )
+    acceleration = force / vehicle.mass - ca.DM([0, 0, vehicle.gravity])
+    derivative = ca.vertcat(v, turning, acceleration, spin, turn)
+    return ca.Function("f", [state, turn], [derivative])
 
 
 def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
-    """Seconds from hover until the vehicle has come near a target that lies ``way`` from it;
-    infinite where IPOPT fails.
+    """Return the seconds from hover until the vehicle is near a target, infinite if IPOPT fails.
+
+    :param way: vector to the target, (3,), m.
     """
-    f, problem = rates_of_change(vehicle), ca.Opti()
-    n, size = WAY + REST, sum(STATES.values())
-    x, u, middle = problem.variable(size, n + 1), problem.variable(4, n + 1), problem.variable(4, n)
+    f = rates_of_change(vehicle)
+    problem = ca.Opti()
+    n = WAY + REST
+    size = sum(STATES.values())
+    # States and inputs at the ends of the intervals, inputs in their middle, the two durations, s.
+    x = problem.variable(size, n + 1)
+    u = problem.variable(4, n + 1)
+    middle = problem.variable(4, n)
     durations = problem.variable(2)
+
+    # Hermite-Simpson: the state in the middle is that of a cubic, and Simpson's rule integrates.
     h = ca.horzcat(*[durations[0] / WAY] * WAY, *[durations[1] / REST] * REST)
     steps = ca.repmat(h, size, 1)
     slope = f.map(n + 1)(x, u)
     half = (x[:, :-1] + x[:, 1:]) / 2 + steps / 8 * (slope[:, :-1] - slope[:, 1:])
-    problem.subject_to(
-        x[:, 1:] - x[:, :-1]
-        == steps / 6 * (slope[:, :-1] + 4 * f.map(n)(half, middle) + slope[:, 1:])
-    )
+    slopes = slope[:, :-1] + 4 * f.map(n)(half, middle) + slope[:, 1:]
+    problem.subject_to(x[:, 1:] - x[:, :-1] == steps / 6 * slopes)
+
+    # The rotors follow commands within their limits, by Eq. 4.1.
     low, high = np.sqrt(vehicle.thrust_limits)
     for turn, speeds in ((u, x[13:, :]), (middle, half[13:, :])):
         problem.subject_to(ca.vec(turn - vehicle.motor_gain_up * (high - speeds)) <= 0)
         problem.subject_to(ca.vec(turn - vehicle.motor_gain_down * (low - speeds)) >= 0)
+
+    # From hover to within NEAR of the target, and from then on it stays there.
     hover = np.array([0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 1, 1, 1])
     problem.subject_to(x[:, 0] == hover)
     problem.subject_to(problem.bounded(0.05, durations, [20.0, REST_TIME]))
     problem.subject_to(ca.vec(ca.sum1((x[:3, WAY:] - ca.repmat(way, 1, REST + 1)) ** 2)) <= NEAR**2)
-    # At rest in any heading, level:
+    # At rest at the end: level, in any heading.
     problem.subject_to(x[4:6, -1] == 0)
     problem.subject_to(x[7:13, -1] == 0)
     problem.subject_to(x[13:, -1] == 1)
@@ -102,8 +107,9 @@ def least_time(vehicle: Vehicle, way: np.ndarray) -> float:
 
 
 def flight(vehicle: Vehicle, way: np.ndarray) -> tuple[np.ndarray, list[float]]:
-    """The states of the geometric expert's flight at the ends of the intervals, and the durations
-    of its two parts, s.
+    """Fly the geometric expert to the target.
+
+    :returns: its states at the ends of the intervals, and the durations of its two parts, s.
     """
     settings = FlightSettings(
         task_kwargs={"start_position": (0.0, 0.0, START)},
@@ -111,12 +117,10 @@ def flight(vehicle: Vehicle, way: np.ndarray) -> tuple[np.ndarray, list[float]]:
         noise=0.0,
         max_episode_steps=3000,
     )
-    batch, expert, states, distance = (
-        QuadcopterBatch(1, settings, seed=0, autoreset=False),
-        GeometricExpert(vehicle),
-        [],
-        [],
-    )
+    batch = QuadcopterBatch(1, settings, seed=0, autoreset=False)
+    expert = GeometricExpert(vehicle)
+    states = []
+    distance = []
     batch.reset()
     start = batch.true_state().position[0].copy()
     batch.set_target(start + way)
@@ -127,24 +131,24 @@ def flight(vehicle: Vehicle, way: np.ndarray) -> tuple[np.ndarray, list[float]]:
         batch.step(expert.actions(batch.true_state()))
     near = int(np.flatnonzero(np.array(distance) > NEAR)[-1]) + 1
     seconds = [near * vehicle.control_step, 0.5 * REST_TIME]
-    at = np.concatenate(
-        [np.linspace(0, seconds[0], WAY + 1), seconds[0] + np.linspace(0, seconds[1], REST + 1)[1:]]
-    )
+    to_target = np.linspace(0, seconds[0], WAY + 1)
+    to_rest = seconds[0] + np.linspace(0, seconds[1], REST + 1)[1:]
+    ends = np.concatenate([to_target, to_rest])
     times = np.arange(len(states)) * vehicle.control_step
-    return np.stack([np.interp(at, times, column) for column in np.array(states).T]), seconds
+    return np.stack([np.interp(ends, times, column) for column in np.array(states).T]), seconds
 
 
 def directions(n: int) -> np.ndarray:
-    """n unit vectors spread evenly over the sphere (Fibonacci), (n, 3)."""
+    """Return n unit vectors spread evenly over the sphere (Fibonacci), (n, 3)."""
     k = np.arange(n) + 0.5
-    z, angle = 1 - 2 * k / n, np.pi * (1 + 5**0.5) * k
-    return np.stack(
-        [np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], axis=1
-    )
+    z = 1 - 2 * k / n
+    radius = np.sqrt(1 - z**2)
+    angle = np.pi * (1 + 5**0.5) * k
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
 def main() -> None:
-    """Solve, print."""
+    """Solve for each distance and direction, and print the means."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -156,13 +160,13 @@ def main() -> None:
     options = parser.parse_args()
     vehicle = load_vehicle(options.vehicle)
     for distance in options.distances:
-        times = np.array(
-            [least_time(vehicle, distance * each) for each in directions(options.directions)]
-        )
-        found = times[np.isfinite(times)]
-        spread = f"{found.mean():.2f} s ({found.min():.2f} to {found.max():.2f})"
+        targets = distance * directions(options.directions)
+        times = np.array([least_time(vehicle, target) for target in targets])
+        solved = times[np.isfinite(times)]
         print(
-            f"{vehicle.name}, {distance:g} m: {spread}, {found.size} of {times.size} directions solved",
+            f"{vehicle.name}, {distance:g} m: {solved.mean():.2f} s "
+            f"({solved.min():.2f} to {solved.max():.2f}), "
+            f"{solved.size} of {times.size} directions solved",
             flush=True,
         )
 

@@ -1,4 +1,4 @@
-"""A callback of one's own: flights of the policy as it is, as plots in TensorBoard.
+"""Your own callback: flights of the current policy, as plots in TensorBoard.
 
     python examples/trajectory_plots.py
     tensorboard --logdir tb
@@ -29,16 +29,15 @@ from sb3_quad.simulation.settings import FlightSettings
 
 
 class TrajectoryPlots(EveryTimesteps):
-    """Flies a few episodes every ``every`` timesteps and logs them as ``flights/figure``: path,
-    error, actions.
+    """Fly a few episodes every ``every`` timesteps, and log them as ``flights/figure``.
 
-    It works with any algorithm whose policy flies on the quadcopter's own observation. The flights
-    are deterministic, the same each time, and separate from the training: neither its environments
-    nor its random numbers are touched.
+    The figure shows path, error and actions. It works with any algorithm whose policy flies on the
+    quadcopter's own observation. The flights are deterministic, the same each time, and separate
+    from the training: neither its environments nor its random numbers are touched.
 
     :param every: timesteps between plots.
     :param n_flights: episodes in a plot.
-    :param seed: of the flights.
+    :param seed: seed of the flights.
     :param max_steps: control steps after which an episode ends at the latest.
     :param environment: keywords of :class:`~sb3_quad.envs.vec_env.QuadcopterVecEnv`, such as
         ``task`` and ``vehicle``.
@@ -78,14 +77,12 @@ def _plot(flights: Arrays) -> Picture:
     actions = picture.add_subplot(
         1, 3, 3, xlabel="time (s)", ylabel="action", title="actions of flight 0", ylim=(-1.05, 1.05)
     )
-    for number, (position, target) in enumerate(
-        zip(flights["position"], flights["target"], strict=True)
-    ):
+    paths = zip(flights["position"], flights["target"], strict=True)
+    for number, (position, target) in enumerate(paths):
         space.plot(*position.T, color=f"C{number}")
         space.plot(*target[:1].T, color=f"C{number}", marker="D")
-        error.plot(
-            flights["time"], np.linalg.norm(position - target, axis=1), label=f"flight {number}"
-        )
+        distance = np.linalg.norm(position - target, axis=1)
+        error.plot(flights["time"], distance, label=f"flight {number}")
     actions.plot(
         flights["time"], flights["action"][0], label=[f"rotor {rotor}" for rotor in range(4)]
     )
@@ -119,7 +116,8 @@ if __name__ == "__main__":
         n_epochs=1,
         gamma=0.99,
         learning_rate=LinearSchedule(5e-3, 2.5e-4, 1.0),
-        beta=1.0,  # the expert flies the first rollout, and less of each following one
+        # The expert flies the first rollout, and less of each following one.
+        beta=1.0,
         beta_decay=0.2,
         beta_final=0.0,
         seed=0,

@@ -1,15 +1,13 @@
-"""Search for the geometric expert's gains for a vehicle, by CMA-ES (Hansen, through Optuna), on the
-batched environment.
+"""Search for the geometric expert's gains for a vehicle, by CMA-ES (Hansen, through Optuna).
 
     pip install '.[tune]'                                                     # from a clone
     python examples/tune_expert.py my.yaml -o tuned.yaml -n 300
     sb3-quad train --algo dagger --expert geometric --env-kwargs vehicle:tuned.yaml
 
-Gains are judged by recoveries first, then by the time after which they stay at targets 7 to 20 m
-away, and by how many flights leave them again, on the same episodes each time. The file that is
-written is the vehicle with the gains found, or with those that it began with where these are as
-good on episodes that the search has not seen. Ctrl-C writes the best so far; the study is kept in
-OUTPUT.journal, and the same command continues it.
+Gains are judged by recoveries first, then by the settling time at targets 7 to 20 m away and by the
+overshoot rate, on the same episodes each time. The file holds the vehicle with the new gains, or
+with the first ones if these are as good on episodes that the search has not seen. Ctrl-C writes the
+best so far. OUTPUT.journal keeps the study, and the same command continues it.
 """
 
 import argparse
@@ -23,88 +21,103 @@ import yaml
 from optuna.storages import JournalStorage
 from optuna.storages.journal import JournalFileBackend
 
+from sb3_quad.base.arrays import BoolArray
 from sb3_quad.base.seeds import row_seeds, seed_for
 from sb3_quad.evaluation.flights import Flights, Hook, fly, fly_settings
 from sb3_quad.experts.geometric import GeometricExpert
 from sb3_quad.simulation.settings import FlightSettings
+from sb3_quad.simulation.state import QuadcopterState
 from sb3_quad.vehicles.gains import GAIN_NAMES, GeometricGains
 from sb3_quad.vehicles.vehicle import Vehicle, load_vehicle
 
 NEAR = 0.1  # m
-CLOSE = 1.5  # m; the height above ground over which coming close to it loses its weight, by e
-# Weights, in seconds of the way to a target: per share lost, per share that comes close to the
-# ground, per share that leaves its target again, per reward of a recovery.
-LOST, TOO_LOW, LEFT, RECOVERY_REWARD = 1500.0, 1000.0, 0.5, 0.25
-WAYS = {"target_distance": 20.0, "nearest_target": 7.0}  # m
-DESCENT, WAY, RECOVERY = 400, 800, 1000  # control steps flown of each kind
-# Slow descents are for agents that imitate the expert imprecisely; the expert itself could do
-# without, and is not asked.
+CLOSE = 1.5  # m; the cost of a low flight falls by a factor of e over this height
+
+# Weights, in seconds of settling time: of the share of crashes, of the share of flights close to
+# the ground, of the overshoot rate, of the reward of a recovery.
+LOST = 1500.0
+TOO_LOW = 1000.0
+LEFT = 0.5
+RECOVERY_REWARD = 0.25
+
+TARGETS = {"target_distance": 20.0, "nearest_target": 7.0}  # m
+
+# Control steps of each kind of flight.
+DESCENT_STEPS = 400
+TRACKING_STEPS = 800
+RECOVERY_STEPS = 1000
+
+# Slow descents help agents that imitate the expert imprecisely. The expert itself does not need
+# them, so its own flights cannot find this gain.
 SEARCHED = tuple(name for name in GAIN_NAMES if name != "descent_deceleration")
-RANGE = 2.0  # each gain between its first value divided by this and multiplied by it
+RANGE = 2.0  # each gain lies between its first value divided by this and multiplied by this
 
 
 class Lowest(Hook):
     """The lowest height of each flight, m."""
 
-    def on_start(self, state, vehicle) -> None:
+    def on_start(self, state: QuadcopterState, vehicle: Any) -> None:
         self.height = state.position[:, 2].copy()
 
-    def after_step(self, step, state, actions, flying) -> None:
+    def after_step(
+        self, step: int, state: QuadcopterState, actions: Any, flying: BoolArray
+    ) -> None:
         self.height = np.minimum(self.height, np.where(flying, state.position[:, 2], 0.0))
 
 
 class Objective:
-    """The cost of gains, to be minimised; 1500 per share of recoveries lost, then seconds.
+    """The cost of gains, to be minimised: 1500 for crashing always, then seconds.
 
-    Nearly all starts are recovered by any sensible gains and do not tell them apart: of ``starts``
-    recoveries, the sixtieth on which the first gains come closest to the ground is flown, and the
-    others taken as recovered.
+    Sensible gains recover from nearly all starts, so most starts do not tell them apart. Of
+    ``starts`` recoveries only one in sixty is flown: those on which the first gains come closest to
+    the ground. The others count as recovered.
     """
 
     def __init__(self, vehicle: Vehicle, starts: int, targets: int, seed: int) -> None:
-        self.vehicle, self.starts = vehicle, starts
-        begun = row_seeds(seed_for("search", seed), starts + max(targets // 2, 1))
-        heights = self.fly(GeometricExpert(vehicle), "state_recovery", begun[:starts], DESCENT)[
-            1
-        ].height
-        self.hardest = [begun[row] for row in np.sort(np.argsort(heights)[: max(starts // 60, 1)])]
-        self.tracking, self.recovery = begun[:targets], begun[starts:]
+        self.vehicle = vehicle
+        self.starts = starts
+        seeds = row_seeds(seed_for("search", seed), starts + max(targets // 2, 1))
+        first = GeometricExpert(vehicle)
+        _, lowest = self.fly(first, "state_recovery", seeds[:starts], DESCENT_STEPS)
+        lowest_first = np.argsort(lowest.height)
+        hardest = np.sort(lowest_first[: max(starts // 60, 1)])
+        self.hardest = [seeds[row] for row in hardest]
+        self.tracking = seeds[:targets]
+        self.recovery = seeds[starts:]
 
     def __call__(self, gains: GeometricGains) -> float:
         expert = GeometricExpert(self.vehicle, gains)
-        hard, lowest = self.fly(expert, "state_recovery", self.hardest, DESCENT)
-        tracking, _ = self.fly(expert, "target_tracking", self.tracking, WAY)
-        recovery, _ = self.fly(expert, "state_recovery", self.recovery, RECOVERY)
-        # Recoveries that are not chosen for being hard find gains that lose other starts than the
-        # hardest.
+        hard, lowest = self.fly(expert, "state_recovery", self.hardest, DESCENT_STEPS)
+        tracking, _ = self.fly(expert, "target_tracking", self.tracking, TRACKING_STEPS)
+        recovery, _ = self.fly(expert, "state_recovery", self.recovery, RECOVERY_STEPS)
+
+        # Ordinary recoveries find gains that crash from starts other than the hardest.
         lost = (~hard.survival).sum() / self.starts + (~recovery.survival).mean()
-        low = (
-            np.exp(-np.maximum(lowest.height, 0.0) / CLOSE).sum() / self.starts
-        )  # tells near losses apart
-        settling = np.nan_to_num(
-            tracking.settling_time[NEAR], nan=2 * WAY * self.vehicle.control_step
-        ).mean()
-        left, reward = (
-            (tracking.survival & (tracking.overshoot > NEAR)).mean(),
-            recovery.reward.mean(),
-        )
+        # The height tells narrow escapes from safe ones.
+        low = np.exp(-np.maximum(lowest.height, 0.0) / CLOSE).sum() / self.starts
+        # A flight that does not settle counts as twice its length.
+        never = 2 * TRACKING_STEPS * self.vehicle.control_step
+        settling = np.nan_to_num(tracking.settling_time[NEAR], nan=never).mean()
+        left = (tracking.survival & (tracking.overshoot > NEAR)).mean()
+        reward = recovery.reward.mean()
         return float(
             LOST * lost + TOO_LOW * low + settling + LEFT * left - RECOVERY_REWARD * reward
         )
 
-    def fly(self, expert, task, seeds, steps):
-        """The first episode of each seed, on the true state."""
-        keywords = {
-            "task": task,
-            "task_kwargs": WAYS if task == "target_tracking" else None,
-            "max_episode_steps": steps,
-        }
-        settings, lowest = FlightSettings(vehicle=self.vehicle, noise=0.0, **keywords), Lowest()
+    def fly(
+        self, expert: GeometricExpert, task: str, seeds: Sequence[int], steps: int
+    ) -> tuple[Flights, Lowest]:
+        """Fly the first episode of each seed, on the true state."""
+        keywords: dict[str, Any] = {"task": task, "max_episode_steps": steps}
+        if task == "target_tracking":
+            keywords["task_kwargs"] = TARGETS
+        settings = FlightSettings(vehicle=self.vehicle, noise=0.0, **keywords)
+        lowest = Lowest()
         return fly_settings(expert, settings, seeds, hooks=[lowest]), lowest
 
 
 def with_values(gains: GeometricGains, values: dict[str, float]) -> GeometricGains:
-    """The gains with some replaced, of four digits."""
+    """Replace some gains, rounded to four digits."""
     rounded = {name: float(f"{value:.4g}") for name, value in values.items()}
     return GeometricGains.model_validate({**gains.model_dump(exclude={"measured"}), **rounded})
 
@@ -122,17 +135,16 @@ def measure_expert(
         [fly(expert, "state_recovery", episodes, seed, **keywords) for seed in seeds]
     )
     tracking = fly(expert, "target_tracking", episodes, seeds[0], **keywords)
-    times, stays = (
-        np.nan_to_num(each[NEAR], nan=time_limit * vehicle.control_step)
-        for each in (tracking.time_to, tracking.settling_time)
-    )
+    never = time_limit * vehicle.control_step
+    time_to = np.nan_to_num(tracking.time_to[NEAR], nan=never)
+    settling_time = np.nan_to_num(tracking.settling_time[NEAR], nan=never)
     return {
         "recovery_survival": round(float(recovery.survival.mean()), 5),
         "recovery_episodes": recovery.n,
         "tracking_survival": round(float(tracking.survival.mean()), 5),
         "tracking_episodes": tracking.n,
-        "time_to_0_1_m": round(float(times.mean()), 3),  # mean time until 0.1 m from the target, s
-        "settling_time": round(float(stays.mean()), 3),  # until it stays there, s
+        "time_to_0_1_m": round(float(time_to.mean()), 3),  # s, mean
+        "settling_time": round(float(settling_time.mean()), 3),  # s, mean
         "tracking_reward": round(float(tracking.reward.mean()), 3),  # mean (Eqs. 4.5-4.9)
         "observation_noise": 0.0,
         "seeds": [*seeds],
@@ -140,13 +152,13 @@ def measure_expert(
 
 
 def fresh_cost(metrics: dict[str, Any]) -> float:
-    """What gains cost on fresh episodes, with the same weights, s."""
+    """The cost of gains on fresh episodes, with the same weights, s."""
     lost = LOST * (1.0 - metrics["recovery_survival"])
     return lost + metrics["settling_time"]
 
 
 def main() -> None:
-    """Search, measure, write."""
+    """Search, measure on fresh episodes, write the file."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -162,7 +174,9 @@ def main() -> None:
     parser.add_argument(
         "--episodes", type=int, default=960, help="fresh episodes at the end, of four sets (960)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of the search and its episodes (0)")
+    parser.add_argument(
+        "--seed", type=int, default=0, help="seed of the search and its episodes (0)"
+    )
     options = parser.parse_args()
 
     vehicle = load_vehicle(options.vehicle)
@@ -182,10 +196,9 @@ def main() -> None:
     objective = Objective(vehicle, options.starts, options.targets, options.seed)
 
     def cost(trial: optuna.Trial) -> float:
-        values = {
-            name: trial.suggest_float(name, x / RANGE, x * RANGE, log=True)
-            for name, x in start.items()
-        }
+        values = {}
+        for name, x in start.items():
+            values[name] = trial.suggest_float(name, x / RANGE, x * RANGE, log=True)
         return objective(with_values(first, values))
 
     try:
@@ -197,18 +210,19 @@ def main() -> None:
 
     tried = [first, with_values(first, study.best_params)]
     seeds = row_seeds(seed_for("expert", options.seed), 4)
-    measured = [
-        measure_expert(GeometricExpert(vehicle, each), vehicle, seeds, options.episodes)
-        for each in tried
-    ]
-    for word, metrics in zip(("before", "found"), measured, strict=True):
-        print(f"{word}: {metrics!r}")
-    best = 1 if fresh_cost(measured[1]) < fresh_cost(measured[0]) else 0
-    print(
-        ""
-        if best
-        else "the search found nothing better on fresh episodes: the file keeps the gains that it began with"
-    )
+    measured = []
+    for name, gains in zip(("before", "found"), tried, strict=True):
+        expert = GeometricExpert(vehicle, gains)
+        metrics = measure_expert(expert, vehicle, seeds, options.episodes)
+        measured.append(metrics)
+        print(f"{name}: {metrics!r}")
+    best = 1
+    if fresh_cost(measured[1]) >= fresh_cost(measured[0]):
+        best = 0
+        print(
+            "the search found nothing better on fresh episodes: "
+            "the file keeps the gains that it began with"
+        )
     chosen = tried[best].model_copy(update={"measured": measured[best]})
     tuned = vehicle.model_copy(update={"geometric_gains": chosen})
     output.write_text(

@@ -1,5 +1,7 @@
-"""What every test starts from (the CPU, one thread of torch, fixed seeds, no display), and small
-agents to fly and read.
+"""Common state of all tests (CPU, one PyTorch thread, fixed seeds, no display), and small agents.
+
+``--shuffle SEED`` runs the tests in another order. Where the output is not a terminal, a line each
+minute says how far they are.
 """
 
 import importlib.abc
@@ -9,11 +11,11 @@ import random
 import shutil
 import signal
 import sys
+import threading
 from pathlib import Path
 
-os.environ["CUDA_VISIBLE_DEVICES"] = (
-    ""  # read when torch is imported; the tests are the same on every machine
-)
+# PyTorch reads it when it is imported. Without a GPU the tests are the same on every machine.
+os.environ["CUDA_VISIBLE_DEVICES"] = ""
 os.environ["MPLBACKEND"] = "Agg"
 
 import numpy as np
@@ -31,20 +33,15 @@ settings.register_profile(
 )
 settings.load_profile("default")
 
+# fmt: off
 TINY = [
-    "--n-envs",
-    "16",
-    "-n",
-    "1600",
-    "--eval-episodes",
-    "2",
-    "--eval-freq",
-    "800",
-    "--no-progress",
-    "--num-threads",
-    "1",
+    "--n-envs", "16", "-n", "1600", "--eval-episodes", "2", "--eval-freq", "800",
+    "--no-progress", "--num-threads", "1",
 ]
-HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
+# fmt: on
+
+# By algorithm, settings with which a rollout takes about a second.
+HYPERPARAMS = {
     "dagger": ["n_steps:50", "gradient_steps:2", "batch_size:64"],
     "ppo_bc": ["n_steps:50", "n_epochs:2", "batch_size:400", "critic_warmup:0"],
     "sac_bc": ["learning_starts:100", "buffer_size:2000", "batch_size:64", "gradient_steps:2"],
@@ -52,7 +49,8 @@ HYPERPARAMS = {  # by algorithm, what makes a rollout of it a matter of a second
 
 
 class WithoutPyBullet(importlib.abc.MetaPathFinder):
-    """Where there is no PyBullet, skips what imports it: a test, or a file of them.
+    """Skip a test, or a file of tests, that imports PyBullet where there is none.
+
     test_without_pybullet.py has the rest.
     """
 
@@ -65,21 +63,86 @@ if importlib.util.find_spec("pybullet") is None:
     sys.meta_path.insert(0, WithoutPyBullet())
 
 
-def pytest_configure():
-    """Under nohup, or in a shell's background, signals are ignored, also by the programs that are
-    started from here.
+class Progress:
+    """Report each minute how many tests have run. A terminal shows that by itself.
+
+    Under xdist only the controller reports; it hears of its workers' tests by the same hooks.
     """
-    for number in (signal.SIGINT, getattr(signal, "SIGHUP", signal.SIGINT)):
-        if signal.getsignal(number) is signal.SIG_IGN:
-            signal.signal(
-                number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL
-            )
+
+    def __init__(self, reporter):
+        self._reporter = reporter
+        self._total = 0
+        self._done = 0
+        self._ended = threading.Event()
+
+    def pytest_collection_finish(self, session):
+        self._total = self._total or len(session.items)
+
+    @pytest.hookimpl(optionalhook=True)
+    def pytest_xdist_node_collection_finished(self, ids):
+        self._total = len(ids)
+
+    def pytest_runtestloop(self):
+        threading.Thread(target=self._report, daemon=True).start()
+
+    def pytest_runtest_logfinish(self):
+        self._done += 1
+
+    def pytest_sessionfinish(self):
+        self._ended.set()
+
+    def _report(self):
+        while not self._ended.wait(60):
+            stats = self._reporter.stats
+            failed = len(stats.get("failed", ())) + len(stats.get("error", ()))
+            # The line before it is one of dots, which has not ended.
+            self._reporter.write_line(f"\n{self._done} of {self._total} tests, {failed} failed")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run the tests in another order")
+
+
+def pytest_configure():
+    """Under nohup, or in a shell's background, signals are ignored, also by the programs that the
+    tests start. Restore them.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    hangup = getattr(signal, "SIGHUP", None)  # Windows has none
+    if hangup is not None and signal.getsignal(hangup) is signal.SIG_IGN:
+        signal.signal(hangup, signal.SIG_DFL)
+
+
+def pytest_sessionstart(session):
+    is_worker = hasattr(session.config, "workerinput")
+    if not is_worker and not sys.stdout.isatty():
+        plugins = session.config.pluginmanager
+        plugins.register(Progress(plugins.get_plugin("terminalreporter")))
+
+
+def pytest_collection_modifyitems(config, items):
+    """Shuffle the files, and the tests of each file: the tests of a file share its fixtures."""
+    seed = config.getoption("--shuffle")
+    if seed is None:
+        return
+    generator = random.Random(seed)
+    by_file = {}
+    for item in items:
+        by_file.setdefault(item.path, []).append(item)
+    files = list(by_file.values())
+    generator.shuffle(files)
+    items.clear()
+    for tests in files:
+        generator.shuffle(tests)
+        items.extend(tests)
 
 
 @pytest.fixture(autouse=True)
 def same_start(monkeypatch):
-    """Sums come out the same on any number of cores, global generators start from the same seed,
-    closing tables are small.
+    """Start each test from the same state.
+
+    With one thread, sums come out the same on any number of cores. Closing tables are small.
     """
     torch.set_num_threads(1)
     random.seed(0)
@@ -89,35 +152,28 @@ def same_start(monkeypatch):
     monkeypatch.setattr("sb3_quad.cli.closing.PIPELINE_EPISODES", 4)
 
 
-def _trained(algo: str, folder: Path) -> Path:
+def _train(algo: str, folder: Path) -> Path:
     from sb3_quad.cli import main
 
-    command = [
-        "train",
-        "--algo",
-        algo,
-        "--env",
-        "QuadStateRecovery-v0",
-        "--conf-file",
-        f"nominal/{algo}.yml",
-        "--seed",
-        "3",
-    ]
-    assert main([*command, "-f", str(folder), *TINY, "--hyperparams", *HYPERPARAMS[algo]]) == 0
+    command = ["train", "--algo", algo, "--env", "QuadStateRecovery-v0"]
+    command += ["--conf-file", f"nominal/{algo}.yml", "--seed", "3", "-f", str(folder)]
+    assert main([*command, *TINY, "--hyperparams", *HYPERPARAMS[algo]]) == 0
     return folder / algo / "QuadStateRecovery-v0_1"
 
 
 @pytest.fixture(scope="session")
 def trained_runs(tmp_path_factory):
-    """By an algorithm's name, the folder of a tiny run of it, trained when it is first asked for;
-    to be read, not written.
+    """A function from an algorithm's name to the folder of a tiny run, trained on first use.
+
+    The folder is shared: read it, and do not write there.
     """
-    folder, found = tmp_path_factory.mktemp("logs"), {}
+    folder = tmp_path_factory.mktemp("logs")
+    runs = {}
 
     def run(algo: str) -> Path:
-        if algo not in found:
-            found[algo] = _trained(algo, folder)
-        return found[algo]
+        if algo not in runs:
+            runs[algo] = _train(algo, folder)
+        return runs[algo]
 
     return run
 
@@ -132,21 +188,23 @@ def dagger_run(trained_runs, tmp_path):
 
 @pytest.fixture(scope="session")
 def results_folder(tmp_path_factory):
-    """The results of evaluating two experts on a suite of two short scenarios; to be read, not
-    written.
+    """The results of evaluating two experts on a suite of two short scenarios.
+
+    The folder is shared: read it, and do not write there.
     """
     from sb3_quad.cli import main
 
     folder = tmp_path_factory.mktemp("results")
     suite = folder / "small.yaml"
-    hover = "{name: hover, duration: 0.5, episodes: 3}"
-    far = "{name: far, target: [1, 0, 15], duration: 1, episodes: 2}"
-    suite.write_text(f"{{name: small, scenarios: [{hover}, {far}]}}")
-    out = folder / "out"
-    assert (
-        main(["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out), "--no-report"])
-        == 0
+    suite.write_text(
+        "name: small\n"
+        "scenarios:\n"
+        "- {name: hover, duration: 0.5, episodes: 3}\n"
+        "- {name: far, target: [1, 0, 15], duration: 1, episodes: 2}\n"
     )
+    out = folder / "out"
+    command = ["evaluate", "pid", "geometric", "--suite", str(suite), "-o", str(out)]
+    assert main([*command, "--no-report"]) == 0
     return out
 
 

@@ -172,7 +172,7 @@ def test_a_run_of_a_configuration_file_follows_what_best_model_logs(tmp_path):
     [
         (DAgger, ("bta", 1.0, 0.0), "did you mean 'beta'"),
         (DAgger, ("beta", 1.0, -0.5), "a probability"),
-        (DAgger, ("n_steps", 1.0, 0.0), "n_steps of DAgger is 10, which is no float"),
+        (DAgger, ("n_steps", 1.0, 0.0), "n_steps of DAgger is 10, which is not a float"),
         (PPO, ("bc_coef", 1.0, 0.0), "unknown coefficient of PPO 'bc_coef'"),
         (PPOBC, ("bc_coef", 1.0, -1.0), "at least 0"),
     ],

@@ -1,6 +1,4 @@
-"""The Python of the README and of docs/ runs as it stands there; the fast tests shorten its
-trainings.
-"""
+"""The Python code of README and docs/ runs unchanged; the fast tests shorten its trainings."""
 
 import re
 import runpy
@@ -17,7 +15,8 @@ from sb3_quad.controllers.resolve import resolve_expert
 from sb3_quad.evaluation.flights import fly
 
 ROOT = Path(__file__).resolve().parent.parent
-ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or by what it is
+# Page and number of blocks that cannot simply be run, and why, or which test runs them.
+ELSEWHERE = {
     ("docs/evaluate.md", 0): "reads the folder of a whole evaluation",
     ("docs/export.md", 0): "tests/test_export.py",
     ("docs/export.md", 1): "tests/test_export.py",
@@ -30,8 +29,8 @@ ELSEWHERE = {  # page and number of a block that cannot simply be run: why, or b
 def python_blocks(page: str) -> list[str]:
     """The code of a page's Python blocks, in order, each on the lines that it has in the page."""
     text = (ROOT / page).read_text(encoding="utf-8")
-    found = re.finditer(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
-    return ["\n" * text.count("\n", 0, match.start(1)) + match.group(1) for match in found]
+    blocks = re.finditer(r"^```python\n(.*?)^```", text, flags=re.DOTALL | re.MULTILINE)
+    return ["\n" * text.count("\n", 0, match.start(1)) + match.group(1) for match in blocks]
 
 
 NAMES = [
@@ -49,7 +48,7 @@ TO_RUN = [
 
 
 def run(page: str) -> dict[str, object]:
-    """Run a page's blocks in order, in one namespace, in the present folder; the namespace."""
+    """Run a page's blocks in order, in the current folder. Returns their namespace."""
     scope: dict[str, object] = {"__name__": page}
     for number, code in enumerate(PAGES[page]):
         if (page, number) not in ELSEWHERE:
@@ -64,23 +63,23 @@ def folder(tmp_path, monkeypatch):
 
 
 def shorten_trainings(monkeypatch, rollouts=1):
-    """Trainings end after so many rollouts. A list of them: how long they were to be, and the
-    weights that they end with.
+    """End each training after some rollouts.
+
+    :returns: a list that gets the intended length and the final weights of each training.
     """
-    learn, trained = OnPolicyAlgorithm.learn, []
+    learn = OnPolicyAlgorithm.learn
+    trained = []
 
     def short(self, total_timesteps, *args, **kwargs):
         size = min(total_timesteps, rollouts * self.n_steps * self.n_envs)
         learn(self, size, *args, **{**kwargs, "progress_bar": False})
-        trained.append(
-            (total_timesteps, [each.tolist() for each in self.policy.state_dict().values()])
-        )
+        weights = [tensor.tolist() for tensor in self.policy.state_dict().values()]
+        trained.append((total_timesteps, weights))
         return self
 
     monkeypatch.setattr(OnPolicyAlgorithm, "learn", short)
-    monkeypatch.setattr(
-        sb3_quad.algorithms.offset_correction, "correct_offset", lambda model: None
-    )  # which needs an agent that flies
+    # An offset can be corrected only if the agent flies; after one rollout it does not.
+    monkeypatch.setattr(sb3_quad.algorithms.offset_correction, "correct_offset", lambda model: None)
     return trained
 
 
@@ -94,22 +93,25 @@ def shown_output(page):
 
 
 def check_output(page, output):
-    """A page shows what its code prints, to within what another seed changes; stage two recovers
-    more often.
+    """Check that a page shows what its code prints, up to what another seed changes.
+
+    The agent of PPO must recover more often than the one of DAgger.
     """
-    shown, number = shown_output(page), re.compile(r"\d+\.\d+")
+    number = re.compile(r"\d+\.\d+")
+    shown = shown_output(page)
     assert number.sub("#", shown) in number.sub("#", output)
-    ours, theirs = (
-        [[float(each) for each in number.findall(line)] for line in text.splitlines()]
-        for text in (output, shown)
-    )
-    for (survival, error), (shown_survival, shown_error) in zip(
-        [line for line in ours if len(line) == 2], theirs, strict=True
-    ):
-        assert survival == pytest.approx(shown_survival, abs=5.0) and error == pytest.approx(
-            shown_error, abs=0.02
-        )
-    assert theirs[-2][0] + 20 < theirs[-1][0]
+    printed = []
+    for line in output.splitlines():
+        values = [float(value) for value in number.findall(line)]
+        if len(values) == 2:
+            printed.append(values)
+    expected = []
+    for line in shown.splitlines():
+        expected.append([float(value) for value in number.findall(line)])
+    for (survival, error), (shown_survival, shown_error) in zip(printed, expected, strict=True):
+        assert survival == pytest.approx(shown_survival, abs=5.0)
+        assert error == pytest.approx(shown_error, abs=0.02)
+    assert expected[-2][0] + 20 < expected[-1][0]
 
 
 def check_readme(scope):
@@ -164,12 +166,14 @@ def test_a_page_gives_what_it_says(page, capsys):
 
 
 @pytest.mark.slow
-def test_pages_and_examples_train_the_same_stages_and_show_the_same(monkeypatch):
-    """Of which one trains in full, above. After three rollouts the actor has learnt, too."""
-    trained, shown = shorten_trainings(monkeypatch, rollouts=3), {}
+def test_pages_and_examples_train_the_same_agents_and_show_the_same(monkeypatch):
+    """The test above trains one of them in full. After three rollouts the actor has learnt, too."""
+    trained = shorten_trainings(monkeypatch, rollouts=3)
+    shown = {}
     for page in ("README.md", "docs/ppo_bc.md"):
         scope, shown[page] = run(page), re.findall(r"\d+\.\d+", shown_output(page))[-4:]
-    assert scope["model"].num_timesteps == 3 * 60_000 + 60_000  # the second page goes on
+    # The second page continues the training.
+    assert scope["model"].num_timesteps == 3 * 60_000 + 60_000
     del trained[4:]
     for script in (["train_dagger.py"], ["train_ppo_bc.py", "dagger.zip"]):
         monkeypatch.setattr(sys, "argv", script)

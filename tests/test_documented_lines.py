@@ -1,6 +1,4 @@
-"""Every `sb3-quad` line of README, docs/ and --help runs, on one small rollout and a few flights of
-a second.
-"""
+"""Every `sb3-quad` line of README, docs/ and --help runs, with one small rollout or short flights."""
 
 import re
 import shlex
@@ -22,24 +20,28 @@ from sb3_quad.training import pipeline
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
-PENDULUM = "Pendulum-v1: {policy: MlpPolicy, n_timesteps: 100, n_steps: 100, batch_size: 50, gradient_steps: 2}"
-ELSEWHERE = {  # parts of lines that are not run here: where they are, or why
+PENDULUM = """
+Pendulum-v1:
+  policy: MlpPolicy
+  n_timesteps: 100
+  n_steps: 100
+  batch_size: 50
+  gradient_steps: 2
+"""
+# Parts of lines that are not run here: which test runs them, or why nothing does.
+ELSEWHERE = {
     "--executor ray": "tests/test_ray.py",
     "--resume": "tests/test_runs.py",
     "--track": "tests/test_tracking.py",
     "my_experts:": "tests/test_docs.py",
-    "my_package.control:make": "a module of the user's",
+    "my_package.control:make": "a module of the reader",
     "$RUNS": "agents of a sweep of an hour and a half",
-    "…": "a line in short",
+    "…": "an abbreviated line",
 }
 EVALUATED = ["--eval-env-kwargs", "max_episode_steps:100", "--no-progress"]
-SHORTER = {  # flags that a command is given beside those that stand there
-    "evaluate": [
-        "--episodes",
-        "2",
-        "--overwrite",
-        "--no-report",
-    ],  # a report is written for the lines of report
+# Flags that a command gets in addition to its own. Reports are written for the lines of `report`.
+SHORTER = {
+    "evaluate": ["--episodes", "2", "--overwrite", "--no-report"],
     "enjoy": ["-n", "20", "--overwrite"],
     "export": ["--overwrite"],
     "sweep": ["--dry-run"],
@@ -50,6 +52,7 @@ SHORTER = {  # flags that a command is given beside those that stand there
     "benchmark": ["--seconds", "0.02", "--sizes", "8", "--n-envs", "1"],
     "check-vehicle": ["-n", "2"],
 }
+# Upper bounds of settings.
 SMALL = {
     "n_timesteps": 960,
     "n_envs": 48,
@@ -58,20 +61,21 @@ SMALL = {
     "n_epochs": 2,
     "gradient_steps": 4,
 }
+NOT_FOR_ONE_ROLLOUT = {
+    "require",
+    "correct_offset",
+    "position_scale",
+    "overshoot_cost",
+    "correction_env_kwargs",
+    "correction_rounds",
+}
 FLOWN = 100  # control steps, at most
-WITHOUT = (
-    "-n",
-    "--n-trials",
-    "--max-total-trials",
-    "--sizes",
-    "-P",
-)  # flags that SHORTER gives, or that need a screen
+# Flags that are removed: SHORTER gives them, or they need a screen.
+WITHOUT = ("-n", "--n-trials", "--max-total-trials", "--sizes", "-P")
 
 
 def documented() -> list[str]:
-    """Lines of shell blocks and of the commands' help, less remarks and folders of modules; each
-    once.
-    """
+    """Collect the lines of shell blocks and of --help, without comments and repetitions."""
     found = []
     for page in PAGES:
         for language, block in re.findall(
@@ -94,7 +98,7 @@ LINES = [line for line in documented() if not any(part in line for part in ELSEW
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory, trained_runs):
-    """What the lines read: runs, agents, files of the user's."""
+    """A folder with what the lines read: runs, agents, files of the reader."""
     place = tmp_path_factory.mktemp("documented")
     for name in ("agent.zip", "path/to/agent.zip"):
         (place / name).parent.mkdir(parents=True, exist_ok=True)
@@ -133,37 +137,31 @@ def folder(tmp_path_factory, trained_runs):
 
 
 def shorter(content):
-    """Settings with one small rollout and small grids; no requirement and no trim, which an agent
-    of one rollout fails.
+    """Return settings with one small rollout and small grids.
+
+    An agent of one rollout would fail requirements and offset corrections, so there are none.
     """
+    if isinstance(content, list):
+        return [shorter(entry) for entry in content]
     if not isinstance(content, dict):
-        return [shorter(each) for each in content] if isinstance(content, list) else content
-    kept = {
-        key: shorter(value)
-        for key, value in content.items()
-        if key
-        not in (
-            "require",
-            "correct_offset",
-            "position_scale",
-            "overshoot_cost",
-            "correction_env_kwargs",
-            "correction_rounds",
-        )
-    }
+        return content
+    kept = {}
+    for key, value in content.items():
+        if key not in NOT_FOR_ONE_ROLLOUT:
+            kept[key] = shorter(value)
     if isinstance(kept.get("vary"), dict):
         kept["vary"] = {key: values[:2] for key, values in kept["vary"].items()}
-    return kept | {
-        key: min(kept[key], most) for key, most in SMALL.items() if isinstance(kept.get(key), int)
-    }
+    for key, most in SMALL.items():
+        if isinstance(kept.get(key), int):
+            kept[key] = min(kept[key], most)
+    return kept
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("line", LINES)
 def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
-    command, *arguments = shlex.split(
-        line.replace("--n-envs 8", "--n-envs 2")
-    )  # each may be a process
+    # Each environment may be a process of its own.
+    command, *arguments = shlex.split(line.replace("--n-envs 8", "--n-envs 2"))
     read, longest = YamlFolder.read, FlightSettings.longest_episode.fget
     monkeypatch.setattr(
         YamlFolder,
@@ -171,9 +169,8 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
         lambda self, source: (shorter(read(self, source)[0]), read(self, source)[1]),
     )
     monkeypatch.setattr(load, "parse_yaml", lambda text, where: shorter(parse_yaml(text, where)))
-    monkeypatch.setattr(
-        evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1)
-    )  # processes would fly longer
+    # Worker processes would not see the patches below.
+    monkeypatch.setattr(evaluate, "start_executor", lambda *options: ThreadPoolExecutor(1))
     monkeypatch.setattr(
         FlightSettings, "longest_episode", property(lambda self: min(longest(self), FLOWN))
     )
@@ -183,30 +180,18 @@ def test_a_documented_line_runs(line, folder, monkeypatch, capsys):
     monkeypatch.syspath_prepend(ROOT / "examples")
     monkeypatch.chdir(folder)
     while any(flag in arguments for flag in WITHOUT):
-        first = next(place for place, each in enumerate(arguments) if each in WITHOUT)
+        first = min(arguments.index(flag) for flag in WITHOUT if flag in arguments)
         del arguments[first : first + 1 + (arguments[first] != "-P")]
         while first < len(arguments) and arguments[first].isdigit():
             del arguments[first]
-    screen = (
-        []
-        if command != "enjoy" or "-o" in arguments or "--no-render" in arguments
-        else ["--no-render"]
-    )
+    screen = []
+    if command == "enjoy" and "-o" not in arguments and "--no-render" not in arguments:
+        screen = ["--no-render"]
     if command == "report":
-        main(
-            [
-                "evaluate",
-                "pid",
-                "--suite",
-                "quick",
-                "--episodes",
-                "2",
-                "-o",
-                arguments[0],
-                "--overwrite",
-            ]
-        )
-        arguments += [] if "--overwrite" in arguments else ["--overwrite"]
+        flags = ["--suite", "quick", "--episodes", "2", "-o", arguments[0], "--overwrite"]
+        main(["evaluate", "pid", *flags])
+        if "--overwrite" not in arguments:
+            arguments.append("--overwrite")
     assert main([command, *arguments, *screen, *SHORTER.get(command, [])]) == 0, (
         capsys.readouterr().err
     )

@@ -90,7 +90,7 @@ def test_other_environments_and_numbers_are_refused():
         FlightMetrics(tolerance=0.0)
     with pytest.raises(ConfigError, match="window 0"):
         FlightMetrics(window=0)
-    with pytest.raises(ConfigError, match="no quadcopter"):
+    with pytest.raises(ConfigError, match="not a quadcopter"):
         PPO("MlpPolicy", "Pendulum-v1", n_steps=10, batch_size=10, **small()).learn(
             10, callback=FlightMetrics()
         )

@@ -1,5 +1,6 @@
-"""The notebooks of docs/notebooks run from top to bottom, with few and short episodes and one
-rollout of each training.
+"""The notebooks of docs/notebooks run from top to bottom.
+
+Episodes are few and short, and each training has one rollout.
 """
 
 import re
@@ -18,7 +19,7 @@ PARAMETERS = re.compile(
 
 
 def shortened(text):
-    """The code with 2 for each number of its cell of parameters, which is that of papermill."""
+    """Replace each number in the cell of parameters (papermill's) by 2."""
     (cell,) = PARAMETERS.findall(text)
     return text.replace(cell, re.sub(r"(?m)^([A-Z]+) = [\d_]+", r"\1 = 2", cell))
 
@@ -26,7 +27,8 @@ def shortened(text):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_runs(name, tmp_path, monkeypatch):
-    text, drawn = NOTEBOOKS[name].read_text(encoding="utf-8"), []
+    text = NOTEBOOKS[name].read_text(encoding="utf-8")
+    drawn = []
 
     def show():
         plt.gcf().draw_without_rendering()
@@ -36,9 +38,8 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(plt, "show", show)
     monkeypatch.setattr(FlightSettings, "longest_episode", 100)
-    monkeypatch.setattr(
-        "sb3_quad.algorithms.offset_correction.correct_offset", lambda model: None
-    )  # which needs an agent that flies
+    # An offset can be corrected only if the agent flies; after one rollout it does not.
+    monkeypatch.setattr("sb3_quad.algorithms.offset_correction.correct_offset", lambda model: None)
     with plt.rc_context():
         exec(compile(shortened(text), str(NOTEBOOKS[name]), "exec"), {"__name__": name})
     assert drawn and all(figure.axes for figure in drawn)
@@ -46,9 +47,7 @@ def test_a_notebook_runs(name, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", NOTEBOOKS)
 def test_a_notebook_is_in_jupytexts_form(name):
-    """Its head names the form and the kernel, its first cell is its title, and its numbers are
-    shortened by the test above.
-    """
+    """The head names form and kernel, the first cell is the title; the numbers can be shortened."""
     text = NOTEBOOKS[name].read_text(encoding="utf-8")
     _, head, cells = text.split("# ---\n", 2)
     assert "format_name: percent" in head and "name: python3" in head

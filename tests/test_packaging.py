@@ -1,4 +1,4 @@
-"""The package as others get it: built, installed in an environment of its own, used from anywhere."""
+"""The package as others get it: built, installed into an empty environment, used from anywhere."""
 
 import ast
 import configparser
@@ -20,12 +20,8 @@ import sb3_quad
 ROOT = Path(__file__).resolve().parent.parent
 CODE = ("sb3_quad", "envs", "callbacks", "zoo_configs")
 DATA = {".yaml", ".yml", ".typed", ".j2", ".css", ".js", ".md", ".zip"}
-APART = (
-    "zoo",
-    "ray",
-    "track",
-    "pybullet",
-)  # extras in the environment of make test-zoo, and one that most have anyway
+# Extras in the environments of make test-zoo and make docs, and one that most have anyway.
+APART = {"zoo", "ray", "track", "docs", "pybullet"}
 HEAVY = ("torch", "pybullet", "numba", "stable_baselines3", "matplotlib")
 
 
@@ -63,10 +59,20 @@ def package_folders():
 
 
 def requirements(text):
-    """The names in lines such as ``rl_zoo3[plots]>=2.9``."""
-    return {
-        re.split(r"[\[>=;]", line)[0].strip().lower() for line in text.splitlines() if line.strip()
-    }
+    """The names in lines such as ``rl_zoo3[plots]>=2.9``, without this package's own."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    names = {re.split(r"[\[>=;]", line)[0].strip().lower() for line in lines}
+    return names - {"sb3_quad"}
+
+
+def extra_requirements(options, extra):
+    """The names that an extra installs, those of the extras that it names included."""
+    text = options["options.extras_require"][extra]
+    names = requirements(text)
+    for listed in re.findall(r"sb3_quad\[([\w,]+)\]", text):
+        for other in listed.split(","):
+            names |= extra_requirements(options, other)
+    return names
 
 
 @pytest.fixture(scope="module")
@@ -182,10 +188,9 @@ def test_each_dependency_is_pinned(options):
 
 
 def test_the_extra_for_developers_holds_all_but_those_apart(options):
-    extras = {name: requirements(text) for name, text in options["options.extras_require"].items()}
-    assert extras["dev"] >= set().union(
-        *(extras[name] for name in extras if name not in ("dev", *APART))
-    ) - {"torch"}
+    extras = {name: extra_requirements(options, name) for name in options["options.extras_require"]}
+    for name in extras.keys() - APART:
+        assert extras["dev"] >= extras[name], name
     assert "moviepy" in extras["video"]  # Gymnasium's RecordVideo imports it
     page, tried = (
         (ROOT / name).read_text(encoding="utf-8") for name in ("docs/installation.md", ".ci/extras")
@@ -223,9 +228,9 @@ def test_what_the_code_imports_is_declared(options):
         "sb3_contrib": "sb3-contrib",
     }
     brought = {"llvmlite": "numba", "pybullet_data": "pybullet", "typing_extensions": "torch"}
-    extras = [text for name, text in options["options.extras_require"].items() if name != "dev"]
-    wanted = "\n".join([options["options"]["install_requires"], *extras])
-    declared = requirements(wanted)
+    declared = requirements(options["options"]["install_requires"])
+    for name in options["options.extras_require"].keys() - {"tests", "docs", "dev"}:
+        declared |= extra_requirements(options, name)
     for path in (path for name in CODE for path in (ROOT / name).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
@@ -272,10 +277,12 @@ def test_no_data_file_is_outside_a_package():
 def test_the_wheel_works_from_another_folder(installed, tmp_path):
     code = """
 import importlib, importlib.resources, json, pkgutil, sys, sb3_quad
-names = [found.name for found in pkgutil.walk_packages(sb3_quad.__path__, "sb3_quad.") if "__main__" not in found.name]
+modules = pkgutil.walk_packages(sb3_quad.__path__, "sb3_quad.")
+names = [module.name for module in modules if "__main__" not in module.name]
 for name in names: importlib.import_module(name)
 configs = importlib.resources.files("sb3_quad.zoo_configs")
-print(json.dumps([names, [sys.modules[name].__file__ for name in names], configs.joinpath("dagger.yml").read_text()]))
+files = [sys.modules[name].__file__ for name in names]
+print(json.dumps([names, files, configs.joinpath("dagger.yml").read_text()]))
 """
     names, files, config = json.loads(
         run(installed / "python", "-c", code, cwd=tmp_path).splitlines()[-1]
@@ -301,17 +308,7 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
     The closing tables are of few episodes, and PyTorch has one thread: its others only wait for
     each other here.
     """
-    algo = [
-        "--algo",
-        "dagger",
-        "--num-threads",
-        "1",
-        "-n",
-        "1600",
-        "--n-envs",
-        "16",
-        "--eval-episodes",
-    ]
+    algo = "--algo dagger --num-threads 1 -n 1600 --n-envs 16 --eval-episodes".split()
     small = ["--seed", "0", "--hyperparams", "n_steps:50", "gradient_steps:5", "batch_size:256"]
     search = ["--n-trials", "2", "--n-evaluations", "1", "--search-space", "space.yml"]
     zip_file, best = (
@@ -326,7 +323,10 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
         ["train", *algo, "0", "--conf-file", best],
     ]
     (tmp_path / "space.yml").write_text("learning_rate: {low: 1.0e-3, high: 1.0e-2, log: true}\n")
-    code = f"from sb3_quad.cli import closing, main; closing.FRESH_EPISODES = 4; assert not any(map(main, {commands!r}))"
+    code = (
+        "from sb3_quad.cli import closing, main; closing.FRESH_EPISODES = 4; "
+        f"assert not any(map(main, {commands!r}))"
+    )
     run(installed / "python", "-c", code, cwd=tmp_path)
     for path in (Path(Path(zip_file).name).with_suffix(".onnx"), Path("pretrained.pt")):
         assert (tmp_path / path).stat().st_size > 10_000
@@ -336,7 +336,10 @@ def test_the_wheel_trains_exports_and_tunes(installed, tmp_path):
 def test_the_installed_package_works_from_the_checkout(installed):
     """There the checkout's sb3_quad/ comes first, whose envs/ and the like lie beside it."""
     assert "train" in run(installed / "python", "-m", "sb3_quad.cli", "--help", cwd=ROOT)
-    code = "import sb3_quad.envs.registration as r, sb3_quad.callbacks, sb3_quad.zoo_configs.thesis; print(r.__file__)"
+    code = (
+        "import sb3_quad.envs.registration as r, sb3_quad.callbacks, sb3_quad.zoo_configs.thesis; "
+        "print(r.__file__)"
+    )
     assert run(installed / "python", "-c", code, cwd=ROOT).strip() == str(
         ROOT / "envs" / "registration.py"
     )

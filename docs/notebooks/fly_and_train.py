@@ -34,9 +34,9 @@ from sb3_quad.report.plots import STYLE
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 
 # %% tags=["parameters"]
-EPISODES = 480  # of each comparison
-IMITATION = 600_000  # timesteps of stage one
-REINFORCEMENT = 3_000_000  # timesteps of stage two
+EPISODES = 480  # episodes of each comparison
+IMITATION = 600_000  # timesteps of DAgger
+REINFORCEMENT = 3_000_000  # timesteps of PPO
 
 # %% [markdown]
 # ## Fly
@@ -57,30 +57,24 @@ def recorded(controller, n=24, seed=7):
 
 # %% tags=["hide-input"]
 def plot_recoveries(controllers):
-    """Tilt and distance from the target over time, one column for each controller; a cross where a
-    flight is lost.
-    """
-    _, axes = plt.subplots(
-        2, len(controllers), figsize=(4.2 * len(controllers), 4.6), sharex=True, sharey="row"
-    )
-    for (top, bottom), (name, controller), colour in zip(
-        axes.T, controllers.items(), COLOURS, strict=False
-    ):
+    """Plot tilt and distance from the target over time, with a cross where a flight ends early."""
+    n = len(controllers)
+    _, axes = plt.subplots(2, n, figsize=(4.2 * n, 4.6), sharex=True, sharey="row")
+    for number, (name, controller) in enumerate(controllers.items()):
+        top, bottom = axes[:, number]
+        colour = COLOURS[number]
         flights = recorded(controller)
+        times = flights["time"]
         _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
-        tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1)))  # of the body's z axis
+        # The angle between the body's z axis and the vertical.
+        tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1)))
         distance = np.linalg.norm(flights["position"] - flights["target"], axis=-1)
         for panel, values in ((top, tilt), (bottom, distance)):
-            panel.plot(flights["time"], values.T, color=colour, alpha=0.55, linewidth=1)
+            panel.plot(times, values.T, color=colour, alpha=0.55, linewidth=1)
             for row, samples in zip(values, flights["samples"], strict=True):
-                if samples < len(flights["time"]):
-                    panel.plot(
-                        flights["time"][samples - 1],
-                        row[samples - 1],
-                        "x",
-                        color="#1c2430",
-                        markersize=5,
-                    )
+                if samples < len(times):
+                    last = samples - 1
+                    panel.plot(times[last], row[last], "x", color="#1c2430", markersize=5)
         top.set_title(name, loc="left", fontweight="bold")
         bottom.set(xlabel="time (s)", xlim=(0, 6))
     axes[0, 0].set(ylabel="tilt (deg)", yticks=[0, 45, 90, 135, 180])
@@ -97,13 +91,14 @@ plot_recoveries(
 )
 
 # %% [markdown]
-# Each line is a flight, each cross the end of one. The PID controller linearises at hover, and
-# loses most flights that begin upside down. The agent has learnt to turn over first.
+# Each line is a flight, each cross a crash or a flight that got out of range. The PID controller
+# assumes small angles, and crashes on most flights that begin upside down. The agent has learnt to
+# turn over first.
 #
-# ## Stage one: imitate
+# ## Imitate
 #
-# `DAgger` lets the policy fly and asks the expert what it would have done in each state. It is used
-# as any algorithm of Stable-Baselines3 is. `QuadcopterVecEnv` flies all its quadcopters in one
+# `DAgger` lets the policy fly and asks the expert what it would have done in each state. You use it
+# like any algorithm of Stable-Baselines3. `QuadcopterVecEnv` flies all its quadcopters in one
 # compiled call.
 
 # %%
@@ -126,11 +121,12 @@ imitation.learn(IMITATION)
 imitation.save("imitation")
 
 # %% [markdown]
-# ## Stage two: go beyond the expert
+# ## Go beyond the expert
 #
-# `PPOBC` is PPO with a cloning term that keeps the policy near the expert. `bc_filter="agreement"`
-# leaves out the states in which the agent recovers and the PID would do otherwise. The callback
-# notes the mean reward of the last episodes, as any callback of Stable-Baselines3 can.
+# `PPOBC` is PPO with a cloning term that keeps the policy near the expert. With
+# `bc_filter="agreement"` the term ignores states in which the agent recovers and the PID would do
+# something else. The callback records the mean reward of the last episodes, as any callback of
+# Stable-Baselines3 can.
 
 
 # %%
@@ -145,7 +141,8 @@ class RewardCurve(BaseCallback):
 
     def _on_rollout_end(self):
         rewards = [episode["r"] for episode in self.model.ep_info_buffer]
-        self.points.append((self.num_timesteps, np.mean(rewards) if rewards else np.nan))
+        mean = np.mean(rewards) if rewards else np.nan
+        self.points.append((self.num_timesteps, mean))
 
 
 agent = PPOBC(
@@ -182,18 +179,18 @@ timesteps, rewards = np.array(curve.points).T
 figure, axes = plt.subplots(figsize=(6.4, 3))
 axes.plot(timesteps / 1e6, rewards, color=COLOURS[0])
 axes.set(
-    xlabel="million timesteps of stage two",
+    xlabel="million timesteps",
     ylabel="mean reward of an episode",
     title="Learning curve",
 )
 plt.show()
 
 # %% [markdown]
-# The first points are those of few and short episodes. After two rollouts, in which only the critic
-# learns, the policy gets better.
+# The first points come from few and short episodes. In the first two rollouts only the critic
+# learns. Then the policy gets better.
 #
-# A policy that hovers beside its target is corrected without training: `correct_offset` measures the offset
-# and takes it out of the first layer.
+# A policy may hover at a small offset from its target. You can correct it without training:
+# `correct_offset` measures the offset and takes it out of the first layer.
 
 # %%
 correct_offset(agent)
@@ -202,18 +199,19 @@ agent.save("my_agent")
 # %% [markdown]
 # ## Who recovers
 #
-# All three fly the same fresh episodes, which no training has seen.
+# All three fly the same fresh episodes. No training has seen them.
 
 # %%
-stages = {"PID expert": PIDExpert(), "stage one, DAgger": imitation, "stage two, PPO+BC": agent}
-recoveries = {
-    name: fly(each, "state_recovery", EPISODES, seed=1000) for name, each in stages.items()
-}
-targets = {name: fly(each, "target_tracking", EPISODES, seed=1000) for name, each in stages.items()}
-for name in stages:
-    survival, error = recoveries[name].survival.mean(), np.median(targets[name].final_error)
+controllers = {"PID expert": PIDExpert(), "imitation agent": imitation, "RL agent": agent}
+recoveries = {}
+for name, controller in controllers.items():
+    recoveries[name] = fly(controller, "state_recovery", EPISODES, seed=1000)
+    targets = fly(controller, "target_tracking", EPISODES, seed=1000)
+    survival = recoveries[name].survival.mean()
+    error = np.median(targets.final_error)
     print(
-        f"{name:18} {survival:6.1%} of recoveries survive; median final error of targets 10 m away {error:.3f} m"
+        f"{name:16} {survival:6.1%} of recoveries survive; "
+        f"median final error of targets 10 m away {error:.3f} m"
     )
 
 # %% tags=["hide-input"]
@@ -233,11 +231,11 @@ axes.legend(loc="lower right")
 plt.show()
 
 # %%
-plot_recoveries(stages)
+plot_recoveries(controllers)
 
 # %% [markdown]
 # ## Further
 #
-# `my_agent.zip` is a zip of stock `PPO`. The same two stages with more timesteps, evaluations,
-# snapshots and a table at the end are one command: `sb3-quad train --thesis`. `sb3-quad demo
-# my_agent.zip pid` writes a page in which you throw your own agent about.
+# Stock `PPO` loads `my_agent.zip`. One command does both trainings with more timesteps,
+# evaluations, snapshots and a table at the end: `sb3-quad train --thesis`. `sb3-quad demo
+# my_agent.zip pid` writes a page on which you can throw your own agent.

@@ -14,7 +14,8 @@
 # # Your own expert and reward
 #
 # The experts of the package hurry. Suppose your quadcopter carries a cup of coffee: it should fly
-# slowly and hardly tilt. An expert of your own says so by example, a reward of your own by a price.
+# slowly and hardly tilt. With your own expert you say so by example, with your own reward by a
+# price.
 
 # %%
 import matplotlib.pyplot as plt
@@ -35,7 +36,7 @@ from sb3_quad.simulation.state import TARGET, QuadcopterState
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 
 # %% tags=["parameters"]
-EPISODES = 240  # of each comparison
+EPISODES = 240  # episodes of each comparison
 IMITATION = 900_000  # timesteps that the agent imitates
 REINFORCEMENT = 600_000  # timesteps that another learns from the reward
 
@@ -43,8 +44,8 @@ REINFORCEMENT = 600_000  # timesteps that another learns from the reward
 # ## An expert
 #
 # An expert has `actions(state)`: for the true state of n vehicles it returns n rows of four rotor
-# thrusts in [-1, 1]. Here the geometric controller of the package does the work, and only ever sees
-# a target close ahead. The nearer that target, the slower it flies.
+# thrusts in [-1, 1]. Here the geometric controller of the package does the work. It sees only a
+# target close ahead, and the nearer that target is, the slower it flies.
 
 
 # %%
@@ -53,7 +54,8 @@ class UnhurriedExpert(Expert):
 
     def __init__(self, vehicle="itm", reach=0.6):
         super().__init__(vehicle)
-        self.reach, self.controller = reach, GeometricExpert(vehicle)
+        self.reach = reach
+        self.controller = GeometricExpert(vehicle)
 
     def actions(self, state):
         """Float32 (n, 4), for the true state of n vehicles."""
@@ -67,7 +69,7 @@ class UnhurriedExpert(Expert):
 # %% [markdown]
 # ## Does it do what you want
 #
-# Everything that flies is asked in the same way, so that `fly` takes the expert as it is.
+# `fly` takes anything that flies: experts, models of Stable-Baselines3, functions.
 
 
 # %%
@@ -80,25 +82,22 @@ def recorded(controller, n=24, seed=7):
 
 # %% tags=["hide-input"]
 def plot_flights(controllers):
-    """Distance from the target, speed and tilt over time: the median of the flights, and the range
-    of nine in ten.
-    """
+    """Plot distance, speed and tilt over time: the median, and the range of nine flights in ten."""
     _, panels = plt.subplots(1, 3, figsize=(11, 3.2))
-    for (name, controller), colour in zip(controllers.items(), COLOURS, strict=False):
+    for number, (name, controller) in enumerate(controllers.items()):
+        colour = COLOURS[number]
         flights = recorded(controller)
+        times = flights["time"]
         _, x, y, _ = np.moveaxis(flights["quaternion"], -1, 0)
-        values = (
-            np.linalg.norm(flights["position"] - flights["target"], axis=-1),
-            np.linalg.norm(flights["velocity"], axis=-1),
-            np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1))),
-        )
-        for panel, each in zip(panels, values, strict=True):
-            low, middle, high = np.nanpercentile(each, [5, 50, 95], axis=0)
-            panel.fill_between(flights["time"], low, high, color=colour, alpha=0.15, linewidth=0)
-            panel.plot(flights["time"], middle, color=colour, label=name)
-    for panel, label in zip(
-        panels, ("distance from the target (m)", "speed (m/s)", "tilt (deg)"), strict=True
-    ):
+        distance = np.linalg.norm(flights["position"] - flights["target"], axis=-1)
+        speed = np.linalg.norm(flights["velocity"], axis=-1)
+        tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x**2 + y**2), -1, 1)))
+        for panel, values in zip(panels, (distance, speed, tilt), strict=True):
+            low, middle, high = np.nanpercentile(values, [5, 50, 95], axis=0)
+            panel.fill_between(times, low, high, color=colour, alpha=0.15, linewidth=0)
+            panel.plot(times, middle, color=colour, label=name)
+    labels = ("distance from the target (m)", "speed (m/s)", "tilt (deg)")
+    for panel, label in zip(panels, labels, strict=True):
         panel.set(xlabel="time (s)", ylabel=label, xlim=(0, 15), ylim=(0, None))
     panels[0].legend()
     plt.show()
@@ -112,7 +111,7 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert}
 # ## An agent that imitates it
 #
 # The agent sees 18 noisy features instead of the true state. `beta` is the share of the flights
-# that the expert flies itself: all in the first rollout, fewer in each that follows.
+# that the expert flies itself: all in the first rollout, fewer in each later one.
 
 # %%
 agent = DAgger(
@@ -138,49 +137,47 @@ plot_flights({"geometric expert": GeometricExpert(), "unhurried expert": expert,
 # %% [markdown]
 # ## A reward
 #
-# The coefficients of the task's reward have names, and are arguments of the environment:
-# `task_kwargs={"tilt_cost": 0.004}` doubles the thesis's price of a tilt. Anything else is a
-# wrapper. This one charges for restless rotors, which spill coffee too.
+# You can change the coefficients of the task's reward by name:
+# `task_kwargs={"tilt_cost": 0.004}` doubles the thesis's price of a tilt. For anything else write a
+# wrapper. This one charges for restless rotors, which spill coffee, too.
 
 
 # %%
 class CalmActions(VecEnvWrapper):
-    """Takes ``cost`` times the mean squared change of the action from the reward of every control
-    step.
-    """
+    """Subtract ``cost`` times the mean squared change of the action from each reward."""
 
     def __init__(self, venv, cost):
         super().__init__(venv)
         self.cost = cost
 
     def reset(self):
-        """Begin a new episode in every row; hover is the action before."""
+        """Begin a new episode in every row, after an action of hover."""
         self.last = np.zeros((self.num_envs, *self.action_space.shape), dtype=np.float32)
         return self.venv.reset()
 
     def step_async(self, actions):
-        """Note how much the action changes."""
+        """Remember how much the action changes."""
         self.change = np.square(actions - self.last).mean(axis=1)
         self.last = actions.copy()
         self.venv.step_async(actions)
 
     def step_wait(self):
-        """The environment's own reward, less the cost."""
+        """Return the environment's reward less the cost."""
         observations, rewards, dones, infos = self.venv.step_wait()
-        self.last[dones] = 0.0  # these rows begin their next episode
-        return observations, rewards - self.cost * self.change.astype(np.float32), dones, infos
+        rewards = rewards - self.cost * self.change.astype(np.float32)
+        # Rows that are done begin their next episode, after an action of hover.
+        self.last[dones] = 0.0
+        return observations, rewards, dones, infos
 
 
 # %% [markdown]
-# `itm-imitation` comes with the package and has never heard of that price. `PPOBC` goes on from it:
-# PPO, with a cloning term that keeps the policy near an expert.
+# `itm-imitation` comes with the package and was trained without that price. `PPOBC` continues from
+# it: PPO, with a cloning term that keeps the policy near an expert.
 
 
 # %%
 def make_env(n_envs, seed):
-    """Flights to targets 10 m away, where tilts cost twice as much as in the thesis, and restless
-    rotors something.
-    """
+    """Flights to targets 10 m away, where tilts and restless rotors cost more."""
     env = QuadcopterVecEnv(
         n_envs, "target_tracking", {"tilt_cost": 0.004}, max_episode_steps=500, seed=seed
     )
@@ -209,19 +206,19 @@ calm.learn(REINFORCEMENT)
 calm.save("calm")
 
 # %% [markdown]
-# The new reward on fresh flights, before and after, and where it comes from: the squared change of
-# the action over time.
+# Compare the new reward on fresh flights, before and after. The plot shows where it comes from: the
+# squared change of the action over time.
 
 
 # %%
 def mean_reward(controller):
     """Mean reward of the first 5 s of fresh flights."""
     env = make_env(EPISODES, seed=1_000_000)
-    observations, total = env.reset(), np.zeros(EPISODES)
+    observations = env.reset()
+    total = np.zeros(EPISODES)
     for _ in range(500):
-        observations, rewards, _, _ = env.step(
-            controller.predict(observations, deterministic=True)[0]
-        )
+        actions, _ = controller.predict(observations, deterministic=True)
+        observations, rewards, _, _ = env.step(actions)
         total += rewards
     return total.mean()
 
@@ -232,7 +229,8 @@ for (name, controller), colour in zip(before_and_after.items(), COLOURS, strict=
     flights = recorded(controller, n=EPISODES, seed=1_000_000)
     change = np.square(np.diff(flights["action"], axis=1)).mean(axis=(0, 2))
     print(
-        f"{name:6} mean reward {mean_reward(controller):6.2f}, mean squared change {np.nanmean(change):.6f}"
+        f"{name:6} mean reward {mean_reward(controller):6.2f}, "
+        f"mean squared change {np.nanmean(change):.6f}"
     )
     axes.semilogy(flights["time"][1:], change, color=colour, label=name)
 axes.set(
@@ -246,12 +244,12 @@ axes.legend()
 plt.show()
 
 # %% [markdown]
-# The price is one of squares: the large changes on the way fell, the small ones at the target
-# matter little and rose.
+# The cost is quadratic. So the large changes on the way became smaller; the small ones at the
+# target matter little, and became larger.
 #
 # ## Further
 #
-# In a module of yours, `my_module.py`, the expert also works in every command: `sb3-quad train
+# Put the expert into a module, `my_module.py`, and you can use it in every command: `sb3-quad train
 # --algo dagger --expert my_module:UnhurriedExpert`, `sb3-quad evaluate pid
-# my_module:UnhurriedExpert`. A coefficient of the reward can be given there too: `--env-kwargs
+# my_module:UnhurriedExpert`. You can give coefficients of the reward there, too: `--env-kwargs
 # "task_kwargs:dict(tilt_cost=0.004)"`.

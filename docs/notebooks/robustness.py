@@ -13,9 +13,9 @@
 # %% [markdown]
 # # How robust is your agent
 #
-# A quadcopter outside is heavier than in the data sheet, the wind pushes it, its motors are late.
-# This notebook changes one thing after the other and asks who still arrives. Put the path of your
-# own zip in the place of an agent below.
+# A quadcopter outdoors is heavier than in its data sheet, the wind blows, and its motors are late.
+# This notebook changes one thing after the other and shows who still arrives. Replace an agent
+# below by the path of your own zip.
 
 # %%
 import tempfile
@@ -33,14 +33,14 @@ from sb3_quad.report.plots import STYLE
 plt.rcParams.update({**STYLE, "figure.constrained_layout.use": True, "figure.dpi": 110})
 
 # %% tags=["parameters"]
-EPISODES = 60  # of each controller in each scenario
+EPISODES = 60  # episodes of each controller in each scenario
 
 # %% [markdown]
 # ## Scenarios
 #
 # A scenario says where flights begin, where they go and what happens on the way. `vary` makes a
-# grid of scenarios of one. The thesis's agents know one vehicle in still air; `itm-robust` was
-# trained in random worlds, with changed vehicles, forces and gusts.
+# grid of scenarios from one. `itm-recovery` knows one vehicle, undisturbed. `itm-robust` was
+# trained with domain randomization: other vehicles, forces and gusts.
 
 # %%
 suite = parse_suite(
@@ -78,8 +78,8 @@ controllers = [
 # %% [markdown]
 # ## Flights
 #
-# All controllers fly the same episodes. `evaluate` leaves a folder with all metrics, trajectories
-# and a table of the episodes; the command `sb3-quad evaluate` does the same and makes a page of it.
+# All controllers fly the same episodes. `evaluate` writes a folder with all metrics, trajectories
+# and a table of the episodes. The command `sb3-quad evaluate` does the same and also writes a page.
 
 # %%
 folder = tempfile.mkdtemp()
@@ -89,42 +89,38 @@ print(f"{len(results.entries)} entries of {EPISODES} flights")
 
 # %% tags=["hide-input"]
 def plot_grid(results):
-    """Success with its 95 % interval, and the median final error, over what each group of scenarios
-    varies.
-    """
-    groups = list(dict.fromkeys(each.group for each in results.scenarios))
+    """Plot success (with its 95 % interval) and final error over what each scenario varies."""
+    groups = {}
+    for scenario in results.scenarios:
+        groups.setdefault(scenario.group, []).append(scenario)
+    n = len(groups)
     figure, axes = plt.subplots(
-        2, len(groups), figsize=(3.7 * len(groups), 5.3), sharex="col", sharey="row", squeeze=False
+        2, n, figsize=(3.7 * n, 5.3), sharex="col", sharey="row", squeeze=False
     )
-    for (top, bottom), group in zip(axes.T, groups, strict=True):
-        cells = [each for each in results.scenarios if each.group == group]
+    for (top, bottom), cells in zip(axes.T, groups.values(), strict=True):
         (key,) = cells[0].cell
         x = [cell.cell[key] for cell in cells]
         for controller, colour in zip(results.controllers, COLOURS, strict=False):
-            metrics = [results.entry(controller.label, cell.name).metrics for cell in cells]
-            success = (
-                100
-                * np.array(
-                    [[each.success.value, each.success.low, each.success.high] for each in metrics]
-                ).T
-            )
-            error = [
-                each.final_error_median if each.survival.value >= 0.5 else np.nan
-                for each in metrics
-            ]
-            top.plot(x, success[0], "o-", color=colour, markersize=4, label=controller.label)
-            top.fill_between(x, success[1], success[2], color=colour, alpha=0.15, linewidth=0)
+            success = []
+            error = []
+            for cell in cells:
+                metrics = results.entry(controller.label, cell.name).metrics
+                share = metrics.success
+                success.append((share.value, share.low, share.high))
+                # The median of a few survivors would flatter.
+                survives = metrics.survival.value >= 0.5
+                error.append(metrics.final_error_median if survives else np.nan)
+            value, low, high = 100 * np.array(success).T
+            top.plot(x, value, "o-", color=colour, markersize=4, label=controller.label)
+            top.fill_between(x, low, high, color=colour, alpha=0.15, linewidth=0)
             bottom.plot(x, np.maximum(error, 1e-3), "o-", color=colour, markersize=4)
         top.set_title(cells[0].title.split(":")[0].capitalize(), loc="left", fontweight="bold")
         bottom.set(xlabel=axis_label(key, cells[0]), yscale="log")
         bottom.yaxis.set_major_formatter("{x:g}")
     axes[0, 0].set(ylabel="success (%)", ylim=(-4, 104))
     axes[1, 0].set(ylabel="median final error (m)")
-    figure.legend(
-        *axes[0, 0].get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=len(results.controllers),
-    )
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=len(results.controllers))
     plt.show()
 
 
@@ -132,15 +128,15 @@ def plot_grid(results):
 plot_grid(results)
 
 # %% [markdown]
-# A success survives and ends within 0.1 m of its target. Under another mass or a force the PID and
-# `itm-recovery` come to rest beside the target, since nothing in them adds up the error.
-# `itm-robust` has an integral and remembers its last observations, so that it finds out what it
+# A successful flight survives and ends within 0.1 m of its target. With another mass or a force the
+# PID and `itm-recovery` come to rest at an offset, since nothing in them integrates the error.
+# `itm-robust` has an integral and sees its last observations, from which it can estimate what it
 # flies. A delay of six control steps is too much for all three.
 #
 # ## Two things at once
 #
-# A grid over two keys is a map: recoveries by how far the quadcopter is tilted and how fast it
-# tumbles when it is let go, at 6 m/s in a random direction.
+# A grid over two keys is a map. This one shows recoveries by the tilt and the body rates at the
+# start, at 6 m/s in a random direction.
 
 # %%
 tumbling = parse_suite(
@@ -163,29 +159,20 @@ maps = evaluate(tumbling, controllers, f"{folder}/tumbling")
 figure, panels = plt.subplots(
     1, len(controllers), figsize=(3.5 * len(controllers), 3.2), sharey=True
 )
-first, second = (
-    list(dict.fromkeys(each.cell[key] for each in maps.scenarios)) for key in maps.scenarios[0].cell
-)
+tilts = [0, 45, 90, 135, 180]
+body_rates = [0, 4, 8, 12]
 for panel, controller in zip(panels, maps.controllers, strict=True):
-    shares = [
-        maps.entry(controller.label, each.name).metrics.survival.value * 100
-        for each in maps.scenarios
-    ]
-    grid = np.reshape(shares, (len(first), len(second))).T
+    shares = []
+    for scenario in maps.scenarios:
+        shares.append(maps.entry(controller.label, scenario.name).metrics.survival.value * 100)
+    grid = np.reshape(shares, (len(tilts), len(body_rates))).T
     image = panel.imshow(grid, origin="lower", aspect="auto", cmap="viridis", vmin=0, vmax=100)
     for row, column in np.ndindex(grid.shape):
         colour = "white" if grid[row, column] < 60 else "black"
-        panel.text(
-            column,
-            row,
-            f"{grid[row, column]:.0f}",
-            ha="center",
-            va="center",
-            color=colour,
-            fontsize=8,
-        )
-    panel.set_xticks(range(len(first)), [f"{value:g}" for value in first])
-    panel.set_yticks(range(len(second)), [f"{value:g}" for value in second])
+        text = f"{grid[row, column]:.0f}"
+        panel.text(column, row, text, ha="center", va="center", color=colour, fontsize=8)
+    panel.set_xticks(range(len(tilts)), tilts)
+    panel.set_yticks(range(len(body_rates)), body_rates)
     panel.grid(visible=False)
     panel.set_title(controller.label, loc="left", fontweight="bold")
     panel.set_xlabel("tilt at the start (deg)")
@@ -196,6 +183,6 @@ plt.show()
 # %% [markdown]
 # ## Further
 #
-# The suite `robustness` of the package has more: inertia, motors, noise, gusts and hits, `sb3-quad
-# evaluate pid my_agent.zip --suite robustness --workers 2`. An agent that fails there can be
-# trained in random worlds: `sb3-quad train` does so by default.
+# The suite `robustness` of the package varies more: inertia, motors, noise, gusts and hits. Try
+# `sb3-quad evaluate pid my_agent.zip --suite robustness --workers 2`. If your agent fails there,
+# train it with domain randomization: `sb3-quad train` does so by default.

@@ -1,7 +1,6 @@
-"""What the simulators of others have in common here: starts, observations, policies, the check of
-rotors, metrics, the table.
+"""Starts, observations, policies, metrics and the table, the same for all other simulators.
 
-Nothing here needs ``sb3_quad``: a policy is flown as a user of the exported file would fly it. The
+Nothing here needs ``sb3_quad``: the script flies a policy as a user of the exported file would. The
 conventions are those of docs/export.md: world frame with z up; body frame with x forward, y left, z
 up; SI units; a control step of 10 ms.
 """
@@ -17,18 +16,20 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[Any]
-CONTROL_STEP, STEPS = 0.01, 1500  # s; control steps of a flight
-TASKS = {
-    "targets": (0.1, np.pi),
-    "recoveries": (0.25, np.radians(10.0)),
-}  # success: final error (m) and tilt (rad)
-MAX_DISTANCE, ARRIVED = 30.0, 0.1  # m: farther from the target is lost; within this it has arrived
+CONTROL_STEP = 0.01  # s
+STEPS = 1500  # control steps of a flight
+# A flight succeeds below this final error (m) and tilt (rad).
+TASKS = {"targets": (0.1, np.pi), "recoveries": (0.25, np.radians(10.0))}
+MAX_DISTANCE = 30.0  # m; farther from its target a flight is out of range
+ARRIVED = 0.1  # m
 
 
 @dataclass
 class State:
-    """Of n vehicles: position, velocity (n, 3), world frame; quaternion (n, 4), w first, body to
-    world; body rates (n, 3).
+    """The state of n vehicles.
+
+    Position and velocity (n, 3) are in the world frame, m and m/s; the quaternion (n, 4), w first,
+    turns body to world; body rates (n, 3) are in rad/s.
     """
 
     position: Array
@@ -49,7 +50,7 @@ class State:
 
 
 class Simulator(Protocol):
-    """n vehicles of one kind in the simulator of others."""
+    """n vehicles of one kind in another simulator."""
 
     n: int
     # (4, 3): x, y (m) and the sign of the yaw moment of each rotor, in the simulator's order
@@ -67,14 +68,13 @@ class Simulator(Protocol):
         """The true state."""
 
     def thrusts(self, speeds: Array) -> Array:
-        """Thrusts (N) at rotor speeds given as shares, 0 to 1, of the way from the least to the
-        greatest.
-        """
+        """Thrusts (N) at rotor speeds; 0 is the least speed and 1 the greatest."""
 
 
 class Policy(Protocol):
-    """Thrusts (n, 4), N, of observations (n, 18); experts look at the true state and the targets
-    (n, 3).
+    """A function from observations (n, 18) to thrusts (n, 4), N.
+
+    Experts use the true state and the targets (n, 3) instead.
     """
 
     def reset(self, n: int) -> None:
@@ -85,8 +85,9 @@ class Policy(Protocol):
 
 
 class ExportedAgent:
-    """A file of ``sb3-quad export --format onnx``, which must have been written for a vehicle with
-    the simulator's rotors.
+    """A file of ``sb3-quad export --format onnx``, for a vehicle with the simulator's rotors.
+
+    :raises SystemExit: if it was exported for other rotors.
     """
 
     def __init__(self, file: str, simulator: Simulator) -> None:
@@ -98,40 +99,43 @@ class ExportedAgent:
             file, options, providers=["CPUExecutionProvider"]
         )
         rotors = self._session.get_modelmeta().custom_metadata_map["rotors"]
-        found = re.findall(r"x (\S+) m, y (\S+) m, yaw moment ([+-])", rotors)
-        signs = [[np.sign(float(x)), np.sign(float(y)), float(yaw + "1")] for x, y, yaw in found]
+        signs = []
+        for x, y, yaw in re.findall(r"x (\S+) m, y (\S+) m, yaw moment ([+-])", rotors):
+            signs.append([np.sign(float(x)), np.sign(float(y)), float(yaw + "1")])
         if not np.array_equal(signs, np.sign(simulator.rotors)):
             raise SystemExit(
-                f"{file}: its rotors, {rotors}, are not where the simulator has them; export for that --vehicle"
+                f"{file}: its rotors, {rotors}, are not where the simulator has them; "
+                "export for that --vehicle"
             )
 
     def reset(self, n: int) -> None:
         inputs = self._session.get_inputs()
-        self._state = np.zeros((n, inputs[1].shape[1]), np.float32) if len(inputs) > 1 else None
+        self._state = None
+        if len(inputs) > 1:
+            self._state = np.zeros((n, inputs[1].shape[1]), np.float32)
 
     def __call__(self, observation: Array, state: State, target: Array) -> Array:
         if self._state is None:
             (thrusts,) = self._session.run(None, {"observation": observation})
         else:
-            thrusts, self._state = self._session.run(
-                None, {"observation": observation, "state": self._state}
-            )
+            feed = {"observation": observation, "state": self._state}
+            thrusts, self._state = self._session.run(None, feed)
         return np.asarray(thrusts, np.float64)
 
 
 class Raptor:
-    """RAPTOR's policy (package ``foundation-policy``), as its README and examples/raptor.py say."""
+    """RAPTOR's policy (package ``foundation-policy``), used as in examples/raptor.py."""
 
-    MOTORS = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))  # signs of x, y and yaw moment
+    # Signs of x, y and yaw moment of each motor.
+    MOTORS = ((1, -1, -1), (-1, -1, 1), (-1, 1, -1), (1, 1, 1))
 
     def __init__(self, simulator: Simulator) -> None:
         import foundation_policy
 
-        self._policy, self._thrusts = foundation_policy.Raptor(), simulator.thrusts
-        self._order = [
-            self.MOTORS.index(tuple(signs))
-            for signs in np.sign(simulator.rotors).astype(int).tolist()
-        ]
+        self._policy = foundation_policy.Raptor()
+        self._thrusts = simulator.thrusts
+        signs = np.sign(simulator.rotors).astype(int).tolist()
+        self._order = [self.MOTORS.index(tuple(rotor)) for rotor in signs]
 
     def reset(self, n: int) -> None:
         self._policy.reset()
@@ -141,27 +145,28 @@ class Raptor:
         position, to_body, velocity, rates = np.split(observation, [3, 12, 15], axis=1)
         rotation = to_body.reshape(-1, 3, 3).transpose(0, 2, 1)
         velocity = np.einsum("nij,nj->ni", rotation, velocity).clip(-1.0, 1.0)
-        seen = [position.clip(-0.5, 0.5), rotation.reshape(-1, 9), velocity, rates, self._last]
-        self._last = self._policy.evaluate_step(np.hstack(seen)).astype(np.float32).clip(-1.0, 1.0)
-        return self._thrusts((self._last[:, self._order].astype(np.float64) + 1.0) / 2.0)
+        position = position.clip(-0.5, 0.5)
+        inputs = np.hstack([position, rotation.reshape(-1, 9), velocity, rates, self._last])
+        self._last = self._policy.evaluate_step(inputs).astype(np.float32).clip(-1.0, 1.0)
+        commands = self._last[:, self._order].astype(np.float64)
+        return self._thrusts((commands + 1.0) / 2.0)
 
 
 def sample_starts(task: str, n: int, seed: int) -> tuple[State, Array]:
-    """Starts and targets (n, 3), 15 m above the ground, sampled as the tasks target_tracking and
-    state_recovery do.
+    """Sample starts 15 m above the ground, and targets (n, 3).
+
+    The distributions are those of the tasks target_tracking and state_recovery.
     """
     rng = np.random.default_rng(seed)
-    position, zeros, level = (
-        np.tile([0.0, 0.0, 15.0], (n, 1)),
-        np.zeros((n, 3)),
-        np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
-    )
+    position = np.tile([0.0, 0.0, 15.0], (n, 1))
     if task == "targets":
-        return State(position, level, zeros, zeros), position + 10.0 * _unit(
-            rng.standard_normal((n, 3))
-        )
-    quaternion, (v, w) = _unit(rng.standard_normal((n, 4))), rng.standard_normal((2, n, 3))
-    return State(position, quaternion, 2.0 * v, 4.0 * w), position.copy()
+        zeros = np.zeros((n, 3))
+        level = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+        target = position + 10.0 * _unit(rng.standard_normal((n, 3)))
+        return State(position, level, zeros, zeros), target
+    quaternion = _unit(rng.standard_normal((n, 4)))
+    velocity, body_rates = rng.standard_normal((2, n, 3))
+    return State(position, quaternion, 2.0 * velocity, 4.0 * body_rates), position.copy()
 
 
 def _unit(vectors: Array) -> Array:
@@ -176,18 +181,21 @@ def observe(state: State, target: Array) -> Array:
 
 
 def check_rotors(make: Callable[[int], Simulator]) -> None:
-    """Speed up one rotor at a time in hover: the body must turn as the rotor's place and direction
-    say, beside what wind does.
+    """Speed up one rotor at a time in hover, and check that the body turns as its place says.
 
-    :raises SystemExit: it does not.
+    :raises SystemExit: if it turns in another way.
     """
     simulator = make(4)
-    still, state = _after_hover(simulator, 0.0), _after_hover(make(4), 0.2)
+    # The difference to a plain hover takes out what the wind does.
+    hovering = _after_hover(simulator, 0.0)
+    turned = _after_hover(make(4), 0.2)
+    rates = turned.body_rates - hovering.body_rates
+    climb = turned.velocity[:, 2] - hovering.velocity[:, 2]
     x, y, yaw = simulator.rotors.T
-    rates, climb = state.body_rates - still.body_rates, (state.velocity - still.velocity)[:, 2]
     if not np.array_equal(np.sign(rates), np.sign(np.stack([y, -x, yaw], axis=1))):
         raise SystemExit(
-            f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body by {rates.tolist()} rad/s"
+            f"{simulator}: rotors at {simulator.rotors.tolist()} turn the body "
+            f"by {rates.tolist()} rad/s"
         )
     if not (climb > 0.0).all():
         raise SystemExit(
@@ -205,8 +213,10 @@ def _after_hover(simulator: Simulator, share: float) -> State:
 
 @dataclass
 class Flights:
-    """Of n flights: who survived and succeeded, final error (m), times (s) of first and lasting
-    arrival; else inf.
+    """Results of n flights, (n,) each.
+
+    Final errors are in m, times in s: first arrival, and settling time. They are infinite for a
+    flight that crashed, got out of range or never arrived.
     """
 
     survived: Array
@@ -219,18 +229,23 @@ class Flights:
 def fly(
     simulator: Simulator, policy: Policy, task: str, seed: int, noise: float, delay: int
 ) -> Flights:
-    """Fly a task; :param delay: control steps from a command to its effect."""
+    """Fly a task.
+
+    :param noise: relative standard deviation of each observed number.
+    :param delay: control steps from a command to its effect.
+    """
     start, target = sample_starts(task, simulator.n, seed)
     rng = np.random.default_rng([seed, 1])
     simulator.reset(start)
     policy.reset(simulator.n)
     commands = [np.full((simulator.n, 4), simulator.hover)] * delay
-    state, lost = start, np.zeros(simulator.n, np.bool_)
+    state = start
+    lost = np.zeros(simulator.n, np.bool_)
     errors = np.zeros((STEPS, simulator.n))
     for step in range(STEPS):
-        observation = observe(state, target) * (
-            1.0 + noise * rng.standard_normal((simulator.n, 18))
-        )
+        factors = 1.0 + noise * rng.standard_normal((simulator.n, 18))
+        observation = observe(state, target) * factors
+        # The simulator may give anything for a vehicle that has crashed, also NaN.
         observation[lost] = 0.0
         commands.append(policy(observation.astype(np.float32), state, target))
         simulator.step(np.where(lost[:, None], simulator.hover, commands.pop(0)))
@@ -241,35 +256,46 @@ def fly(
     distance, tilt = TASKS[task]
     near = errors <= ARRIVED
     first = np.where(near.any(axis=0), near.argmax(axis=0) + 1, np.inf)
-    last = np.where(near[-1], STEPS + 1 - np.logical_and.accumulate(near[::-1]).sum(axis=0), np.inf)
+    # Steps at the end of the flight that are near without a break.
+    near_at_the_end = np.logical_and.accumulate(near[::-1]).sum(axis=0)
+    last = np.where(near[-1], STEPS + 1 - near_at_the_end, np.inf)
     succeeded = ~lost & (errors[-1] <= distance) & (state.rotation[:, 2, 2] >= np.cos(tilt))
     return Flights(~lost, succeeded, errors[-1], first * CONTROL_STEP, last * CONTROL_STEP)
 
 
 HEADER = (
-    "| vehicle | conditions | controller | survive: targets / recoveries | succeed | to 0.1 m | stay within 0.1 m:"
-    " targets / recoveries | final error, targets: median / 95 % |\n|---|---|---|---|---|---|---|---|"
+    "| vehicle | conditions | controller | survive: targets / recoveries | succeed | to 0.1 m "
+    "| settling time: targets / recoveries | final error, targets: median / 95 % |\n"
+    "|---|---|---|---|---|---|---|---|"
 )
 
 
 def table_row(labels: Iterable[str], targets: Flights, recoveries: Flights) -> str:
-    """A line of the table. Times are medians over all flights (a lost one never arrives), errors
-    are of who survived.
+    """Format a line of the table.
+
+    Times are medians over all flights; one that crashes never arrives. Errors are of the survivors.
     """
-    both = (targets, recoveries)
-    rates = [
-        " / ".join(f"{100 * getattr(each, name).mean():.1f}" for each in both) + " %"
-        for name in ("survived", "succeeded")
-    ]
-    stayed = " / ".join(_seconds(each.stayed) for each in both)
+    survive = f"{_percent(targets.survived)} / {_percent(recoveries.survived)} %"
+    succeed = f"{_percent(targets.succeeded)} / {_percent(recoveries.succeeded)} %"
+    settle = f"{_seconds(targets.stayed)} / {_seconds(recoveries.stayed)}"
     error = targets.error[targets.survived]
-    median, high = np.quantile(error, [0.5, 0.95]) if error.size else (np.nan, np.nan)
-    cells = [*labels, *rates, _seconds(targets.arrived), stayed, f"{median:.3f} / {high:.3f} m"]
+    median = high = np.nan
+    if error.size:
+        median, high = np.quantile(error, [0.5, 0.95])
+    errors = f"{median:.3f} / {high:.3f} m"
+    cells = [*labels, survive, succeed, _seconds(targets.arrived), settle, errors]
     return f"| {' | '.join(cells)} |"
 
 
+def _percent(flights: Array) -> str:
+    return f"{100 * flights.mean():.1f}"
+
+
 def _seconds(times: Array) -> str:
-    return f"{median:.2f} s" if np.isfinite(median := np.median(times)) else "-"
+    median = np.median(times)
+    if not np.isfinite(median):
+        return "-"
+    return f"{median:.2f} s"
 
 
 @dataclass
@@ -278,13 +304,13 @@ class Cell:
 
     vehicle: str
     conditions: str
-    make: Callable[[int], Simulator]  # of n vehicles
+    make: Callable[[int], Simulator]  # from the number of vehicles
 
 
 def main(
     description: str, cells: Mapping[str, Cell], others: Mapping[str, Callable[[Any], Policy]]
 ) -> None:
-    """The command of a script: check the rotors, fly, print the table.
+    """Run a script's command: check the rotors, fly, print the table.
 
     :param others: controllers to compare with, by name; each is made for a simulator.
     """
@@ -303,7 +329,7 @@ def main(
         choices=cells,
         default=[*cells],
         metavar="CELL",
-        help=f"of {', '.join(cells)} (all)",
+        help=f"some of {', '.join(cells)} (all)",
     )
     add(
         "--others",
@@ -311,17 +337,17 @@ def main(
         choices=others,
         default=[*others],
         metavar="NAME",
-        help=f"of {', '.join(others)} (all)",
+        help=f"some of {', '.join(others)} (all)",
     )
     add(
         "--delay",
         nargs="+",
         type=int,
         default=[0],
-        help="control steps from a command to its effect; several: each (0)",
+        help="control steps from a command to its effect; each of several is flown (0)",
     )
     add("-n", type=int, default=256, help="flights of each task in a cell (256)")
-    add("--seed", type=int, default=1, help="of starts and noise (1)")
+    add("--seed", type=int, default=1, help="seed of starts and noise (1)")
     add(
         "--noise",
         type=float,
@@ -333,18 +359,20 @@ def main(
     for cell in (cells[name] for name in options.cells):
         check_rotors(cell.make)
         simulator = cell.make(options.n)
-        agents = [(*Path(file).stem.partition("@"), file) for file in options.files]
-        policies = {
-            name: ExportedAgent(file, simulator)
-            for name, _, of, file in agents
-            if of in ("", cell.vehicle)
-        }
-        policies |= {name: others[name](simulator) for name in options.others}
+        policies: dict[str, Policy] = {}
+        for file in options.files:
+            name, _, vehicle = Path(file).stem.partition("@")
+            if vehicle in ("", cell.vehicle):
+                policies[name] = ExportedAgent(file, simulator)
+        for name in options.others:
+            policies[name] = others[name](simulator)
         for delay in options.delay:
-            conditions = cell.conditions + f", {10 * delay} ms delay" * (delay > 0)
+            conditions = cell.conditions
+            if delay > 0:
+                conditions += f", {10 * delay} ms delay"
             for name, policy in policies.items():
-                flights = [
-                    fly(simulator, policy, task, options.seed, options.noise, delay)
-                    for task in TASKS
-                ]
+                flights = []
+                for task in TASKS:
+                    how = (options.seed, options.noise, delay)
+                    flights.append(fly(simulator, policy, task, *how))
                 print(table_row([cell.vehicle, conditions, name], *flights), flush=True)

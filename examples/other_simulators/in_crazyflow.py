@@ -1,8 +1,9 @@
-"""Fly exported agents in crazyflow (TU Munich), as they are, and RAPTOR's policy beside them.
+r"""Fly exported agents in crazyflow (TU Munich), and RAPTOR's policy to compare with.
 
-    sb3-quad export any-quadcopter --format onnx --vehicle cf2x_L250 -o any-quadcopter@cf2x_L250.onnx
-    python examples/other_simulators/in_crazyflow.py any-quadcopter@cf2x_L250.onnx --cells cf2x_L250
-    --delay 0 1
+    sb3-quad export any-quadcopter --format onnx --vehicle cf2x_L250 \
+        -o any-quadcopter@cf2x_L250.onnx
+    python examples/other_simulators/in_crazyflow.py any-quadcopter@cf2x_L250.onnx \
+        --cells cf2x_L250 --delay 0 1
 
 crazyflow: rotors M1 to M4 as Bitcraze numbers them; quaternions x, y, z, w; commands are rotor
 speeds in rpm. Its first principles: rotors that spin up and down at different rates, drag,
@@ -31,17 +32,14 @@ class Crazyflow:
     def __init__(self, drone: str, n: int) -> None:
         self.n = n
         parameters = load_params(Dynamics.first_principles, drone)
-        self._curve = np.asarray(
-            parameters["rpm2thrust"], np.float64
-        ).ravel()  # thrust (N), polynomial in rpm
+        # Coefficients of the thrust (N), a polynomial in rpm.
+        self._curve = np.asarray(parameters["rpm2thrust"], np.float64).ravel()
         self._limits = float(parameters["thrust_min"]), float(parameters["thrust_max"])
         self.hover = float(parameters["mass"]) * 9.81 / 4.0
-        roll, pitch, yaw = np.asarray(
-            parameters["mixing_matrix"]
-        )  # signs of the moments that a rotor's thrust makes
-        self.rotors = np.stack(
-            [-pitch * (arm := float(np.ravel(parameters["L"])[0])), roll * arm, yaw], axis=1
-        )
+        # Signs of the moments that each rotor's thrust makes about the three axes.
+        roll, pitch, yaw = np.asarray(parameters["mixing_matrix"])
+        arm = float(np.ravel(parameters["L"])[0])
+        self.rotors = np.stack([-pitch * arm, roll * arm, yaw], axis=1)
         kind = {
             "dynamics": Dynamics.first_principles,
             "control": Control.rotor_vel,
@@ -59,22 +57,20 @@ class Crazyflow:
             "ang_vel": start.body_rates,
             "rotor_vel": hover,
         }
-        arrays = {
-            name: jnp.asarray(values[:, None], jnp.float32) for name, values in fields.items()
-        }
+        arrays = {}
+        for name, values in fields.items():
+            arrays[name] = jnp.asarray(values[:, None], jnp.float32)
         self._sim.data = self._sim.data.replace(states=self._sim.data.states.replace(**arrays))
 
     def step(self, thrusts: Array) -> None:
-        self._sim.rotor_vel_control(
-            jnp.asarray(self._speeds(thrusts.clip(*self._limits))[:, None], jnp.float32)
-        )
+        speeds = self._speeds(thrusts.clip(*self._limits))
+        self._sim.rotor_vel_control(jnp.asarray(speeds[:, None], jnp.float32))
         self._sim.step(round(FREQUENCY * CONTROL_STEP))
 
     def state(self) -> State:
         now = self._sim.data.states
-        position, quaternion, velocity, rates = (
-            np.asarray(x[:, 0], np.float64) for x in (now.pos, now.quat, now.vel, now.ang_vel)
-        )
+        fields = (now.pos, now.quat, now.vel, now.ang_vel)
+        position, quaternion, velocity, rates = (np.asarray(x[:, 0], np.float64) for x in fields)
         return State(position, np.roll(quaternion, 1, axis=1), velocity, rates)
 
     def thrusts(self, speeds: Array) -> Array:
@@ -85,7 +81,10 @@ class Crazyflow:
         return np.asarray(motor_force2rotor_vel(thrusts, self._curve))
 
 
-CELLS = {name: Cell(name, "drag", partial(Crazyflow, name)) for name in ("cf2x_L250", "cf21B_500")}
+CELLS = {
+    "cf2x_L250": Cell("cf2x_L250", "drag", partial(Crazyflow, "cf2x_L250")),
+    "cf21B_500": Cell("cf21B_500", "drag", partial(Crazyflow, "cf21B_500")),
+}
 
 if __name__ == "__main__":
     main(__doc__ or "", CELLS, {"RAPTOR": Raptor})

@@ -1,7 +1,9 @@
-"""Fly exported agents in l2f (RAPTOR's and Learning to Fly's simulator), as they are, and RAPTOR's
-policy beside them.
+r"""Fly exported agents in l2f, the simulator of RAPTOR and of Learning to Fly.
 
-    sb3-quad export any-quadcopter --format onnx --vehicle l2f_crazyflie -o any-quadcopter@l2f_crazyflie.onnx
+RAPTOR's policy flies there, too, to compare with.
+
+    sb3-quad export any-quadcopter --format onnx --vehicle l2f_crazyflie \
+        -o any-quadcopter@l2f_crazyflie.onnx
     python examples/other_simulators/in_l2f.py any-quadcopter@l2f_crazyflie.onnx
 
 l2f: its Crazyflie of 30.6 g, whose rotors spin up with 18/s and down with 4/s, numbered as Bitcraze
@@ -24,34 +26,33 @@ FIELDS = {
 
 
 class L2F:
-    """n vehicles as n is 4 or 2 to a higher power: l2f has a module for each number."""
+    """n vehicles; n is 4, 8, 16 and so on, since l2f has a module for each number."""
 
     ground = 0.0145  # m, as in l2f_crazyflie.yaml
 
     def __init__(self, n: int) -> None:
-        self.n, self._vector = n, getattr(l2f, f"vector{n}")
-        self._device, self._environment, self._rng = (
-            l2f.Device(),
-            self._vector.VectorEnvironment(),
-            self._vector.VectorRng(),
-        )
+        self.n = n
+        self._vector = getattr(l2f, f"vector{n}")
+        self._device = l2f.Device()
+        self._environment = self._vector.VectorEnvironment()
+        self._rng = self._vector.VectorRng()
         self._parameters = self._vector.VectorParameters()
-        self._now, self._next = self._vector.VectorState(), self._vector.VectorState()
+        self._now = self._vector.VectorState()
+        self._next = self._vector.VectorState()
         self._vector.initialize_rng(self._device, self._rng, 0)
         self._vector.initialize_environment(self._device, self._environment)
         self._vector.initial_parameters(self._device, self._environment, self._parameters)
-        single, parameters = l2f.Environment(), self._parameters.parameters[0]
+        # Mass and rotors of the vehicle can be read as JSON only.
+        single = l2f.Environment()
+        parameters = self._parameters.parameters[0]
         l2f.initialize_environment(self._device, single)
         dynamics = json.loads(l2f.parameters_to_json(self._device, single, parameters))["dynamics"]
-        positions, torques = (
-            np.array(dynamics["rotor_positions"]),
-            np.array(dynamics["rotor_torque_directions"]),
-        )
+        positions = np.array(dynamics["rotor_positions"])
+        torques = np.array(dynamics["rotor_torque_directions"])
         self.rotors = np.column_stack([positions[:, :2], torques[:, 2]])
         self.hover = dynamics["mass"] * 9.81 / 4.0
-        self._curve = np.array(
-            dynamics["rotor_thrust_coefficients"][0]
-        )  # thrust (N), polynomial in the share of the speed
+        # Coefficients of the thrust (N), a polynomial in the share of the greatest speed.
+        self._curve = np.array(dynamics["rotor_thrust_coefficients"][0])
 
     def reset(self, start: State) -> None:
         hover = np.full(4, self._shares(np.array(self.hover)))
@@ -75,21 +76,18 @@ class L2F:
         self._now.assign(self._next)
 
     def state(self) -> State:
-        return State(
-            **{
-                ours: np.array([getattr(each, theirs) for each in self._now.states])
-                for ours, theirs in FIELDS.items()
-            }
-        )
+        fields = {}
+        for ours, theirs in FIELDS.items():
+            fields[ours] = np.array([getattr(state, theirs) for state in self._now.states])
+        return State(**fields)
 
     def thrusts(self, speeds: Array) -> Array:
         return np.polynomial.polynomial.polyval(speeds, self._curve)
 
     def _shares(self, thrusts: Array) -> Array:
         c, b, a = self._curve
-        return ((-b + np.sqrt(np.maximum(b * b - 4.0 * a * (c - thrusts), 0.0))) / (2.0 * a)).clip(
-            0.0, 1.0
-        )
+        root = np.sqrt(np.maximum(b * b - 4.0 * a * (c - thrusts), 0.0))
+        return ((-b + root) / (2.0 * a)).clip(0.0, 1.0)
 
 
 CELLS = {"l2f_crazyflie": Cell("l2f_crazyflie", "no drag", L2F)}

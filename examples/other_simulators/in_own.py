@@ -1,10 +1,9 @@
-"""Fly the same exported agents and RAPTOR's policy, on the same starts, in the simulator of this
-package.
+r"""Fly the same exported agents and RAPTOR's policy, on the same starts, in our simulator.
 
-    python examples/other_simulators/in_own.py any-quadcopter@cf2x_L250.onnx --cells cf2x_L250
-    --delay 0 1
+    python examples/other_simulators/in_own.py any-quadcopter@cf2x_L250.onnx \
+        --cells cf2x_L250 --delay 0 1
 
-A cell is a vehicle file of that name; the delay is given here and not by the file.
+A cell is a vehicle file of that name. You give the delay here; the file's own delay is ignored.
 """
 
 from functools import partial
@@ -25,14 +24,21 @@ class Own:
     """n vehicles of one file, in a constant wind (m/s) along x."""
 
     def __init__(self, vehicle: str, wind: float, n: int) -> None:
-        self.n, self._vehicle = n, load_vehicle(vehicle).model_copy(update={"delay": 0})
-        self.hover, self.ground = self._vehicle.hover_thrust, self._vehicle.collision_radius
-        self.rotors = np.column_stack(
-            [self._vehicle.rotor_positions, self._vehicle.rotor_directions]
-        )
-        randomize = {"wind": {"magnitude": wind, "direction": [1.0, 0.0, 0.0]}} if wind else None
-        endless: dict[str, Any] = {"max_episode_steps": NEVER, "task_kwargs": {"max_distance": 1e6}}
-        settings = FlightSettings(vehicle=self._vehicle, randomize=randomize, noise=0.0, **endless)
+        self.n = n
+        self._vehicle = load_vehicle(vehicle).model_copy(update={"delay": 0})
+        self.hover = self._vehicle.hover_thrust
+        self.ground = self._vehicle.collision_radius
+        positions = self._vehicle.rotor_positions
+        self.rotors = np.column_stack([positions, self._vehicle.rotor_directions])
+        # The script decides when a flight ends, so no episode of the batch does.
+        keywords: dict[str, Any] = {
+            "max_episode_steps": NEVER,
+            "task_kwargs": {"max_distance": 1e6},
+            "noise": 0.0,
+        }
+        if wind:
+            keywords["randomize"] = {"wind": {"magnitude": wind, "direction": [1.0, 0.0, 0.0]}}
+        settings = FlightSettings(vehicle=self._vehicle, **keywords)
         self._batch = QuadcopterBatch(n, settings, seed=0, autoreset=False)
 
     def reset(self, start: State) -> None:
@@ -52,8 +58,11 @@ class Own:
         return np.asarray(self._vehicle.thrust_coefficient * (low + (high - low) * speeds) ** 2)
 
 
-CELLS = {name: Cell(name, "drag", partial(Own, name, 0.0)) for name in ("cf2x_L250", "cf21B_500")}
-CELLS["l2f_crazyflie"] = Cell("l2f_crazyflie", "no drag", partial(Own, "l2f_crazyflie", 0.0))
+CELLS = {
+    "cf2x_L250": Cell("cf2x_L250", "drag", partial(Own, "cf2x_L250", 0.0)),
+    "cf21B_500": Cell("cf21B_500", "drag", partial(Own, "cf21B_500", 0.0)),
+    "l2f_crazyflie": Cell("l2f_crazyflie", "no drag", partial(Own, "l2f_crazyflie", 0.0)),
+}
 for name in ("rotorpy_crazyflie", "rotorpy_hummingbird"):
     CELLS[name] = Cell(name, "drag", partial(Own, name, 0.0))
     CELLS[name + "_wind"] = Cell(name, "drag, wind 4 m/s", partial(Own, name, 4.0))

@@ -1,9 +1,11 @@
-"""Fly exported agents in RotorPy (University of Pennsylvania), as they are, with its SE3 controller
-and RAPTOR's policy.
+r"""Fly exported agents in RotorPy (University of Pennsylvania).
 
-    sb3-quad export any-quadcopter --format onnx --vehicle rotorpy_crazyflie -o any-quadcopter@rotorpy_crazyflie.onnx
-    python examples/other_simulators/in_rotorpy.py any-quadcopter@rotorpy_crazyflie.onnx --cells
-    crazyflie crazyflie_wind
+Its SE3 controller and RAPTOR's policy fly there, too, to compare with.
+
+    sb3-quad export any-quadcopter --format onnx --vehicle rotorpy_crazyflie \
+        -o any-quadcopter@rotorpy_crazyflie.onnx
+    python examples/other_simulators/in_rotorpy.py any-quadcopter@rotorpy_crazyflie.onnx \
+        --cells crazyflie crazyflie_wind
 
 RotorPy: rotors front left, front right, back right, back left; quaternions x, y, z, w. Its drag of
 rotors and body and its translational lift are on. SE3 sees the true state, the others observations
@@ -29,8 +31,9 @@ torch.set_num_threads(1)
 
 
 class Loaded(BatchedMultirotor):
-    """Vehicles with payloads: of a mass (kg) at an offset (m, body frame) from the centre of mass;
-    mass and inertia stay.
+    """Vehicles with payloads: masses (kg, (n,)) at offsets (m, (n, 3)) from the centre of mass.
+
+    Only their weight acts. Mass and inertia of the vehicle do not change.
     """
 
     payload = torch.zeros(1), torch.zeros(1, 3)
@@ -54,10 +57,9 @@ class Loaded(BatchedMultirotor):
 class RotorPy:
     """n vehicles of ``rotorpy.vehicles`` in a wind.
 
-    :param wind: of the number of vehicles, one of its wind profiles.
-    :param payload: the greatest mass of AdaptiveQuadBench's payload, by that of the vehicle.
-    :param weakness: the greatest that the thrust of each rotor may be off, either way, in shares of
-        it.
+    :param wind: function from the number of vehicles to one of RotorPy's wind profiles.
+    :param payload: greatest mass of AdaptiveQuadBench's payload, as a share of the vehicle's mass.
+    :param weakness: greatest error of a rotor's thrust in either direction, as a share of it.
     """
 
     def __init__(
@@ -69,31 +71,27 @@ class RotorPy:
         weakness: float = 0.0,
     ) -> None:
         parameters = importlib.import_module(f"rotorpy.vehicles.{vehicle}_params").quad_params
-        self._substeps = max(
-            2, round(2 * CONTROL_STEP / parameters["tau_m"])
-        )  # Runge-Kutta steps in a control step
-        self.n, self._rows, self._wind, self._k_eta = (
-            n,
-            torch.arange(n),
-            wind(n),
-            parameters["k_eta"],
-        )
-        self._speeds = parameters["rotor_speed_min"], parameters["rotor_speed_max"]
+        # Runge-Kutta steps in a control step: two in each time constant of the motors.
+        self._substeps = max(2, round(2 * CONTROL_STEP / parameters["tau_m"]))
+        self.n = n
+        self._rows = torch.arange(n)
+        self._wind = wind(n)
+        self._k_eta = parameters["k_eta"]
+        self._speeds = (parameters["rotor_speed_min"], parameters["rotor_speed_max"])
         self.hover = parameters["mass"] * 9.81 / 4.0
-        self.ground = {"crazyflie": 0.0145, "hummingbird": 0.06}[
-            vehicle
-        ]  # m, as in our vehicle files
+        # m, as in our vehicle files.
+        self.ground = {"crazyflie": 0.0145, "hummingbird": 0.06}[vehicle]
         positions = np.stack([*parameters["rotor_pos"].values()])
         self.rotors = np.column_stack([positions[:, :2], parameters["rotor_directions"]])
         self.parameters = BatchedMultirotorParams([parameters] * n, n, DEVICE)
-        rng, arm = np.random.default_rng(0), np.linalg.norm(positions[0])
+        rng = np.random.default_rng(0)
+        arm = np.linalg.norm(positions[0])
         efficiency = torch.tensor(1.0 + weakness * rng.uniform(-1.0, 1.0, (n, 4)))
-        self.parameters.k_eta, self.parameters.k_m = (
-            self.parameters.k_eta * efficiency,
-            self.parameters.k_m * efficiency,
-        )
+        self.parameters.k_eta = self.parameters.k_eta * efficiency
+        self.parameters.k_m = self.parameters.k_m * efficiency
         mass = payload * parameters["mass"] * rng.uniform(0.0, 1.0, n)
-        self._payload = torch.tensor(mass), torch.tensor(0.2 * arm * rng.uniform(-1.0, 1.0, (n, 3)))
+        offset = 0.2 * arm * rng.uniform(-1.0, 1.0, (n, 3))
+        self._payload = (torch.tensor(mass), torch.tensor(offset))
 
     def reset(self, start: State) -> None:
         self._time = 0.0
@@ -120,10 +118,13 @@ class RotorPy:
             self._time += duration
 
     def state(self) -> State:
-        position, quaternion, velocity, rates = (
-            self.fields[name].numpy() for name in ("x", "q", "v", "w")
+        quaternion = np.roll(self.fields["q"].numpy(), 1, axis=1)
+        return State(
+            self.fields["x"].numpy(),
+            quaternion,
+            self.fields["v"].numpy(),
+            self.fields["w"].numpy(),
         )
-        return State(position, np.roll(quaternion, 1, axis=1), velocity, rates)
 
     def thrusts(self, speeds: Array) -> Array:
         low, high = self._speeds
@@ -131,8 +132,9 @@ class RotorPy:
 
 
 class SE3:
-    """RotorPy's own geometric controller, with the gains of its vehicle file; it sees the true
-    state.
+    """RotorPy's own geometric controller, on the true state.
+
+    Its gains come from RotorPy's vehicle file.
     """
 
     def __init__(self, simulator: RotorPy) -> None:
@@ -140,19 +142,21 @@ class SE3:
         self._control = BatchedSE3Control(simulator.parameters, simulator.n, DEVICE)
 
     def reset(self, n: int) -> None:
-        self._rest = {name: torch.zeros(n, 3) for name in ("x_dot", "x_ddot")} | {
-            name: torch.zeros(n) for name in ("yaw", "yaw_dot")
+        self._rest = {
+            "x_dot": torch.zeros(n, 3),
+            "x_ddot": torch.zeros(n, 3),
+            "yaw": torch.zeros(n),
+            "yaw_dot": torch.zeros(n),
         }
 
     def __call__(self, observation: Array, state: State, target: Array) -> Array:
         wanted = {"x": torch.tensor(target), **self._rest}
-        return np.asarray(
-            self._control.update(0.0, self._simulator.fields, wanted)["cmd_motor_thrusts"].numpy()
-        )
+        commands = self._control.update(0.0, self._simulator.fields, wanted)
+        return np.asarray(commands["cmd_motor_thrusts"].numpy())
 
 
 def gusts(n: int) -> BatchedSinusoidWind:
-    """Sines of 2 m/s and 0.3 Hz along each axis, in a phase of their own."""
+    """Sines of 2 m/s and 0.3 Hz along each axis, each with a phase of its own."""
     phase = torch.tensor(np.random.default_rng(0).uniform(0.0, 1.0 / 0.3, (n, 3)))
     return BatchedSinusoidWind(torch.full((n, 3), 2.0), torch.full((n, 3), 0.3), phase)
 
@@ -162,9 +166,8 @@ WINDS = {
     "_wind": ("drag, wind 4 m/s", partial(BatchedConstantWind, wx=4.0, wy=0.0, wz=0.0)),
     "_gusts": ("drag, sine gusts 2 m/s", gusts),
 }
-BENCH: dict[
-    str, tuple[str, dict[str, float]]
-] = {  # the ranges of AdaptiveQuadBench's config/randomization_config.py
+# The ranges of AdaptiveQuadBench's config/randomization_config.py.
+BENCH: dict[str, tuple[str, dict[str, Any]]] = {
     "_payload": ("drag, payload up to 0.5 m off centre", {"payload": 0.5}),
     "_rotors": ("drag, each rotor off by up to 30 %", {"weakness": 0.3}),
 }

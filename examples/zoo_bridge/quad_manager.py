@@ -1,8 +1,7 @@
-"""rl_zoo3's ``ExperimentManager`` with our settings files: experts, the batched environment,
-settings of evaluations.
+"""rl_zoo3's ``ExperimentManager`` for our settings files.
 
-What differs holds for our algorithms and for any algorithm on our environments; everything else is
-as it was.
+It adds experts, the batched environment and settings of evaluations, for our algorithms and for any
+algorithm on our environments. For everything else it is rl_zoo3's own.
 """
 
 import argparse
@@ -31,27 +30,29 @@ VEC_ENVS = get_args(VecEnvKind)
 
 
 class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
-    """Sets up trainings of ours in rl_zoo3.
+    """Set up our trainings in rl_zoo3.
 
-    ==========================
-    =================================================================================== key or flag
-    what becomes of it ==========================
-    ===================================================================================
-    ``--conf-file``             also a file of this package by name; by default its ``<algo>.yml``
-    ``expert``                  resolved as ``sb3-quad train`` does, for the vehicle of
-    ``env_kwargs`` ``vec_env``                 ``batch`` (default), ``dummy`` or ``subproc``; the
-    flag ``--vec-env``, where given, over it ``--env-kwargs``            put over those of the file,
-    key by key ``eval_env_kwargs``         put over ``env_kwargs`` in evaluations,
-    ``--eval-env-kwargs`` over both ``eval_tasks``              left out: rl_zoo3 evaluates on one
-    environment; a line says so ``learning_rate: lin_x``    SB3's own schedule, so that the zip
-    loads where rl_zoo3 is not installed ``-i`` / --trained-agent    for our algorithms: policy and
-    critic of any on-policy zip, with a new optimiser ``-optimize``, --trial-id   for our
-    algorithms: refused; ``sb3-quad tune`` searches, and writes settings for ``-conf``
-    ==========================
-    ===================================================================================
+    =========================  =================================================================
+    key or flag                effect
+    =========================  =================================================================
+    ``--conf-file``            may name a file of this package; by default its ``<algo>.yml``
+    ``expert``                 resolved as in ``sb3-quad train``, for the vehicle of
+                               ``env_kwargs``
+    ``vec_env``                ``batch`` (default), ``dummy`` or ``subproc``; the flag
+                               ``--vec-env`` comes first
+    ``--env-kwargs``           come before those of the file, key by key
+    ``eval_env_kwargs``        come before ``env_kwargs`` in evaluations, and
+                               ``--eval-env-kwargs`` before both
+    ``eval_tasks``             ignored, with a line that says so: rl_zoo3 evaluates on one
+                               environment
+    ``learning_rate: lin_x``   SB3's own schedule, so that the zip loads without rl_zoo3
+    ``-i``, --trained-agent    for our algorithms: policy and critic of any on-policy zip, with
+                               a new optimiser
+    ``-optimize``, --trial-id  for our algorithms: refused; ``sb3-quad tune`` searches, and
+                               writes settings for ``-conf``
+    =========================  =================================================================
 
-    Its ``args.yml`` gives as ``env_kwargs`` what evaluations are flown with, which is what
-    ``enjoy`` is to show.
+    In ``args.yml``, ``env_kwargs`` are those of the evaluations, which ``enjoy`` shows.
     """
 
     config: str
@@ -74,16 +75,16 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             self.monitor_kwargs = {"info_keywords": ("is_success",)}  # for plot_train -y success
 
     def read_hyperparameters(self) -> Any:
-        """The settings of the environment, to be processed and to be saved."""
+        """Read the settings, once to be processed and once to be saved."""
         if not self._ours:
             return super().read_hyperparameters()
-        given, self.env_kwargs = self.env_kwargs, {}
+        # rl_zoo3 would replace the file's env_kwargs by the flags; merge them instead.
+        given = self.env_kwargs
+        self.env_kwargs = {}
         settings, saved = super().read_hyperparameters()
-        for each in (settings, saved):
-            each["env_kwargs"] = {
-                **parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs"),
-                **given,
-            }
+        from_file = parse_mapping(settings.get("env_kwargs"), f"{self.config}: env_kwargs")
+        settings["env_kwargs"] = {**from_file, **given}
+        saved["env_kwargs"] = {**from_file, **given}
         return settings, saved
 
     def _preprocess_hyperparams(self, hyperparams: Settings) -> Any:
@@ -94,12 +95,11 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
             hyperparams.pop("eval_env_kwargs", None), f"{self.config}: eval_env_kwargs"
         )
         if hyperparams.pop("eval_tasks", None):
-            print("eval_tasks: left out, rl_zoo3 evaluates on the environment's own task")
+            print("eval_tasks: ignored, rl_zoo3 evaluates on the environment's own task")
         expert = hyperparams.pop("expert", None)
         if self._own_algorithm:
-            hyperparams["expert"] = resolve_expert(
-                expert or DEFAULT_EXPERT, hyperparams["env_kwargs"].get("vehicle", "itm")
-            )
+            vehicle = hyperparams["env_kwargs"].get("vehicle", "itm")
+            hyperparams["expert"] = resolve_expert(expert or DEFAULT_EXPERT, vehicle)
         for name, parameter in constructor_parameters(ALGOS[self.algo]).items():
             if name in hyperparams:
                 hyperparams[name] = convert(hyperparams[name], parameter, f"{self.config}: {name}")
@@ -115,51 +115,52 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
         }
         if self._batched and processed[1] is not None:
             raise ConfigError(
-                "env_wrapper: the batched environment has no single environments to wrap; use vec_env dummy"
+                "env_wrapper: the batched environment has no single environments to wrap; "
+                "use vec_env dummy"
             )
         return processed
 
     def _preprocess_schedules(self, hyperparams: Settings) -> Settings:
-        return (
-            hyperparams if self._ours else super()._preprocess_schedules(hyperparams)
-        )  # ours are made above
+        # _preprocess_hyperparams has made our schedules already.
+        if self._ours:
+            return hyperparams
+        return super()._preprocess_schedules(hyperparams)
 
     def _choose_vec_env(self, setting: str | None) -> None:
         parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
         parser.add_argument("--vec-env")
-        flag = parser.parse_known_args()[
-            0
-        ].vec_env  # rl_zoo3's own default hides whether it was given
-        kind = flag or setting or ("batch" if self._env_id in ENVIRONMENTS else "dummy")
+        # rl_zoo3's own default hides whether the flag was given, so read the command line again.
+        flags, _ = parser.parse_known_args()
+        default = "batch" if self._env_id in ENVIRONMENTS else "dummy"
+        kind = flags.vec_env or setting or default
         if kind not in VEC_ENVS:
             raise ConfigError(f"{self.config}: {unknown('vec_env', kind, VEC_ENVS)}")
         if kind == "batch" and self._env_id not in ENVIRONMENTS:
             raise ConfigError(
-                f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; use dummy or subproc"
+                f"{self.config}: vec_env is batch, but {self._env_id} has no batched form; "
+                "use dummy or subproc"
             )
         self._batched = kind == "batch"
         if kind != "batch":
             self.vec_env_class = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}[kind]
 
     def create_envs(self, n_envs: int, eval_env: bool = False, no_log: bool = False) -> Any:
-        """The environments of a training or an evaluation, with their wrappers."""
+        """Make the environments of a training or an evaluation, with their wrappers."""
         if self._batched:
-            kwargs = {
-                "task": ENVIRONMENTS[self._env_id],
-                **(self.eval_env_kwargs if eval_env else self.env_kwargs),
-            }
-            file = (
-                None if eval_env or no_log else str(Path(self.save_path) / "0")
-            )  # with .monitor.csv after it
+            kwargs = self.eval_env_kwargs if eval_env else self.env_kwargs
+            kwargs = {"task": ENVIRONMENTS[self._env_id], **kwargs}
+            file = None
+            if not eval_env and not no_log:
+                file = str(Path(self.save_path) / "0")  # VecMonitor appends .monitor.csv
 
             def make(makers: list[Callable[[], Any]]) -> VecEnv:
-                """As many rows as SB3's ``make_vec_env`` would make environments."""
+                """Make a row for each environment that SB3's ``make_vec_env`` would make."""
                 env = QuadcopterVecEnv(len(makers), staggered=not eval_env, **kwargs)
                 with warnings.catch_warnings():
                     warnings.filterwarnings(
                         "ignore", "The environment is already wrapped with a `Monitor`"
                     )
-                    return VecMonitor(env, file, ("is_success",))  # writes the file
+                    return VecMonitor(env, file, ("is_success",))
 
             self.vec_env_class = make
         return super().create_envs(n_envs, eval_env, no_log)
@@ -181,15 +182,13 @@ class QuadExperimentManager(rl_zoo3.exp_manager.ExperimentManager):
 
 
 def _find_config(given: str, algo: str) -> str:
-    """The path of a settings file: one on disk, or one of this package.
+    """Return the path of a settings file, on disk or of this package.
 
-    :param given: as in rl_zoo3: what ``--conf-file`` says, or the path of rl_zoo3's own file if it
-        says nothing.
+    :param given: value of ``--conf-file``, or the path of rl_zoo3's own file without that flag.
     """
-    nothing_said = (
-        Path(given) == Path(rl_zoo3.exp_manager.__file__).parent / "hyperparams" / f"{algo}.yml"
-    )
-    name = f"{algo}.yml" if nothing_said else given
-    if name in SETTINGS.names() and (nothing_said or not Path(name).is_file()):
+    zoo_file = Path(rl_zoo3.exp_manager.__file__).parent / "hyperparams" / f"{algo}.yml"
+    is_default = Path(given) == zoo_file
+    name = f"{algo}.yml" if is_default else given
+    if name in SETTINGS.names() and (is_default or not Path(name).is_file()):
         return str(resources.files("sb3_quad.zoo_configs").joinpath(name))
     return given
