@@ -16,9 +16,9 @@ from typing import Any
 from sb3_quad.base.errors import ConfigError
 from sb3_quad.base.files import refuse_existing, write_bytes
 from sb3_quad.cli.parser import Parser, add_common
+from sb3_quad.evaluation.scenarios import THESIS_SCENARIOS
 
 PANELS = ("success", "survival", "reward", "losses")
-THESIS = {"state_recovery": "recovery", "target_tracking": "tracking"}  # its scenarios by task
 
 
 def add_arguments(parser: Parser) -> None:
@@ -33,8 +33,8 @@ def add_arguments(parser: Parser) -> None:
     add(
         "--line", action="append", default=[], type=_line, metavar="NAME:SUCCESS:REWARD", help=lines
     )
-    thesis = f"draw what the thesis prints of {', '.join(THESIS)} as horizontal lines"
-    add("--thesis", choices=[*THESIS], metavar="TASK", help=thesis)
+    thesis = f"draw what the thesis prints of {', '.join(THESIS_SCENARIOS)} as horizontal lines"
+    add("--thesis", choices=[*THESIS_SCENARIOS], metavar="TASK", help=thesis)
     add(
         "--show",
         nargs="+",
@@ -100,9 +100,8 @@ def run(options: argparse.Namespace) -> int:
         raise ConfigError(f"--output {options.output}: must end in .png, .svg or .pdf")
     lines = {}
     if options.thesis:  # its success is our survival
-        for name, reference in (
-            load_suite("thesis").scenario(THESIS[options.thesis]).reference.items()
-        ):
+        scenario = load_suite("thesis").scenario(THESIS_SCENARIOS[options.thesis])
+        for name, reference in scenario.reference.items():
             lines[f"thesis: {name}"] = reference.model_dump(
                 include={"survival", "reward"}, exclude_none=True
             )

@@ -46,15 +46,12 @@ class VectorDistribution(OneOf):
 
     ways = ("value", "std", "magnitude")
 
-    value: Vector | None = Field(
-        default=None, description="the vector itself, in the unit of what it is for"
-    )
-    std: NonNegativeFloat | None = Field(
-        default=None, description="standard deviation of each component, in the same unit"
-    )
-    magnitude: NonNegativeFloat | None = Field(
-        default=None, description="length, in the same unit; the direction is random"
-    )
+    value: Vector | None = None
+    """the vector itself, in the unit of what it is for"""
+    std: NonNegativeFloat | None = None
+    """standard deviation of each component, in the same unit"""
+    magnitude: NonNegativeFloat | None = None
+    """length, in the same unit; the direction is random"""
 
     @property
     def largest(self) -> float:
@@ -80,16 +77,12 @@ class Attitude(OneOf):
 
     ways = ("quaternion", "tilt", "distribution")
 
-    quaternion: tuple[float, float, float, float] | None = Field(
-        default=None, description="w, x, y, z, body to world; is normalised"
-    )
-    tilt: Annotated[float, Field(ge=0, le=180)] | None = Field(
-        default=None,
-        description="angle between body z and world z, deg; about a random horizontal axis",
-    )
-    distribution: Literal["uniform"] | None = Field(
-        default=None, description="uniform on SO(3), as in state recovery"
-    )
+    quaternion: tuple[float, float, float, float] | None = None
+    """w, x, y, z, body to world; is normalised"""
+    tilt: Annotated[float, Field(ge=0, le=180)] | None = None
+    """angle between body z and world z, deg; about a random horizontal axis"""
+    distribution: Literal["uniform"] | None = None
+    """uniform on SO(3), as in state recovery"""
 
     @model_validator(mode="before")
     @classmethod
@@ -117,19 +110,16 @@ class Attitude(OneOf):
 class Start(Frozen):
     """Where and how an episode starts; rotors turn at hover speed."""
 
-    position: Vector = Field(default=(0.0, 0.0, 15.0), description="r0, world frame, m")
-    attitude: Attitude = Field(
-        default=Attitude(tilt=0.0), description="level, uniform, {quaternion: …} or {tilt: deg}"
-    )
-    velocity: VectorDistribution = Field(
-        default=ZERO, description="m/s: [x, y, z], {std: …} or {magnitude: …}"
-    )
-    velocity_frame: Frame = Field(
-        default="world", description="world or body: the axes of velocity"
-    )
-    body_rates: VectorDistribution = Field(
-        default=ZERO, description="body frame, rad/s: given as velocity is"
-    )
+    position: Vector = (0.0, 0.0, 15.0)
+    """r0, world frame, m"""
+    attitude: Attitude = Attitude(tilt=0.0)
+    """level, uniform, {quaternion: …} or {tilt: deg}"""
+    velocity: VectorDistribution = ZERO
+    """m/s: [x, y, z], {std: …} or {magnitude: …}"""
+    velocity_frame: Frame = "world"
+    """world or body: the axes of velocity"""
+    body_rates: VectorDistribution = ZERO
+    """body frame, rad/s: given as velocity is"""
 
     @model_validator(mode="after")
     def _turnable(self) -> "Start":
@@ -149,17 +139,14 @@ class Target(OneOf):
 
     ways = ("position", "distance", "waypoints")
 
-    position: Vector | None = Field(default=None, description="r_T, world frame, m")
-    distance: NonNegativeFloat | None = Field(
-        default=None,
-        description="from the start in a uniformly random direction above ground, m; 0: the start itself",
-    )
-    waypoints: tuple[Vector, ...] | None = Field(
-        default=None, min_length=1, description="targets one after the other, world frame, m"
-    )
-    radius: PositiveFloat | None = Field(
-        default=None, description="a waypoint counts as reached within this, m (0.5)"
-    )
+    position: Vector | None = None
+    """r_T, world frame, m"""
+    distance: NonNegativeFloat | None = None
+    """from the start in a uniformly random direction above ground, m; 0: the start itself"""
+    waypoints: tuple[Vector, ...] | None = Field(default=None, min_length=1)
+    """targets one after the other, world frame, m"""
+    radius: PositiveFloat | None = None
+    """a waypoint counts as reached within this, m (0.5)"""
 
     @property
     def points(self) -> tuple[Vector, ...]:
@@ -176,25 +163,22 @@ class Target(OneOf):
 class Wrench(Frozen):
     """An external force and torque at the centre of mass for some time; those that overlap add up."""
 
-    start: NonNegativeFloat = Field(default=0.0, description="when it begins, s")
-    duration: PositiveFloat | None = Field(
-        default=None, description="how long it acts, s; left out: to the end"
-    )
-    force: VectorDistribution = Field(
-        default=ZERO, description="N, or as unit says: [x, y, z], {std: …} or {magnitude: …}"
-    )
-    torque: VectorDistribution = Field(
-        default=ZERO, description="N m, or as unit says: as force is given"
-    )
-    unit: Literal["SI", "weight"] = Field(
-        default="SI",
-        description="weight: force in weights m g of the vehicle, torque in weights times its arm length",
-    )
-    factor: float = Field(
-        default=1.0, description="multiplies force and torque alike; to vary the size of a hit"
-    )
-    force_frame: Frame = Field(default="world", description="world or body: the axes of force")
-    torque_frame: Frame = Field(default="body", description="world or body: the axes of torque")
+    start: NonNegativeFloat = 0.0
+    """when it begins, s"""
+    duration: PositiveFloat | None = None
+    """how long it acts, s; left out: to the end"""
+    force: VectorDistribution = ZERO
+    """N, or as unit says: [x, y, z], {std: …} or {magnitude: …}"""
+    torque: VectorDistribution = ZERO
+    """N m, or as unit says: as force is given"""
+    unit: Literal["SI", "weight"] = "SI"
+    """weight: force in weights m g of the vehicle, torque in weights times its arm length"""
+    factor: float = 1.0
+    """multiplies force and torque alike; to vary the size of a hit"""
+    force_frame: Frame = "world"
+    """world or body: the axes of force"""
+    torque_frame: Frame = "body"
+    """world or body: the axes of torque"""
 
     def units(self, vehicle: Vehicle) -> tuple[float, float]:
         """The units of force, N, and torque, N m, on a vehicle before its changes."""
@@ -207,19 +191,14 @@ class VehicleChanges(Frozen):
     limits stay what they are.
     """
 
-    mass: Factor = Field(
-        default=1.0, description="is a factor: 1.3 is 30 % more; thrust limits in N stay"
-    )
-    inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = Field(
-        default=1.0, description="factor of Ixx, Iyy and Izz, or one for each"
-    )
-    motor_gain: Factor = Field(
-        default=1.0, description="is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"
-    )
-    delay: Annotated[int, Field(ge=0, le=100)] | None = Field(
-        default=None,
-        description="control steps from a command to its effect; left out: the vehicle's own",
-    )
+    mass: Factor = 1.0
+    """is a factor: 1.3 is 30 % more; thrust limits in N stay"""
+    inertia: PositiveFloat | tuple[PositiveFloat, PositiveFloat, PositiveFloat] = 1.0
+    """factor of Ixx, Iyy and Izz, or one for each"""
+    motor_gain: Factor = 1.0
+    """is a factor of k_m (Eq. 4.1): 1.3 is 30 % more"""
+    delay: Annotated[int, Field(ge=0, le=100)] | None = None
+    """control steps from a command to its effect; left out: the vehicle's own"""
 
     def apply(self, vehicle: Vehicle) -> Vehicle:
         """The changed vehicle.

@@ -39,24 +39,24 @@ NumberOrRange = float | tuple[float, float]
 class Reference(Frozen):
     """What others measured, printed beside our own metrics; a pair is a range."""
 
-    success: NumberOrRange | None = Field(
-        default=None, description="share of flights that end at their target, 0 to 1"
-    )
-    survival: NumberOrRange | None = Field(
-        default=None, description="share that neither crash nor get lost: the thesis's success"
-    )
-    reward: NumberOrRange | None = Field(default=None, description="mean per episode")
-    time_to: dict[str, NumberOrRange | None] = Field(
-        default_factory=dict,
-        description="from tolerances in m to mean times in s; null: never within it",
-    )
-    path: NumberOrRange | None = Field(default=None, description="mean path, m")
-    final_error: NumberOrRange | None = Field(default=None, description="|r - r_T| at the end, m")
-    flown: NumberOrRange | None = Field(default=None, description="until the flight ended, s")
-    recovery_time: NumberOrRange | None = Field(
-        default=None, description="until the vehicle was stable again, s"
-    )
-    note: str = Field(default="", description="what the source says in words")
+    success: NumberOrRange | None = None
+    """share of flights that end at their target, 0 to 1"""
+    survival: NumberOrRange | None = None
+    """share that neither crash nor get lost: the thesis's success"""
+    reward: NumberOrRange | None = None
+    """mean per episode"""
+    time_to: dict[str, NumberOrRange | None] = Field(default_factory=dict)
+    """from tolerances in m to mean times in s; null: never within it"""
+    path: NumberOrRange | None = None
+    """mean path, m"""
+    final_error: NumberOrRange | None = None
+    """|r - r_T| at the end, m"""
+    flown: NumberOrRange | None = None
+    """until the flight ended, s"""
+    recovery_time: NumberOrRange | None = None
+    """until the vehicle was stable again, s"""
+    note: str = ""
+    """what the source says in words"""
 
     @field_validator("time_to", mode="before")
     @classmethod
@@ -71,59 +71,44 @@ class Reference(Frozen):
 class Scenario(Frozen):
     """What is flown, how often, and what others measured there. Units m, s, rad, N, N m, kg."""
 
-    name: str = Field(pattern=NAME, description="letters, digits, _ . -; unique in its suite")
-    title: str = Field(default="", description="heading of tables and plots; left out: the name")
-    description: str = Field(default="", description="what it is, and where it comes from")
-    start: Start = Field(
-        default=Start(), description="where an episode starts; left out: hovering at (0, 0, 15) m"
-    )
-    target: Target = Field(
-        default=Target(distance=0.0), description="where to fly; left out: to the start"
-    )
-    wrenches: tuple[Wrench, ...] = Field(default=(), description="external forces and torques")
-    noise: Noise | Annotated[float, Field(ge=0, le=1)] = Field(
-        default=0.05,
-        description="relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}",
-    )
-    duration: Annotated[float, Field(gt=0, le=600)] = Field(
-        default=15.0, description="of an episode; the unit is s"
-    )
-    max_distance: PositiveFloat = Field(
-        default=30.0, description="farther than this from the target ends an episode, m"
-    )
-    vehicle: str | Vehicle | None = Field(
-        default=None,
-        description="name, or path of a YAML file (relative to the suite's); left out: the agent's own, or itm",
-    )
-    vehicle_changes: VehicleChanges = Field(
-        default=VehicleChanges(), description="unknown to the controller"
-    )
-    vehicles: VehicleDistribution | None = Field(
-        default=None,
-        description="each episode has a vehicle of it, unknown to the controller, such as {distribution: raptor}",
-    )
-    randomize: Randomization | None = Field(
-        default=None,
-        description="what differs by episode, unknown to the controller, such as {gusts: {std: 1}}",
-    )
-    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = Field(
-        default=240, description="how many are flown"
-    )
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = Field(
-        default=0, description="from which every episode gets its own"
-    )
-    tolerances: tuple[PositiveFloat, ...] = Field(
-        default=TOLERANCES, min_length=1, description="of arrival, |r - r_T|, m"
-    )
-    reference: dict[str, Reference] = Field(
-        default_factory=dict, description="from a column's title to others' metrics"
-    )
-    group: str | None = Field(
-        default=None, description="the scenario that this one is a cell of; set by vary"
-    )
-    cell: dict[str, float] = Field(
-        default_factory=dict, description="this cell's values, by key; set by vary"
-    )
+    name: str = Field(pattern=NAME)
+    """letters, digits, _ . -; unique in its suite"""
+    title: str = ""
+    """heading of tables and plots; left out: the name"""
+    description: str = ""
+    """what it is, and where it comes from"""
+    start: Start = Start()
+    """where an episode starts; left out: hovering at (0, 0, 15) m"""
+    target: Target = Target(distance=0.0)
+    """where to fly; left out: to the start"""
+    wrenches: tuple[Wrench, ...] = ()
+    """external forces and torques"""
+    noise: Noise | Annotated[float, Field(ge=0, le=1)] = 0.05
+    """relative std of the observation noise, a share: 0.05 is 5 %; or {relative: …, additive: …}"""
+    duration: Annotated[float, Field(gt=0, le=600)] = 15.0
+    """of an episode; the unit is s"""
+    max_distance: PositiveFloat = 30.0
+    """farther than this from the target ends an episode, m"""
+    vehicle: str | Vehicle | None = None
+    """name, or path of a YAML file (relative to the suite's); left out: the agent's own, or itm"""
+    vehicle_changes: VehicleChanges = VehicleChanges()
+    """unknown to the controller"""
+    vehicles: VehicleDistribution | None = None
+    """each episode has a vehicle of it, unknown to the controller, such as {distribution: raptor}"""
+    randomize: Randomization | None = None
+    """what differs by episode, unknown to the controller, such as {gusts: {std: 1}}"""
+    episodes: Annotated[int, Field(ge=1, le=1_000_000)] = 240
+    """how many are flown"""
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    """from which every episode gets its own"""
+    tolerances: tuple[PositiveFloat, ...] = Field(default=TOLERANCES, min_length=1)
+    """of arrival, |r - r_T|, m"""
+    reference: dict[str, Reference] = Field(default_factory=dict)
+    """from a column's title to others' metrics"""
+    group: str | None = None
+    """the scenario that this one is a cell of; set by vary"""
+    cell: dict[str, float] = Field(default_factory=dict)
+    """this cell's values, by key; set by vary"""
 
     @field_validator("vehicle")
     @classmethod
@@ -302,11 +287,12 @@ class Scenario(Frozen):
 class Suite(Frozen):
     """Scenarios that belong together."""
 
-    name: str = Field(pattern=NAME, description="what the suite is called")
-    description: str = Field(default="", description="what it is for")
-    source: str = Field(
-        default="reference", description="where the reference comes from; heads its column"
-    )
+    name: str = Field(pattern=NAME)
+    """what the suite is called"""
+    description: str = ""
+    """what it is for"""
+    source: str = "reference"
+    """where the reference comes from; heads its column"""
     scenarios: tuple[Scenario, ...] = Field(min_length=1)
 
     def scenario(self, name: str) -> Scenario:
