@@ -232,22 +232,22 @@ def slim_bytes(path: str | Path, settings: FlightSettings | None = None) -> byte
     return buffer.getvalue()
 
 
-def measure(policy: Any, n_episodes: int, **settings: Any) -> dict[str, Flights]:
+def measure(policy: Any, n_flights: int, **settings: Any) -> dict[str, Flights]:
     """The flights of the table's rows, by name: recoveries, then targets at each distance.
 
-    :param n_episodes: at each distance.
+    :param n_flights: at each distance.
     :param settings: ``vehicle``, ``noise`` and ``observation_std``, as
         :func:`~sb3_quad.evaluation.flights.fly` takes them.
     """
     parts = [
-        fly(policy, "state_recovery", n_episodes, seed_for("card", k), **settings)
+        fly(policy, "state_recovery", n_flights, seed_for("card", k), **settings)
         for k in range(N_RECOVERIES)
     ]
     rows = {RECOVERY: Flights.concatenate(parts)}
     for name, distance in TARGETS.items():
         task = {"target_distance": distance}
         seed = seed_for("card", int(1000 * distance))
-        rows[name] = fly(policy, "target_tracking", n_episodes, seed, task_kwargs=task, **settings)
+        rows[name] = fly(policy, "target_tracking", n_flights, seed, task_kwargs=task, **settings)
     return rows
 
 

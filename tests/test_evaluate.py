@@ -105,11 +105,11 @@ def test_the_physical_limit_stands_beside_the_time_to_stay(here, capsys):
     assert [entry.physical_limit for entry in load_results("out").entries] == [*limits, None, None]
     lines = capsys.readouterr().out.splitlines()
     (at,) = (
-        number for number, line in enumerate(lines) if "physical limit of that time, s" in line
+        number for number, line in enumerate(lines) if "physical limit of the settling time, s" in line
     )
     assert (
         all(f"{limit:.2f}" in lines[at] for limit in limits)
-        and "to stay within 0.1 m, s" in lines[at - 1]
+        and "settling time (0.1 m), s" in lines[at - 1]
     )
 
 
@@ -263,7 +263,7 @@ def test_failures_are_one_line_each_and_the_others_fly(here, capsys):
 def test_labels():
     specs = parse_controllers(["pid", "x/other.zip", "runs/lr=1/z.zip", "me=q.zip"])
     assert [spec.label for spec in specs] == ["pid", "other", "z", "me"]
-    with pytest.raises(ConfigError, match="two are called so"):
+    with pytest.raises(ConfigError, match="two have this label"):
         parse_controllers(["a/best.zip", "b/best.zip"])
 
 

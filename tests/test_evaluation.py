@@ -136,7 +136,7 @@ def test_times_to_stay_and_overshoot_are_those_of_the_distances():
     distances = Distances()
     flights = fly(
         load_pretrained("itm-robust"),
-        n_episodes=24,
+        n_flights=24,
         max_steps=700,
         hooks=[distances],
         **env_kwargs("itm-robust"),

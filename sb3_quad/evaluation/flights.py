@@ -163,7 +163,8 @@ def fly(
     :param tolerances: of arrival, |r - r_T|, m.
     :param hooks: are called along the way.
     :param reward: a reward of your own, ``reward(state, actions)`` -> (n,) for the state after each
-        control step and the actions (n, 4); its sums are ``Flights.own_reward``.
+        control step and the actions (n, 4); its sums are ``Flights.own_reward``. A class is
+        instantiated for these episodes and may remember.
     :raises ConfigError: an unknown backend or keyword, fewer than one episode, or a controller of
         another kind.
     :raises ControllerError: a controller or reward that fails in flight.
@@ -209,6 +210,9 @@ def fly_settings(
             fleet.true_state,
             deterministic=deterministic,
         )
+        if isinstance(reward, type):
+            # A reward that remembers, such as the last actions, begins afresh with these episodes.
+            reward = reward()
         plan = plan or Plan()
         return _fly_fleet(
             fleet, pilot, plan, settings.longest_episode, tolerances, [*hooks], reward
@@ -285,7 +289,7 @@ def _fly_fleet(
 def _at_start(
     state: QuadcopterState, plan: Plan, arrivals: "Arrivals", motion: "Motion", course: "Waypoints"
 ) -> Flights:
-    """The metrics before the first step; those of arrivals, motion and course are views of theirs."""
+    """The metrics before the first step; arrivals, motion and course update theirs in place."""
     n = state.n
     undefined = np.full(n, np.nan)
     return Flights(

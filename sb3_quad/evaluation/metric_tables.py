@@ -52,10 +52,20 @@ def settling_row(tolerance: float) -> Row:
     return Row(f"{SETTLING} ({tolerance:g} m)", "s")
 
 
-def share_cell(estimate: Estimate) -> Cell:
+def estimate_cell(
+    estimate: Estimate | None, factor: float = 1.0, decimals: int = 2, none: str = "–"
+) -> Cell:
+    """Return an estimate with its interval, both times ``factor``; the words ``none`` for None."""
+    if estimate is None:
+        return Cell(words=none)
+    ends = factor * estimate.low, factor * estimate.high
+    return Cell(factor * estimate.value, ends, decimals)
+
+
+def share_cell(share: Estimate | None) -> Cell:
     """Return a share in percent, with as many digits as a single flight takes to show."""
-    digits = len(str(estimate.n // 200))
-    return Cell(100 * estimate.value, (100 * estimate.low, 100 * estimate.high), decimals=digits)
+    digits = 0 if share is None else len(str(share.n // 200))
+    return estimate_cell(share, 100.0, digits)
 
 
 def metric_cells(metrics: Metrics) -> Cells:
@@ -63,12 +73,12 @@ def metric_cells(metrics: Metrics) -> Cells:
     cells = {
         SUCCESS: share_cell(metrics.success),
         SURVIVAL: share_cell(metrics.survival),
-        REWARD: _mean(metrics.reward),
-        FLOWN: _mean(metrics.flown),
+        REWARD: estimate_cell(metrics.reward),
+        FLOWN: estimate_cell(metrics.flown),
         OVERSHOOT: Cell(metrics.overshoot, words="–"),
-        PATH: _mean(metrics.path),
+        PATH: estimate_cell(metrics.path),
         MEDIAN: Cell(metrics.final_error_median, decimals=3, words="–"),
-        QUANTILE: replace(_mean(metrics.final_error_95), decimals=3),
+        QUANTILE: estimate_cell(metrics.final_error_95, decimals=3),
         RECOVERY_TIME: _moment(metrics.recovery_time, "recover"),
     }
     near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
@@ -76,22 +86,20 @@ def metric_cells(metrics: Metrics) -> Cells:
         cells[time_row(arrival.tolerance)] = _moment(arrival, "arrive")
         if arrival.tolerance == near:
             cells[settling_row(near)] = _moment(arrival.settling, "settle")
-            cells[OVERSHOOT_RATE] = Cell(words="–")
-            if arrival.overshoot_rate is not None:
-                cells[OVERSHOOT_RATE] = share_cell(arrival.overshoot_rate)
+            cells[OVERSHOOT_RATE] = share_cell(arrival.overshoot_rate)
     if metrics.own_reward is not None:
-        cells[OWN_REWARD] = _mean(metrics.own_reward)
+        cells[OWN_REWARD] = estimate_cell(metrics.own_reward)
     if metrics.cross_track_error is not None:
-        cells[CROSS_TRACK_ERROR] = _mean(metrics.cross_track_error)
+        cells[CROSS_TRACK_ERROR] = estimate_cell(metrics.cross_track_error)
     if metrics.course is not None:
-        cells[REACHED] = _mean(metrics.course.reached)
+        cells[REACHED] = estimate_cell(metrics.course.reached)
         cells[COMPLETED] = share_cell(metrics.course.completed)
-        cells[COURSE_TIME] = _mean(metrics.course.time, "never")
+        cells[COURSE_TIME] = estimate_cell(metrics.course.time, none="never")
     return cells
 
 
 def measured_cells(results: Results, controller: str, scenario: Scenario) -> Cells | None:
-    """Return the :func:`metric_cells` of a label, and the limit of its vehicle; None if it failed."""
+    """Return the :func:`metric_cells` of a label and its vehicle's limit; None if it failed."""
     entry = results.entry(controller, scenario.name)
     if entry is None:
         return None
@@ -235,18 +243,12 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     return [*common, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
-def _mean(estimate: Estimate | None, none: str = "–") -> Cell:
-    if estimate is None:
-        return Cell(words=none)
-    return Cell(estimate.value, (estimate.low, estimate.high))
-
-
 def _moment(moment: Moment, verb: str) -> Cell:
-    """The mean time of an event, and in the note how many flights reach it unless all or none do."""
+    """The mean time of an event; the note says how many flights reach it, unless all or none do."""
     note = ""
     if moment.time is not None and moment.share.value < 1.0:
         note = f"{100 * moment.share.value:.3g} % {verb}"
-    return replace(_mean(moment.time, "never"), note=note)
+    return replace(estimate_cell(moment.time, none="never"), note=note)
 
 
 def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:

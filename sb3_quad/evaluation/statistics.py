@@ -36,9 +36,11 @@ def share(hits: npt.ArrayLike) -> Estimate:
     n = array.size
     p = float(array.mean())
     scale = 1 + Z * Z / n
-    centre = (p + Z * Z / (2 * n)) / scale
-    half_width = Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n)) / scale
-    return Estimate(value=p, low=min(p, centre - half_width), high=max(p, centre + half_width), n=n)
+    centre = p + Z * Z / (2 * n)
+    half = Z * math.sqrt(p * (1 - p) / n + Z * Z / (4 * n * n))
+    low = (centre - half) / scale
+    high = (centre + half) / scale
+    return Estimate(value=p, low=min(p, low), high=max(p, high), n=n)
 
 
 def mean(values: npt.ArrayLike) -> Estimate | None:

@@ -14,10 +14,11 @@ examples:
   sb3-quad evaluate agent.zip --suite robustness --workers 2
   sb3-quad evaluate agent.zip --suite robustness --executor ray --address auto
   sb3-quad evaluate pid my_package.control:make --suite my_scenarios.yaml
+  sb3-quad evaluate pid agent.zip --reward my_package.rewards:calm   the mean of your own reward, too
   sb3-quad evaluate pid --suite quick --backend pybullet       the same episodes on PyBullet
   sb3-quad evaluate pid geometric agent.zip --scenario tracking recovery --vehicle crazyflie -o evaluations/crazyflie
 
-A folder holds the results of one command: give all controllers at once. The same command goes on
+A folder holds the results of one command: give all controllers at once. The same command resumes
 where it was interrupted.
 """
 
@@ -62,6 +63,11 @@ def add_arguments(parser: Parser) -> None:
     add("--backend", default="batch", metavar="KIND", help="batch (compiled, default) or pybullet")
     add("--workers", type=whole, default=1, metavar="N", help="processes that fly side by side (1)")
     add("--overwrite", action="store_true", help="remove the results that the folder holds")
+    add(
+        "--reward",
+        metavar="MODULE:FUNCTION",
+        help="show the mean of a reward of your own, function(state, actions) per control step",
+    )
     add("--report", default=True, help="update report.html and its plots (yes)", **YES_OR_NO)
     add_common(parser, "executor", "trust", "progress")
 
@@ -83,9 +89,18 @@ def run(options: argparse.Namespace) -> int:
     start = time.perf_counter()
     with progress_bar(options.progress) as show:
         show(0, None, "loading")
-        how = options.backend, options.workers, options.overwrite
         results = evaluate(
-            suite, controllers, folder, *how, show, warn, options.executor, options.address
+            suite,
+            controllers,
+            folder,
+            options.backend,
+            options.workers,
+            options.overwrite,
+            progress=show,
+            report=warn,
+            executor=options.executor,
+            address=options.address,
+            reward=options.reward,
         )
     asked, flown = (
         {spec.label for spec in controllers},
