@@ -59,7 +59,10 @@ scenarios:
     episodes: 2
   - name: starts
     start: {velocity: {magnitude: 0}, body_rates: {magnitude: 0}}
-    vary: {start.attitude.tilt: [0, 90], start.body_rates.magnitude: [0, 4], start.velocity.magnitude: [0, 3]}
+    vary:
+      start.attitude.tilt: [0, 90]
+      start.body_rates.magnitude: [0, 4]
+      start.velocity.magnitude: [0, 3]
     duration: 0.5
     episodes: 2
 """

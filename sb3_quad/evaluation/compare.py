@@ -84,10 +84,10 @@ def compare(
     :raises ConfigError: no controllers, an unknown name or keyword, a zip that cannot be read.
     :raises ControllerError: a controller or reward that fails in flight.
     """
-    if n_flights < 1 or not controllers:
-        raise ConfigError(
-            f"compare: {len(controllers)} controllers, {n_flights} flights: give some"
-        )
+    if not controllers:
+        raise ConfigError("compare: give at least one controller, such as {'PID': 'pid'}")
+    if n_flights < 1:
+        raise ConfigError(f"compare: n_flights is {n_flights}, must be at least 1")
     seeds = row_seeds(seed_for("table") if seed is None else seed, n_flights)
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)

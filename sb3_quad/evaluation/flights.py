@@ -326,6 +326,9 @@ def _ask_reward(
         raise ControllerError(f"{name}: fails with {type(error).__name__}: {error}") from error
     if values.shape != (state.n,):
         raise ControllerError(f"{name}: gives shape {values.shape}, must be ({state.n},)")
+    if not np.isfinite(values).all():
+        row = int(np.flatnonzero(~np.isfinite(values))[0])
+        raise ControllerError(f"{name}: gives {values[row]} in row {row}, must be finite")
     return values
 
 
