@@ -29,15 +29,19 @@ class Comparison(dict[str, dict[str, Metrics]]):
     ``tables`` (one :class:`~sb3_quad.evaluation.tables.Table` for each task) are what is shown.
     """
 
-    def __init__(self, labels: Iterable[str]) -> None:
-        super().__init__((label, {}) for label in labels)
+    def __init__(self) -> None:
+        super().__init__()
         self.tables: list[Table] = []
 
     def __str__(self) -> str:
         return "\n".join(map(str, self.tables))
 
     def _repr_markdown_(self) -> str:
-        return "\n\n".join(f"**{table.title}**\n\n{table.markdown()}" for table in self.tables)
+        # Notebooks render this; a table in Markdown has no title of its own.
+        parts = []
+        for table in self.tables:
+            parts += [f"**{table.title}**", table.markdown()]
+        return "\n\n".join(parts)
 
 
 def compare(
@@ -88,7 +92,9 @@ def compare(
         raise ConfigError("compare: give at least one controller, such as {'PID': 'pid'}")
     if n_flights < 1:
         raise ConfigError(f"compare: n_flights is {n_flights}, must be at least 1")
-    seeds = row_seeds(seed_for("table") if seed is None else seed, n_flights)
+    if seed is None:
+        seed = seed_for("table")
+    seeds = row_seeds(seed, n_flights)
     own_reward = load_reward(reward)
     settings = _settings(controllers, env_kwargs)
     pilots = {}
@@ -97,15 +103,15 @@ def compare(
         pilots[label] = resolve_expert(
             controller, flown.vehicle, "controller", layout=flown.rotor_layout
         )
-    comparison = Comparison(controllers)
+
+    comparison = Comparison()
     for task in tasks:
         name = in_words(task)
+        metrics = {}
         for label, pilot in pilots.items():
-            flights = fly_settings(
-                pilot, settings[label].with_changes(task=task), seeds, reward=own_reward
-            )
-            comparison[label][name] = summarise(flights)
-        metrics = {label: comparison[label][name] for label in controllers}
+            how = settings[label].with_changes(task=task)
+            metrics[label] = summarise(fly_settings(pilot, how, seeds, reward=own_reward))
+            comparison.setdefault(label, {})[name] = metrics[label]
         comparison.tables.append(_task_table(name, metrics, settings, thesis_columns))
     return comparison
 
@@ -114,19 +120,20 @@ def _settings(
     controllers: Mapping[str, Any], env_kwargs: Mapping[str, Any]
 ) -> dict[str, FlightSettings]:
     """Return how each controller flies, the task excepted."""
-    own = {label: _own_settings(controller) for label, controller in controllers.items()}
     shared: dict[str, Any] = {}
-    for known in own.values():
-        if known is not None:
-            shared = {name: getattr(known, name) for name in ("vehicle", "vehicles", "noise")}
-            break
-    settings = {}
-    for label, known in own.items():
-        how = shared
+    own: dict[str, dict[str, Any]] = {}
+    for label, controller in controllers.items():
+        known = _own_settings(controller)
         if known is not None:
             # On another vehicle the agent still finds its rotors where it knows them.
-            how = {**known.in_any_task(), "rotor_layout": known.layout}
-        settings[label] = FlightSettings(**how).with_changes(**env_kwargs)
+            own[label] = {**known.in_any_task(), "rotor_layout": known.layout}
+            # The first agent decides for all that do not say how they fly.
+            if not shared:
+                shared = {key: getattr(known, key) for key in ("vehicle", "vehicles", "noise")}
+    settings = {}
+    for label in controllers:
+        how = FlightSettings(**own.get(label, shared))
+        settings[label] = how.with_changes(**env_kwargs)
     return settings
 
 
@@ -140,9 +147,10 @@ def _own_settings(controller: Any) -> FlightSettings | None:
         return None
     where = f"{type(controller).__name__}.{KEY}"
     vehicle = validate(Vehicle, record.get("vehicle"), f"{where}: vehicle")
-    # The task is not of interest here.
-    others = {name: value for name, value in record.items() if not name.startswith("task")}
-    return validate(FlightSettings, {**others, "vehicle": vehicle}, where)
+    # The task of its training does not matter here.
+    default = FlightSettings()
+    changes = {"vehicle": vehicle, "task": default.task, "task_kwargs": default.task_kwargs}
+    return validate(FlightSettings, record | changes, where)
 
 
 def _task_table(
@@ -152,24 +160,29 @@ def _task_table(
     thesis_columns: Iterable[str],
 ) -> Table:
     """Return the table of some controllers that flew the same episodes of a task."""
-    vehicles = {label: first_vehicle(flown.vehicle) for label, flown in settings.items()}
-    first = next(iter(vehicles.values()))
+    vehicles = {}
+    true_state = True
+    for label, how in settings.items():
+        vehicles[label] = first_vehicle(how.vehicle)
+        true_state &= not how.noise
+    first, *others = vehicles.values()
     # Tasks of your own have the rows of target tracking.
     scenario = load_suite("thesis").scenario(THESIS_SCENARIOS.get(task, "tracking"))
-    references = {}
+    columns = [*map(Column, metrics)]
+    references = []
     if task in THESIS_SCENARIOS and first.flies_as(load_vehicle(THESIS_VEHICLE)):
         for name in thesis_columns:
             if name in scenario.reference:
-                references[name] = scenario.reference[name]
-    columns = [Column(label) for label in metrics]
-    columns += [Column(name, source="thesis") for name in references]
-    cells = [metric_cells(measured) for measured in metrics.values()]
-    n = next(iter(metrics.values())).n
-    title = f"{task}: {n} fresh episodes, the same for all"
-    if not any(flown.noise for flown in settings.values()):
+                columns.append(Column(name, source="thesis"))
+                references.append(scenario.reference[name])
+    rows = metric_rows(scenario, [*map(metric_cells, metrics.values())], references)
+
+    n_flights = next(iter(metrics.values())).n
+    title = f"{task}: {n_flights} fresh episodes, the same for all"
+    if true_state:
         title += ", true state"
     caption = CAPTION
-    if any(vehicle != first for vehicle in vehicles.values()):
-        flown = ", ".join(f"{label} flies {vehicle.name}" for label, vehicle in vehicles.items())
-        caption = f"{caption}; {flown}"
-    return Table(columns, metric_rows(scenario, cells, references.values()), "", title, caption)
+    if any(vehicle != first for vehicle in others):
+        for label, vehicle in vehicles.items():
+            caption += f"; {label} flies {vehicle.name}"
+    return Table(columns, rows, title=title, caption=caption)

@@ -64,8 +64,10 @@ class ControllerSpec:
         """
         flown = load_vehicle(vehicle)
         if self.own is not None:
+            # Raises if the rotors of the two do not fit.
             flown.in_layout_of(self.own.layout)
             return unlike_trained(self.label, self.own, flown)
+        # Experts and factories are made for the vehicle that they fly.
         if not self.is_zip:
             return ""
         return (
@@ -83,8 +85,10 @@ def unlike_trained(label: str, own: FlightSettings, flown: Vehicle) -> str:
     # An agent that was trained on many vehicles knows none of them in particular.
     if own.vehicles is not None or trained.flies_as(flown):
         return ""
-    same = " of other parameters" if trained.name == flown.name else ""
-    return f"{label}: was trained on the vehicle {trained.name} and flies {flown.name}{same}"
+    warning = f"{label}: was trained on the vehicle {trained.name} and flies {flown.name}"
+    if trained.name == flown.name:
+        warning += " of other parameters"
+    return warning
 
 
 def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
@@ -94,16 +98,17 @@ def parse_controllers(texts: Sequence[str]) -> list[ControllerSpec]:
 
     :raises ConfigError: two controllers of the same label.
     """
-    specs = [_parse(text) for text in texts]
-    files = [file_name(spec.label) for spec in specs]
-    for file, spec in zip(files, specs, strict=True):
-        way_out = f"label it: name={spec.spec}"
+    specs = [*map(_parse, texts)]
+    files = set[str]()
+    for spec in specs:
+        who = f"controller {spec.label!r}"
         if not spec.label.isprintable():
-            raise ConfigError(f"controller {spec.label!r}: holds control characters; {way_out}")
-        if files.count(file) > 1:
-            raise ConfigError(
-                f"controller {spec.label!r}: two have this label; label them: name={spec.spec}"
-            )
+            raise ConfigError(f"{who}: holds control characters; label it: name={spec.spec}")
+        # Labels that differ may still be the same as names of files.
+        file = file_name(spec.label)
+        if file in files:
+            raise ConfigError(f"{who}: two have this label; label them: name={spec.spec}")
+        files.add(file)
     return specs
 
 

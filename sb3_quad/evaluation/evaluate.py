@@ -116,9 +116,11 @@ def evaluate(
         importlib.import_module("sb3_quad.base.bullet")
     if workers < 1:
         raise ConfigError(f"workers {workers}: must be at least 1")
+    # An error in it shows now, rather than as a failure of each controller.
     load_reward(reward)
 
     records, failures = _load_controllers(suite, controllers, report)
+    # Scenario by scenario, so that a suite that is interrupted compares all controllers.
     jobs = []
     for scenario in suite.scenarios:
         for spec, record in records.items():
@@ -127,22 +129,22 @@ def evaluate(
         suite=suite.name,
         description=suite.description,
         source=suite.source,
-        reward=reward if isinstance(reward, str) else getattr(reward, "__name__", ""),
+        reward=getattr(reward, "__name__", reward or ""),
         package_version=__version__,
         controllers=[*records.values()],
         scenarios=[*suite.scenarios],
         entries=[],
         failures=failures,
         digest=_digest(jobs),
-        finished=False,
     )
     place = Path(folder)
+    # Without a controller there is nothing to write, and no folder.
     if jobs:
         make_folder(place, "results folder", "-o")
         with locked(place, "folder"):
             done = _resume(place, results.digest, jobs, overwrite)
-            results = _fly_missing(place, results, jobs, done, workers, progress, executor, address)
-    return results.model_copy(update={"finished": True})
+            return _fly_missing(place, results, jobs, done, workers, progress, executor, address)
+    return results
 
 
 def _load_controllers(
@@ -153,12 +155,13 @@ def _load_controllers(
     failures = []
     for spec in specs:
         try:
-            vehicles = [_vehicle(spec, scenario) for scenario in suite.scenarios]
             record = controller_record(spec)
-            # Several scenarios give the same notice: report it once.
-            for notice in dict.fromkeys(map(spec.notice, vehicles)):
-                if notice:
-                    report(notice)
+            notices: dict[str, None] = {}
+            for scenario in suite.scenarios:
+                notices[spec.notice(_vehicle(spec, scenario))] = None
+            # Several scenarios give the same notice, or an empty one: report it once.
+            for notice in filter(None, notices):
+                report(notice)
             records[spec] = record
         except SB3QuadError as error:
             failures.append(_failure(spec.label, None, error))
@@ -179,27 +182,33 @@ def _fly_missing(
     """Fly the jobs that are not done, and write everything into the folder."""
     missing = [job for job in jobs if job.name not in done]
     failures = [*results.failures]
+
+    def write(finished: bool) -> Results:
+        # Workers finish in any order; the entries stand in that of the suite.
+        entries = [done[job.name] for job in jobs if job.name in done]
+        changes = {"entries": entries, "failures": failures, "finished": finished}
+        current = results.model_copy(update=changes)
+        if finished and entries:
+            write_episodes(place, entries)
+        if entries:
+            write_text(place / RESULTS, current.model_dump_json(indent=2))
+        return current
+
     progress(len(done), len(jobs), "")
-    alone = executor == "local" and min(workers, len(missing)) <= 1
-    with nullcontext() if alone else start_executor(executor, workers, address) as pool:
-        for number, (job, outcome) in enumerate(_fly_jobs(missing, pool), len(done) + 1):
+    pool: Any = nullcontext()
+    if executor != "local" or min(workers, len(missing)) > 1:
+        pool = start_executor(executor, workers, address)
+    with pool as working:
+        for number, (job, outcome) in enumerate(_fly_jobs(missing, working), len(done) + 1):
             if isinstance(outcome, Failure):
                 failures.append(outcome)
             else:
                 done[job.name], arrays = outcome
                 write_arrays(place / done[job.name].flights, compressed=True, **arrays)
-            # Workers finish in any order; the entries stand in that of the suite.
-            entries = [done[job.name] for job in jobs if job.name in done]
-            results = results.model_copy(update={"entries": entries, "failures": failures})
-            if entries:
-                write_text(place / RESULTS, results.model_dump_json(indent=2))
+            # After each job, so that an interrupted evaluation can resume.
+            write(finished=False)
             progress(number, len(jobs), f"{job.record.label}: {job.scenario.heading}")
-    if done:
-        entries = [done[job.name] for job in jobs if job.name in done]
-        results = results.model_copy(update={"entries": entries, "finished": True})
-        write_episodes(place, entries)
-        write_text(place / RESULTS, results.model_dump_json(indent=2))
-    return results
+    return write(finished=True)
 
 
 def fly_scenario(
@@ -225,6 +234,7 @@ def fly_scenario(
     if recorded is None:
         recorded = RECORDED_FIXED if scenario.is_fixed else RECORDED_RANDOM
     recorder = Recorder(recorded)
+    hooks = [recorder] if recorded else []
     parts = []
     size = PART_SIZES.get(backend, 1)
     for first in range(0, len(seeds), size):
@@ -235,12 +245,14 @@ def fly_scenario(
             part,
             backend,
             scenario.tolerances,
-            hooks=[recorder] if recorded and first == 0 else [],
+            hooks,
             plan=sample_plan(scenario, part),
             reward=reward,
         )
         parts.append(flights)
-    return Flights.concatenate(parts), recorder.arrays() if recorded else {}
+        # Only flights of the first part are recorded.
+        hooks = []
+    return Flights.concatenate(parts), recorder.arrays()
 
 
 def fly_job(job: Job) -> tuple[Entry, Arrays] | Failure:
@@ -298,9 +310,9 @@ def _fly_jobs(jobs: Sequence[Job], executor: "Executor | None") -> Iterator[tupl
 
 def _vehicle(spec: ControllerSpec, scenario: Scenario) -> Vehicle:
     """The vehicle that a controller flies in a scenario: the scenario's, else its own."""
-    if scenario.vehicle is not None:
+    if scenario.vehicle is not None or spec.own is None:
         return scenario.nominal_vehicle()
-    return first_vehicle(spec.own.vehicle if spec.own else DEFAULT_VEHICLE)
+    return first_vehicle(spec.own.vehicle)
 
 
 def _report_vehicles(
@@ -309,6 +321,7 @@ def _report_vehicles(
     """Report controllers, or a reference, that fly different vehicles in the same scenario."""
     vehicles: dict[str, str] = {}
     for scenario in suite.scenarios:
+        # All fly the vehicle that a scenario names.
         if scenario.vehicle is not None:
             continue
         for spec in specs:
@@ -316,7 +329,7 @@ def _report_vehicles(
         if scenario.reference:
             vehicles["the reference"] = DEFAULT_VEHICLE
     if len({*vehicles.values()}) > 1:
-        flown = ", ".join(f"{label} flies {vehicle}" for label, vehicle in vehicles.items())
+        flown = ", ".join(map(" flies ".join, vehicles.items()))
         report(f"not all fly the same vehicle: {flown}; --vehicle gives all of them one")
 
 
@@ -343,6 +356,7 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
                 " or remove them with --overwrite"
             )
         return {entry.name: entry for entry in before.entries if entry.name in kept}
+    # Start from scratch: all numbers in a folder are those of one command.
     for name in WRITTEN:
         (folder / name).unlink(missing_ok=True)
     shutil.rmtree(folder / FLIGHTS, ignore_errors=True)
@@ -352,6 +366,7 @@ def _resume(folder: Path, digest: str, jobs: Sequence[Job], overwrite: bool) -> 
 def _digest(jobs: Sequence[Job]) -> str:
     """Hash all inputs of the flights, the sources of this package included (SHA-256)."""
     digest = hashlib.sha256()
+    # The environments lie next to the package in a checkout, inside it when installed.
     for folder in (Path(__file__).parents[1], Path(registration.__file__).parent):
         for path in sorted([*folder.rglob("*.py"), *folder.rglob("*.yaml")]):
             digest.update(path.read_bytes())

@@ -91,8 +91,10 @@ class PyBulletFleet:
     """
 
     def __init__(self, seeds: Sequence[int], settings: FlightSettings) -> None:
-        from sb3_quad.envs.quadcopter_env import QuadcopterEnv  # PyBullet may be missing
+        # PyBullet may be missing, which matters here only.
+        from sb3_quad.envs.quadcopter_env import QuadcopterEnv
 
+        # Flights end by their plan; none is truncated by its environment.
         keywords = dict(settings.with_changes(max_episode_steps=ENDLESS))
         self._seeds = seeds
         self._envs = [QuadcopterEnv(**keywords) for _ in seeds]
@@ -102,6 +104,7 @@ class PyBulletFleet:
     def reset(self, start: Mapping[str, FloatArray]) -> Float32Array:
         for row, env in enumerate(self._envs):
             state = {name: values[row] for name, values in start.items()}
+            # A target is no part of an environment's state.
             options: dict[str, Any] = {"target": state.pop("target", None), "state": state}
             env.reset(seed=self._seeds[row], options=options)
         self._observation = np.stack([env.observe() for env in self._envs])
@@ -111,6 +114,7 @@ class PyBulletFleet:
         n = len(actions)
         reward, distance = np.zeros((2, n))
         lost, collided, success = np.zeros((3, n), np.bool_)
+        # The others have ended; their environments may not be stepped.
         for row in np.flatnonzero(flying):
             self._observation[row], reward[row], lost[row], _, info = self._envs[row].step(
                 actions[row]

@@ -51,10 +51,11 @@ class Recorder(Hook):
     def on_start(self, state: QuadcopterState, vehicle: Vehicle) -> None:
         self._control_step = vehicle.control_step
         self._stride = max(1, round(1.0 / (SAMPLE_RATE * vehicle.control_step)))
-        m = min(self._m, state.n)
         self._log: list[Arrays] = []
+        m = min(self._m, state.n)
         self._samples = np.zeros(m, dtype=np.int64)
         self._wrench = np.zeros((m, 6))
+        # No action has been given at the start.
         no_actions = np.full((state.n, 4), np.nan, np.float32)
         self._sample(state, no_actions, np.ones(state.n, dtype=np.bool_))
 
@@ -67,6 +68,7 @@ class Recorder(Hook):
     ) -> None:
         if not wrench.any():
             return
+        # Sum forces in the world frame and torques in the body frame until the next sample.
         rows = wrench[: self._m]
         rotation = QuadcopterState(state.array[:, : self._m]).rotation
         self._wrench[:, :3] += rows[:, FORCE_WORLD]
@@ -93,7 +95,9 @@ class Recorder(Hook):
         self._wrench[:] = 0.0
 
     def arrays(self) -> Arrays:
-        """Return the arrays of trajectories, as long as the longest flight."""
+        """Return the arrays of trajectories, as long as the longest flight; none if ``m`` is 0."""
+        if self._m == 0:
+            return {}
         log = self._log[: self._samples.max(initial=1)]
         arrays: Arrays = {
             "time": np.arange(len(log)) * (self._stride * self._control_step),
@@ -107,6 +111,7 @@ class Recorder(Hook):
 def episode_arrays(flights: Flights, seeds: npt.ArrayLike) -> Arrays:
     """Return the ``episode_`` arrays, of all flights."""
     arrays: Arrays = {f"episode_{name}": getattr(flights, name) for name in EPISODES}
+    # The first condition that holds decides.
     conditions = [flights.success, flights.survival, flights.collision]
     arrays["episode_seed"] = np.asarray(seeds, dtype=np.int64)
     arrays["episode_outcome"] = np.select(conditions, OUTCOMES[:3], OUTCOMES[3])
@@ -139,6 +144,7 @@ class Track(NamedTuple):
     @property
     def targets(self) -> FloatArray:
         """The targets, one after the other, (n, 3), m."""
+        # The first sample of each target.
         changed = np.flatnonzero((np.diff(self.target, axis=0) != 0).any(axis=1)) + 1
         return np.asarray(self.target[[0, *changed]])
 

@@ -98,7 +98,7 @@ class Flights:
 
 def arrival_tolerance(tolerances: Iterable[float]) -> float:
     """Return the tolerance, m, by which overshoot and the settling time are judged."""
-    known = list(tolerances)
+    known = {*tolerances}
     return NEAR if NEAR in known else min(known)
 
 
@@ -171,15 +171,12 @@ def fly(
     """
     if n_flights < 1:
         raise ConfigError(f"n_flights {n_flights}: must be at least 1")
-    environment |= {
-        "task": task,
-        "vehicle": vehicle,
-        "noise": noise,
-        "max_episode_steps": max_steps,
-    }
+    # A model flies with its rotors where it knows them.
     if environment.get("rotor_layout") is None:
         environment["rotor_layout"] = known_layout(controller)
-    settings = FlightSettings().with_changes(**environment)
+    settings = FlightSettings().with_changes(
+        task=task, vehicle=vehicle, noise=noise, max_episode_steps=max_steps, **environment
+    )
     seeds = row_seeds(seed, n_flights)
     return fly_settings(controller, settings, seeds, backend, tolerances, hooks, reward=reward)
 
@@ -233,7 +230,7 @@ def _fly_fleet(
     state = fleet.true_state()
     position = state.position.copy()
     course = Waypoints(plan, state.n)
-    arrivals = Arrivals(tolerances, state.distance, course.on_last)
+    arrivals = Arrivals(tolerances, course.to_last(state.distance))
     motion = Motion(state, control_step)
     flights = _at_start(state, plan, arrivals, motion, course)
     if reward is not None:
@@ -244,6 +241,7 @@ def _fly_fleet(
 
     for step in range(1, max_steps + 1):
         time = step * control_step
+        # Disturbances of the plan begin and end between two control steps.
         if step - 1 in plan.wrenches:
             fleet.set_wrench(plan.wrenches[step - 1])
         try:
@@ -267,19 +265,23 @@ def _fly_fleet(
         flights.success[flying] = result.success[flying]
         flights.length[flying] = step
         flights.flown[flying] = time
-        arrivals.see(time, result.distance, flying, course.on_last)
+        arrivals.see(time, course.to_last(result.distance), flying)
         flights.collision[flying & result.lost & result.collided] = True
 
+        # From here on, only the flights that continue count.
         flying &= ~result.lost
         motion.see(step, state, flying)
         for hook in hooks:
             hook.after_step(step, state, actions, flying)
         if not flying.any():
             break
+        # Whoever has reached a waypoint sees the next one from the next step on.
         onward = course.see(time, result.distance, flying)
         if onward.size:
             observation = fleet.set_targets(onward, course.targets(onward))
 
+    # A flight that was lost, or that did not get to its last target, has no success and no time
+    # after which it stays there.
     flights.success[~(flying & course.on_last)] = False
     arrivals.settling_time[:, ~flying] = np.nan
     flights.final_offset[flying] = (state.position - state.target)[flying]
@@ -292,6 +294,10 @@ def _at_start(
     """The metrics before the first step; arrivals, motion and course update theirs in place."""
     n = state.n
     undefined = np.full(n, np.nan)
+    cross_track_error = motion.cross_track_error
+    if len(plan.waypoints):
+        # A course has no single straight line to deviate from.
+        cross_track_error = undefined
     return Flights(
         success=np.zeros(n, dtype=np.bool_),
         survival=np.ones(n, dtype=np.bool_),
@@ -307,8 +313,7 @@ def _at_start(
         final_error=state.distance.copy(),
         final_offset=np.full((n, 3), np.nan),
         recovery_time=motion.recovery_time,
-        # A course has no single straight line to deviate from.
-        cross_track_error=undefined if len(plan.waypoints) else motion.cross_track_error,
+        cross_track_error=cross_track_error,
         waypoint_times=course.times,
         start=np.hstack([state.position, state.quaternion, state.velocity, state.body_rates]),
         target=state.target.copy(),
@@ -319,6 +324,7 @@ def _ask_reward(
     reward: Reward, state: QuadcopterState, actions: Float32Array
 ) -> npt.NDArray[np.float64]:
     """Return the rewards of a function of the user's, which may do anything, as (n,) numbers."""
+    # Instances of a class have no name of their own.
     name = f"reward {getattr(reward, '__name__', type(reward).__name__)}"
     try:
         values = np.asarray(reward(state, actions), dtype=np.float64)
@@ -340,16 +346,13 @@ class Arrivals:
     first within :func:`arrival_tolerance`. NaN where that has not happened.
 
     :param tolerances: m.
-    :param distance: |r - r_T| at the start, (n,), m.
-    :param counts: bool (n,): the flights whose present target is their last.
+    :param distance: |r - r_T| at the start, (n,), m; infinite before the last waypoint.
     """
 
-    def __init__(
-        self, tolerances: Sequence[float], distance: FloatArray, counts: BoolArray
-    ) -> None:
+    def __init__(self, tolerances: Sequence[float], distance: FloatArray) -> None:
         self.tolerances = tolerances
         self._limits = np.array(tolerances)[:, None]
-        self.time_to = np.where((distance <= self._limits) & counts, 0.0, np.nan)
+        self.time_to = np.where(distance <= self._limits, 0.0, np.nan)
         self.settling_time = self.time_to.copy()
         self._first = np.full(len(distance), np.nan)
         if tolerances:
@@ -357,9 +360,9 @@ class Arrivals:
             self._first = self.time_to[[*tolerances].index(arrival_tolerance(tolerances))]
         self.overshoot = np.where(np.isnan(self._first), np.nan, distance)
 
-    def see(self, time: float, distance: FloatArray, flying: BoolArray, counts: BoolArray) -> None:
+    def see(self, time: float, distance: FloatArray, flying: BoolArray) -> None:
         """See |r - r_T|, (n,), m, after a control step that ends at ``time``, s."""
-        inside = (distance <= self._limits) & counts
+        inside = distance <= self._limits
         entered = inside & flying
         self.time_to[np.isnan(self.time_to) & entered] = time
         # Who is outside has to settle again.
@@ -385,14 +388,16 @@ class Waypoints:
     def see(self, time: float, distance: FloatArray, flying: BoolArray) -> IntArray:
         """See |r - r_T|, (n,), m, at ``time``, s; return the rows that get their next target."""
         count = len(self._plan.waypoints)
-        if count == 0:
-            return np.zeros(0, dtype=np.int64)
         near = distance <= self._plan.radius
         reached = np.flatnonzero(flying & (self._next < count) & near)
         self.times[reached, self._next[reached]] = time
         self._next[reached] += 1
         self.on_last |= self._next >= count - 1
         return reached[self._next[reached] < count]
+
+    def to_last(self, distance: FloatArray) -> FloatArray:
+        """Return |r - r_T|, (n,), m, of the flights on the way to their last target; else inf."""
+        return np.where(self.on_last, distance, np.inf)
 
     def targets(self, rows: IntArray) -> FloatArray:
         """The present waypoints of some rows, (len(rows), 3), m."""

@@ -55,6 +55,7 @@ def read_curve(run: str | Path, task: str | None = None) -> Curve:
             if name in OPTIONAL:
                 continue
             raise ConfigError(f"{path}: cannot be read ({name}: no such array)")
+        # A file of another program may hold anything.
         array = arrays[name]
         dimensions = 2 if name in EPISODES.values() else 1
         fits = array.ndim == dimensions and len(array) == arrays["timesteps"].size > 0

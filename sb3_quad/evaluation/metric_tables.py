@@ -4,6 +4,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 
+import numpy as np
+
 from sb3_quad.evaluation.flights import arrival_tolerance
 from sb3_quad.evaluation.metrics import Metrics, Moment
 from sb3_quad.evaluation.results import Results
@@ -29,7 +31,7 @@ CROSS_TRACK_ERROR = Row("cross-track error", "m")
 REACHED = Row("waypoints reached")
 COMPLETED = Row("courses completed", "%")
 COURSE_TIME = Row("time of the course", "s")
-# How the names of the rows with times begin, of which less is better.
+# The names of rows with times begin like this; in them less is better.
 TIME = "mean time to"
 SETTLING = "settling time"
 # Flights that are lost end early, which makes other rows incomparable.
@@ -64,8 +66,9 @@ def estimate_cell(
 
 def share_cell(share: Estimate | None) -> Cell:
     """Return a share in percent, with as many digits as a single flight takes to show."""
-    digits = 0 if share is None else len(str(share.n // 200))
-    return estimate_cell(share, 100.0, digits)
+    if share is None:
+        return Cell(words="–")
+    return estimate_cell(share, 100.0, decimals=len(str(share.n // 200)))
 
 
 def metric_cells(metrics: Metrics) -> Cells:
@@ -84,9 +87,11 @@ def metric_cells(metrics: Metrics) -> Cells:
     near = arrival_tolerance(arrival.tolerance for arrival in metrics.arrivals)
     for arrival in metrics.arrivals:
         cells[time_row(arrival.tolerance)] = _moment(arrival, "arrive")
+        # Settling and overshoot are shown of one tolerance only.
         if arrival.tolerance == near:
             cells[settling_row(near)] = _moment(arrival.settling, "settle")
             cells[OVERSHOOT_RATE] = share_cell(arrival.overshoot_rate)
+    # These exist only of some flights.
     if metrics.own_reward is not None:
         cells[OWN_REWARD] = estimate_cell(metrics.own_reward)
     if metrics.cross_track_error is not None:
@@ -133,17 +138,22 @@ def metric_rows(
 
     :param measured: of each controller; None: it failed.
     """
-    others = [reference_cells(reference) for reference in references]
-    none_lost = all(cells is None or cells[SURVIVAL].value == 100.0 for cells in measured)
+    # A controller that failed has one cell, which says so.
+    failed = {SUCCESS: Cell(words="failed")}
+    ours = [failed if cells is None else cells for cells in measured]
+    others = [*map(reference_cells, references)]
+    none_lost = all(cells[SURVIVAL].value == 100.0 for cells in measured if cells is not None)
     rows = []
     for row in _rows_of(scenario):
-        failed = Cell(words="failed") if row == SUCCESS else Cell()
-        own = [failed if cells is None else cells.get(row, Cell()) for cells in measured]
-        if all(cell == Cell() for cell in own):
+        own = [cells.get(row, Cell()) for cells in ours]
+        # A row without any number of ours is left out, whatever others measured.
+        if not any(cell != Cell() for cell in own):
             continue
         if none_lost or row in ALWAYS_COMPARABLE:
             own = mark_best(row, own)
-        rows.append(replace(row, cells=[*own, *(cells.get(row, Cell()) for cells in others)]))
+        for cells in others:
+            own.append(cells.get(row, Cell()))
+        rows.append(replace(row, cells=own))
     return rows
 
 
@@ -155,18 +165,17 @@ def mark_best(row: Row, cells: Sequence[Cell]) -> list[Cell]:
         sign = -1.0
     else:
         return list(cells)
-    # By cell, how bad and how good it may be: the ends of the interval, turned so that more is
-    # better.
-    ranges = {}
+    # The intervals, turned so that more is better; without a number a cell cannot win.
+    ends = np.full((2, len(cells)), -np.inf)
     for number, cell in enumerate(cells):
         if cell.value is not None:
-            ends = cell.ends or (cell.value, cell.value)
-            ranges[number] = sorted(sign * end for end in ends)
+            ends[:, number] = sorted(np.multiply(sign, cell.ends or (cell.value, cell.value)))
     marked = []
     for number, cell in enumerate(cells):
-        best_of_others = [high for other, (_, high) in ranges.items() if other != number]
-        best = number in ranges and bool(best_of_others)
-        marked.append(replace(cell, best=best and ranges[number][0] > max(best_of_others)))
+        best_of_others = np.delete(ends[1], number).max(initial=-np.inf)
+        # A cell that is alone is not the best.
+        best = bool(ends[0, number] > best_of_others > -np.inf)
+        marked.append(replace(cell, best=best))
     return marked
 
 
@@ -175,35 +184,36 @@ def overview(results: Results, controllers: Sequence[str]) -> Table:
 
     :param controllers: labels, in the order of their columns.
     """
-    columns = [Column(label) for label in controllers]
-    if any(scenario.reference for scenario in results.scenarios):
-        columns.append(Column(results.source, align="left"))
+    columns = [*map(Column, controllers)]
     rows = []
     for heading, scenarios in scenario_groups(results):
         rows.append(Row(heading))
         for scenario in scenarios:
-            rows += _section(results, controllers, scenario, len(columns))
+            rows += _section(results, controllers, scenario)
+            if scenario.reference and len(columns) == len(controllers):
+                columns.append(Column(results.source, align="left"))
     return Table(columns, rows, title=results.suite, caption=CAPTION)
 
 
-def _section(
-    results: Results, controllers: Sequence[str], scenario: Scenario, width: int
-) -> list[Row]:
-    """The rows of a scenario in the overview, ``width`` cells each."""
+def _section(results: Results, controllers: Sequence[str], scenario: Scenario) -> list[Row]:
+    """The rows of a scenario in the overview."""
     measured = [measured_cells(results, label, scenario) for label in controllers]
     rows = metric_rows(scenario, measured, scenario.reference.values())
-    varied = ", ".join(f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items())
     section = []
     for row in rows:
-        name = row.name
-        if varied:
-            name = f"{varied}, {name}" if len(rows) > 1 else varied
-        own = [*row.cells[: len(controllers)]]
+        names = [f"{axis_name(key)} {value:g}" for key, value in scenario.cell.items()]
+        # The values of a cell are name enough for its only row.
+        if len(rows) > 1 or not names:
+            names.append(row.name)
+        cells = [*row.cells[: len(controllers)]]
         # All references share a column.
-        others = zip(scenario.reference, row.cells[len(controllers) :], strict=True)
-        words = [f"{who} {replace(cell, note='').text}" for who, cell in others if cell != Cell()]
-        cells = [*own, Cell(words="; ".join(words))]
-        section.append(Row(f"  {name}", row.unit, cells[:width]))
+        words = []
+        for who, cell in zip(scenario.reference, row.cells[len(controllers) :], strict=True):
+            if cell != Cell():
+                words.append(f"{who} {replace(cell, note='').text}")
+        if words:
+            cells.append(Cell(words="; ".join(words)))
+        section.append(Row(f"  {', '.join(names)}", row.unit, cells))
     return section
 
 
@@ -224,22 +234,25 @@ def _rows_of(scenario: Scenario) -> list[Row]:
     common = [SUCCESS, SURVIVAL]
     if scenario.target.waypoints is not None:
         return [*common, REACHED, COMPLETED, COURSE_TIME]
+    if len(scenario.cell) > 1:
+        return [SUCCESS]
     if scenario.group is not None:
-        return [*common, MEDIAN] if len(scenario.cell) == 1 else [SUCCESS]
+        return [*common, MEDIAN]
     rewards = [REWARD, OWN_REWARD]
     if scenario.target.distance == 0.0:
+        if scenario.is_fixed:
+            common.append(FLOWN)
         # An episode that starts at its target has no way to it.
-        flown = [FLOWN] if scenario.is_fixed else []
-        return [*common, *flown, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
+        return [*common, *rewards, RECOVERY_TIME, MEDIAN, QUANTILE]
     tolerances = scenario.tolerances
     if len(tolerances) > MOST_TOLERANCES:
         # Only the main ones and those of references; a plot shows the others.
         kept = {tolerances[0], *MAIN_TOLERANCES}
         for reference in scenario.reference.values():
-            kept |= {float(key) for key in reference.time_to}
-        tolerances = tuple(tolerance for tolerance in tolerances if tolerance in kept)
+            kept |= {*map(float, reference.time_to)}
+        tolerances = tuple(sorted(kept & {*tolerances}))
     settling = [settling_row(arrival_tolerance(tolerances)), LIMIT, OVERSHOOT_RATE, OVERSHOOT]
-    times = [time_row(tolerance) for tolerance in tolerances]
+    times = map(time_row, tolerances)
     return [*common, *rewards, *settling, *times, PATH, CROSS_TRACK_ERROR, MEDIAN, QUANTILE]
 
 
@@ -256,5 +269,6 @@ def _printed(value: NumberOrRange | None, factor: float = 1.0) -> Cell:
     if value is None:
         return Cell(words="never")
     if isinstance(value, tuple):
+        # Tables have a proper minus sign.
         return Cell(words=" to ".join(f"{factor * end:g}" for end in value).replace("-", "−"))
     return Cell(factor * value, decimals=len(f"{factor * value:g}".partition(".")[2]))

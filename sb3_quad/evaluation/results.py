@@ -150,6 +150,7 @@ def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
     """The lines of a scenario's flights, one each."""
     columns: dict[str, Any] = {name: arrays[f"episode_{name}"] for name in _COLUMNS}
     waypoints = arrays["episode_waypoints"]
+    # Arrays of several numbers become a column for each of them.
     columns["waypoints_reached"] = np.isfinite(waypoints).sum(axis=1)
     for name, axes in _AXES.items():
         for axis, values in zip(axes.split(), arrays[f"episode_{name}"].T, strict=True):
@@ -175,6 +176,7 @@ def _rows(entry: Entry, arrays: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _written(value: Any) -> str:
+    # Nine digits tell any two float32 apart; a number that does not exist stays empty.
     if not isinstance(value, np.floating):
         return str(value)
     return f"{value:.9g}" if np.isfinite(value) else ""

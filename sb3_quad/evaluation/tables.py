@@ -117,13 +117,17 @@ class Table:
         Names are escaped, so that none becomes HTML.
         """
         lines = [
-            [self.corner, *(column.heading for column in self.columns)],
-            ["---"] * (1 + len(self.columns)),
+            _markdown([self.corner, *self._headings]),
+            _markdown(["---"] * (1 + len(self.columns))),
         ]
         for row in self.rows:
             texts = [f"**{cell.text}**" if cell.best else cell.text for cell in row.cells]
-            lines.append([row.heading, *texts])
-        return "\n".join(f"| {' | '.join(map(_escape, line))} |" for line in lines)
+            lines.append(_markdown([row.heading, *texts]))
+        return "\n".join(lines)
+
+    @property
+    def _headings(self) -> list[str]:
+        return [column.heading for column in self.columns]
 
     def __str__(self) -> str:
         """The table as plain text."""
@@ -137,15 +141,17 @@ class Table:
             title=escape(self.title) or None, caption=escape(self.caption) or None
         )
         table.title_justify = table.caption_justify = "left"
-        table.show_header = any([self.corner, *(column.heading for column in self.columns)])
+        table.show_header = any([self.corner, *self._headings])
         table.add_column(Text(self.corner), no_wrap=True)
         for column in self.columns:
             table.add_column(Text(column.heading), justify=column.align)
         for row in self.rows:
             if not row.cells:
                 table.add_section()
+                table.add_row(Text(row.heading, "bold"))
+                continue
             texts = [Text(cell.text, "bold" if cell.best else "") for cell in row.cells]
-            table.add_row(Text(row.heading, "" if row.cells else "bold"), *texts)
+            table.add_row(row.heading, *texts)
         return table
 
 
@@ -158,9 +164,13 @@ def text_table(
     :param rows: each begins with its name.
     """
     columns = [Column(head, align=align) for head in heads[1:]]
-    filled = [Row(name, "", [Cell(words=text) for text in texts]) for name, *texts in rows]
+    filled = []
+    for name, *texts in rows:
+        filled.append(Row(name, "", [Cell(words=text) for text in texts]))
     return Table(columns, filled, heads[0], title)
 
 
-def _escape(text: str) -> str:
-    return escape_html(text.replace("|", "/"), False)
+def _markdown(texts: Iterable[str]) -> str:
+    """A line of a table; the bar that divides its cells may not be in them."""
+    cells = [escape_html(text.replace("|", "/"), False) for text in texts]
+    return f"| {' | '.join(cells)} |"

@@ -58,6 +58,7 @@ def plot_curves(
         for panel, (axis, unit, axis_label) in zip(panels[row], COLUMNS, strict=True):
             panel.set(xlabel=axis_label, ylabel=label)
             panel.label_outer()
+            # The seeds of an agent are one line with a band.
             for name, runs in groups.items():
                 points = _mean_and_range(runs, axis, measure)
                 if points is not None:
@@ -82,6 +83,7 @@ def _measures(curves: Sequence[Curve], show: Sequence[str]) -> list[str]:
     if not show:
         show = ["success", "reward"] if "success" in present else ["reward"]
     measures = []
+    # Runs of different algorithms have different losses: all of them are shown.
     for name in show:
         measures += losses if name == "losses" else [name]
         if name not in present and not (name == "losses" and losses):

@@ -65,14 +65,15 @@ def facts(results: Results) -> str:
     """Return how many flights there are, when and by which version, and how to read numbers."""
     flights = sum(entry.metrics.n for entry in results.entries)
     backends = " and ".join(sorted({entry.backend for entry in results.entries}))
-    dates = sorted({entry.date for entry in results.entries})
-    days = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    dates = {entry.date for entry in results.entries}
+    days = " to ".join(sorted({min(dates), max(dates)}))
     sentences = [
         f"{flights:,} flights of {len(results.controllers)} controllers in"
         f" {len(results.scenarios)} scenarios, {backends} backend, flown {days} by sb3_quad"
         f" {results.package_version}.",
         SMALL_PRINT,
     ]
+    # Only evaluations with an own reward have a row of it.
     if results.reward:
         sentences.insert(1, f"Own reward: {results.reward}.")
     if results.description:
@@ -169,7 +170,10 @@ def _scenario_plots(
             tracks = read_tracks(Path(folder) / entry.flights)
             if tracks:
                 recorded.append(ControllerFlights(label, colour, tracks))
-    plots = [paths_plot(scenario, recorded)] if recorded else []
+    plots = []
+    # Controllers that failed have no flights to draw.
+    if recorded:
+        plots.append(paths_plot(scenario, recorded))
     has_way = scenario.target.waypoints is None and scenario.target.distance != 0.0
     if metrics and has_way and len(scenario.tolerances) > 2:
         plots.append(arrivals_plot(scenario, metrics, colours))
@@ -205,19 +209,21 @@ def _share_table(
 
 
 def _share(row: Row, results: Results, label: str, scenarios: Sequence[Scenario]) -> Cell:
+    """The share of a controller in some scenarios; of several, the least and the greatest."""
     shares = []
+    cell = Cell(words="failed")
     for scenario in scenarios:
         cells = measured_cells(results, label, scenario)
         if cells is not None:
-            shares.append(cells[row])
-    if not shares:
-        return Cell(words="failed")
-    if len(scenarios) == 1:
-        return shares[0]
-    values = [share.value for share in shares if share.value is not None]
-    return Cell(words=f"{min(values):.0f} to {max(values):.0f}")
+            cell = cells[row]
+            shares.append(cell.value or 0.0)
+    if len(scenarios) == 1 or not shares:
+        return cell
+    return Cell(words=f"{min(shares):.0f} to {max(shares):.0f}")
 
 
 def _columns(colours: Mapping[str, str], others: Iterable[str], source: str) -> list[Column]:
-    columns = [Column(label, colour) for label, colour in colours.items()]
-    return columns + [Column(name, source=source) for name in others]
+    columns = [*map(Column, colours.keys(), colours.values())]
+    for name in others:
+        columns.append(Column(name, source=source))
+    return columns

@@ -52,6 +52,7 @@ def arrivals_plot(
     figure, axes = new_axes("tolerance (m)", "time (s)")
     places = np.arange(len(scenario.tolerances))
     width = 0.75 / len(metrics)
+    # A group of bars at each tolerance, one for each controller.
     for number, (label, measured) in enumerate(metrics.items()):
         value, low, high = interval_ends([arrival.time for arrival in measured.arrivals])
         axes.bar(
@@ -115,6 +116,7 @@ def errors_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plo
     figure, axes = new_axes("time (s)", "distance from target (m)")
     for flown in flights:
         band(axes, flown.colour, flown.label, *_quantiles(flown.tracks))
+    # A disturbance that lasts to the end would colour the whole plot.
     for wrench in scenario.wrenches:
         end = wrench.start + (wrench.duration or np.inf)
         if end < scenario.duration:
@@ -132,6 +134,7 @@ def errors_plot(scenario: Scenario, flights: Sequence[ControllerFlights]) -> Plo
 def _quantiles(tracks: Sequence[Track]) -> tuple[FloatArray, FloatArray]:
     """Times, (k,), and the median, least and greatest error, (3, k); NaN where it is infinite."""
     times = max((track.times for track in tracks), key=len)
+    # A flight that has ended early is lost, infinitely far away.
     errors = np.full((len(tracks), len(times)), np.inf)
     for row, track in enumerate(tracks):
         errors[row, : len(track.times)] = track.error

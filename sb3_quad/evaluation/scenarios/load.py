@@ -76,6 +76,7 @@ def parse_suite(content: str, where: str, folder: Path = Path()) -> Suite:
         vehicle = entry.get("vehicle")
         if isinstance(vehicle, str) and VEHICLES.is_path(vehicle):
             entry["vehicle"] = str(folder / vehicle)
+        # A cell of a grid is a scenario like any other.
         for cell in grid(entry, place):
             scenarios.append(validate(Scenario, cell, place))
     return validate(Suite, {**data, "scenarios": scenarios}, where)
@@ -90,10 +91,10 @@ def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         numbers.
     :raises ConfigError: ``vary`` is not such a mapping, or names no place in the entry.
     """
-    plain = {key: value for key, value in entry.items() if key != "vary"}
     if "vary" not in entry:
-        return [plain]
-    axes = entry["vary"]
+        return [dict(entry)]
+    plain = dict(entry)
+    axes = plain.pop("vary")
     if not isinstance(axes, Mapping) or not axes:
         raise ConfigError(
             f"{where}: vary must map keys to lists of numbers, such as 'noise: [0, 0.05, 0.1]'"
@@ -105,8 +106,9 @@ def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
             )
     cells = []
     for values in itertools.product(*axes.values()):
+        # Keys may lead into nested parts, which the cells must not share.
         cell = copy.deepcopy(plain)
-        cell["cell"] = {str(key): value for key, value in zip(axes, values, strict=True)}
+        cell["cell"] = dict(zip(map(str, axes), values, strict=True))
         titles = []
         for key, value in cell["cell"].items():
             put_key(cell, key, value, f"{where}: vary.{key}")
@@ -114,7 +116,7 @@ def grid(entry: Mapping[str, Any], where: str) -> list[dict[str, Any]]:
         name = plain.get("name")
         cell["group"] = name
         cell["title"] = f"{plain.get('title') or name}: {', '.join(titles)}"
-        cell["name"] = f"{name}.{'_'.join(f'{value:g}' for value in values)}"
+        cell["name"] = f"{name}.{'_'.join(map('{:g}'.format, values))}"
         cells.append(cell)
     return cells
 
@@ -142,9 +144,12 @@ def axis_label(key: str, scenario: Scenario | None = None) -> str:
     """
     name = axis_name(key)
     unit = UNITS.get(name)
+    # The unit of a wrench may differ from scenario to scenario.
     if name in WEIGHTS and scenario is not None and key.startswith("wrenches."):
         wrench = scenario.wrenches[int(key.split(".")[1])]
         if wrench.unit == "weight":
             unit = WEIGHTS[name]
-    words = name.replace("_", " ")
-    return f"{words} ({unit})" if unit else words
+    label = name.replace("_", " ")
+    if unit is not None:
+        label += f" ({unit})"
+    return label

@@ -76,6 +76,7 @@ def sample_wrenches(
     acting = []
     times = set[int]()
     for wrench in wrenches:
+        # A wrench acts for whole control steps, at least one.
         first = round(wrench.start / vehicle.control_step)
         last = first + steps
         if wrench.duration is not None:

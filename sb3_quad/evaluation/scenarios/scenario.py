@@ -51,7 +51,7 @@ class Reference(Frozen, use_attribute_docstrings=True):
     def _as_text(cls, value: Any) -> Any:
         if not isinstance(value, dict):
             raise ValueError("must map tolerances in m to times in s")
-        # YAML reads 0.10 and 0.1 as the same number; text keys survive JSON.
+        # Text, since JSON has no numbers as keys.
         return {f"{key:g}" if type(key) is float else str(key): value[key] for key in value}
 
 
@@ -114,9 +114,11 @@ class Scenario(Frozen, use_attribute_docstrings=True):
     @model_validator(mode="after")
     def _possible(self) -> "Scenario":
         vehicle = self.flown_vehicle()
+        # Of a distribution, the vehicle that can do least decides.
         if self.vehicles is not None:
             vehicle = self.vehicles.weakest(vehicle)
         self._check_way(vehicle)
+        # The task checks the ranges of its own fields.
         try:
             _ = self.task
         except ValidationError as error:
@@ -278,10 +280,12 @@ class Suite(Frozen, use_attribute_docstrings=True):
 
         :raises ConfigError: an unknown name.
         """
-        scenarios = {scenario.name: scenario for scenario in self.scenarios}
-        if name not in scenarios:
-            raise ConfigError(unknown("scenario", name, scenarios))
-        return scenarios[name]
+        names = []
+        for scenario in self.scenarios:
+            if scenario.name == name:
+                return scenario
+            names.append(scenario.name)
+        raise ConfigError(unknown("scenario", name, names))
 
     def with_changes(
         self,
@@ -298,8 +302,9 @@ class Suite(Frozen, use_attribute_docstrings=True):
         :raises ConfigError: an unknown name, a number out of range, a scenario that is impossible
             for the vehicle.
         """
-        known = {scenario.name for scenario in self.scenarios}
-        known |= {scenario.group for scenario in self.scenarios if scenario.group is not None}
+        known = set[str]()
+        for scenario in self.scenarios:
+            known |= {scenario.name, scenario.group or scenario.name}
         for name in names:
             if name not in known:
                 raise ConfigError(unknown("scenario", name, known))
@@ -321,10 +326,13 @@ class Suite(Frozen, use_attribute_docstrings=True):
 
     @model_validator(mode="after")
     def _unique(self) -> "Suite":
-        names = [scenario.name for scenario in self.scenarios]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"scenarios: {name!r} is there twice; names must be unique")
+        names = set[str]()
+        for scenario in self.scenarios:
+            if scenario.name in names:
+                raise ValueError(
+                    f"scenarios: {scenario.name!r} is there twice; names must be unique"
+                )
+            names.add(scenario.name)
         return self
 
 
